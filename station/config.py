@@ -1,0 +1,440 @@
+"""The site file: read, checked, explained.
+
+One TOML file describes one station. Unknown keys are refused with the nearest right one, all errors are
+listed at once, paths are relative to the file.
+"""
+
+from __future__ import annotations
+
+import difflib
+import hashlib
+import json
+import math
+import tomllib
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from pydantic import (
+    AfterValidator,
+    AwareDatetime,
+    BaseModel,
+    ConfigDict,
+    Field,
+    ValidationError,
+    model_validator,
+)
+
+from station.errors import ConfigError
+from station.quantities import Air, Grid, Scanner
+
+# Published values: Voordendag et al. (2023), section 2.2 (VZ-6000); Hartzell et al. (2015), Table 1
+# (VZ-4000, LMS-Z390i). The papers give no range noise and no aperture for the VZ-6000, and nothing for the
+# VZ-400i: there the maker's data sheets stand in (RIEGL: 10 mm and 3 mm precision; 0.35 mrad, 1.55 µm).
+SCANNERS: dict[str, dict[str, float]] = {
+    "riegl-vz-6000": {
+        "wavelength_um": 1.064,
+        "beam_divergence_mrad": 0.12,
+        "exit_diameter_m": 0.0,
+        "range_sigma_m": 0.010,
+        "angle_resolution_deg": 0.0005,
+        "inclination_sigma_deg": 0.008,
+        "range_max_m": 6000.0,
+    },
+    "riegl-vz-4000": {
+        "wavelength_um": 1.55,
+        "beam_divergence_mrad": 0.15,
+        "exit_diameter_m": 0.018,
+        "range_sigma_m": 0.010,
+        "angle_resolution_deg": 0.0005,
+        "inclination_sigma_deg": 0.008,
+        "range_max_m": 4000.0,
+    },
+    "riegl-vz-400i": {
+        "wavelength_um": 1.55,
+        "beam_divergence_mrad": 0.35,
+        "exit_diameter_m": 0.007,
+        "range_sigma_m": 0.003,
+        "angle_resolution_deg": 0.0005,
+        "inclination_sigma_deg": 0.008,
+        "range_max_m": 800.0,
+    },
+    "riegl-lms-z390i": {
+        "wavelength_um": 1.55,
+        "beam_divergence_mrad": 0.30,
+        "exit_diameter_m": 0.0085,
+        "range_sigma_m": 0.004,
+        "angle_resolution_deg": 0.001,
+        "inclination_sigma_deg": 0.008,
+        "range_max_m": 400.0,
+    },
+}
+
+Positive = Annotated[float, Field(gt=0)]
+NotNegative = Annotated[float, Field(ge=0)]
+
+
+def _in_utc(moment: datetime) -> datetime:
+    return moment.astimezone(UTC)
+
+
+Utc = Annotated[AwareDatetime, AfterValidator(_in_utc)]
+
+
+class Section(BaseModel):
+    """A table of the site file: nothing unknown, nothing changed after reading."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+
+class StationSection(Section):
+    """Who the station is; goes into the metadata of everything it writes."""
+
+    id: Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_-]{0,31}$")]
+    data: Path
+    name: str = ""
+    institution: str = ""
+
+
+class ScansSection(Section):
+    """Where scans arrive and how they are named."""
+
+    inbox: Path
+    name: str = "%y%m%d_%H%M%S"
+    frame: Literal["scanner", "map"] = "scanner"
+    point_time: Literal["auto", "none"] = "auto"
+    settle_s: NotNegative = 60.0
+    expected_every_s: Positive = 3600.0
+    polling: bool = False
+    timeout_s: Positive = 1800.0
+
+
+class ScannerSection(Section):
+    """The instrument: a known model, each value of which may be overridden."""
+
+    model: str = "riegl-vz-6000"
+    wavelength_um: Annotated[float, Field(ge=0.3, le=2.5)]
+    beam_divergence_mrad: Annotated[float, Field(ge=0, le=10)]
+    exit_diameter_m: Annotated[float, Field(ge=0, le=0.2)]
+    range_sigma_m: Annotated[float, Field(gt=0, le=1)]
+    angle_resolution_deg: Annotated[float, Field(ge=0, le=1)]
+    inclination_sigma_deg: Annotated[float, Field(gt=0, le=1)]
+    range_max_m: Positive
+
+    @model_validator(mode="before")
+    @classmethod
+    def _fill_from_model(cls, given: dict[str, Any]) -> dict[str, Any]:
+        model = given.get("model", "riegl-vz-6000")
+        known = SCANNERS.get(model, {})
+        missing = set(SCANNERS["riegl-vz-6000"]) - set(given)
+        if not known and missing:
+            raise ValueError(
+                f"unknown scanner {model!r}: take one of {', '.join(SCANNERS)},"
+                f" or give {', '.join(sorted(missing))}"
+            )
+        return {**known, **given}
+
+
+class SopSection(Section):
+    """A scanner orientation and position, and from when it holds."""
+
+    from_: Annotated[Utc, Field(alias="from")]
+    file: Path
+    scan: str | None = None
+
+
+class Origin(Section):
+    """A point on the ellipsoid of WGS84."""
+
+    latitude_deg: Annotated[float, Field(ge=-90, le=90)]
+    longitude_deg: Annotated[float, Field(ge=-180, le=360)]
+    height_m: float
+
+
+class MapSection(Section):
+    """The map the products are in, and how the project frame hangs on it."""
+
+    crs: str | None = None
+    origin: Origin | None = None
+    pop: Path | None = None
+    vertical_datum: str = ""
+
+
+class Bounds(Section):
+    """Outer edges of the grid in the map CRS."""
+
+    west: float
+    south: float
+    east: float
+    north: float
+
+
+class GridSection(Section):
+    """The fixed raster."""
+
+    bounds_m: Bounds
+    cell_m: Positive = 1.0
+    min_points: Annotated[int, Field(ge=1)] = 1
+
+    @model_validator(mode="after")
+    def _whole_cells(self) -> GridSection:
+        bounds = self.bounds_m
+        for low, high, axis in (("west", "east", "columns"), ("south", "north", "rows")):
+            cells = (getattr(bounds, high) - getattr(bounds, low)) / self.cell_m
+            if cells < 1:
+                raise ValueError(f"bounds_m.{high} must be at least one cell_m beyond bounds_m.{low}")
+            if abs(cells - round(cells)) > 1e-6:
+                raise ValueError(
+                    f"bounds_m.{low} to bounds_m.{high} is {cells:g} {axis} of cell_m = {self.cell_m:g}:"
+                    " make it a whole number"
+                )
+        if self.shape[0] * self.shape[1] > 100_000_000:
+            raise ValueError(f"{self.shape} cells are too many: coarsen cell_m or cut bounds_m")
+        return self
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Rows and columns."""
+        bounds, cell_m = self.bounds_m, self.cell_m
+        return (round((bounds.north - bounds.south) / cell_m), round((bounds.east - bounds.west) / cell_m))
+
+
+class InclinationSection(Section):
+    """The inclination log beside each scan and what is done with it."""
+
+    suffix: str = "-incl.txt"
+    required: bool = True
+    wait_s: NotNegative = 900.0
+    filter: Literal["blackman", "none"] = "blackman"
+    cutoff_hz: Literal["auto"] | Positive = "auto"
+    mode: Literal["relative", "absolute"] = "relative"
+
+
+class WeatherColumns(Section):
+    """What the weather log calls its columns."""
+
+    time: str = "TIMESTAMP"
+    temperature_c: str
+    humidity_pct: str
+    pressure_hpa: str
+
+
+class WeatherSection(Section):
+    """The station's weather log."""
+
+    file: Path
+    format: Literal["toa5", "csv"] = "toa5"
+    columns: WeatherColumns
+    max_age_s: Positive = 3600.0
+    utc_offset_h: Annotated[float, Field(ge=-14, le=14)] = 0.0
+
+
+class AirValues(Section):
+    """Temperature, pressure and humidity."""
+
+    temperature_c: Annotated[float, Field(ge=-60, le=50)]
+    pressure_hpa: Annotated[float, Field(ge=300, le=1100)]
+    humidity_pct: Annotated[float, Field(ge=0, le=100)]
+
+    @property
+    def air(self) -> Air:
+        """The same as a quantity."""
+        return Air(self.temperature_c, self.pressure_hpa, self.humidity_pct)
+
+
+class AirSection(Section):
+    """What the scanner itself assumed of the air."""
+
+    scanner_setting: AirValues | Literal["weather"] = AirValues(
+        temperature_c=-2.0, pressure_hpa=684.0, humidity_pct=28.0
+    )
+    scanner_corrects: bool = True
+
+
+class AdjustmentSection(Section):
+    """How the pose of each scan is found."""
+
+    method: Literal["none"] = "none"
+
+
+class UncertaintySection(Section):
+    """Which budget is computed, and whether its terms are stored."""
+
+    model: Literal["rigorous", "voordendag2023"] = "rigorous"
+    store_terms: bool = False
+
+
+class ReferenceSection(Section):
+    """The master surface: the mean of the first usable scans, or a GeoTIFF."""
+
+    scans: Annotated[int, Field(ge=1, le=200)] | Path = 8
+
+
+class ServiceSection(Section):
+    """The running service."""
+
+    memory_gb: Annotated[float, Field(ge=0.5, le=1024)] = 4.0
+
+
+class SiteFile(Section):
+    """The whole file."""
+
+    station: StationSection
+    scans: ScansSection
+    scanner: ScannerSection = ScannerSection.model_validate({})
+    sop: tuple[SopSection, ...] = ()
+    map: MapSection = MapSection()
+    grid: GridSection
+    inclination: InclinationSection | None = None
+    weather: WeatherSection | None = None
+    air: AirSection = AirSection()
+    adjustment: AdjustmentSection = AdjustmentSection()
+    uncertainty: UncertaintySection = UncertaintySection()
+    reference: ReferenceSection = ReferenceSection()
+    service: ServiceSection = ServiceSection()
+
+    @model_validator(mode="after")
+    def _chain_is_complete(self) -> SiteFile:
+        if self.scans.frame == "scanner" and not self.sop:
+            raise ValueError('scans.frame = "scanner" needs an [[sop]] to lead the points to the map')
+        if self.map.crs is None and (self.map.pop or self.map.origin):
+            raise ValueError("map.pop and map.origin lead to a map: say which with map.crs")
+        if self.map.pop and self.map.origin and self.scans.frame == "scanner":
+            raise ValueError("map.pop and map.origin are two ways to the same map: keep one")
+        return self
+
+
+class Site(SiteFile):
+    """A checked site file whose paths are absolute."""
+
+    path: Path
+
+    @property
+    def grid_cells(self) -> Grid:
+        """The fixed raster as a quantity."""
+        ny, nx = self.grid.shape
+        return Grid(self.grid.bounds_m.west, self.grid.bounds_m.north, self.grid.cell_m, nx, ny)
+
+    @property
+    def instrument(self) -> Scanner:
+        """The scanner as a quantity, angles in radians."""
+        given = self.scanner
+        return Scanner(
+            model=given.model,
+            wavelength_um=given.wavelength_um,
+            beam_divergence_rad=given.beam_divergence_mrad * 1e-3,
+            exit_diameter_m=given.exit_diameter_m,
+            range_sigma_m=given.range_sigma_m,
+            angle_resolution_rad=math.radians(given.angle_resolution_deg),
+            inclination_sigma_rad=math.radians(given.inclination_sigma_deg),
+            range_max_m=given.range_max_m,
+        )
+
+    @property
+    def science_hash(self) -> str:
+        """Identify every setting that changes a number in the store (16 hex digits).
+
+        Where things lie and how long the service waits is left out.
+        """
+        told = self.model_dump(
+            mode="json",
+            exclude={
+                "path": True,
+                "service": True,
+                "station": True,
+                "scans": {"inbox", "settle_s", "expected_every_s", "polling", "timeout_s", "name"},
+                "sop": True,  # an epoch names the SOP it was made with
+                "weather": {"file"},
+                "inclination": {"wait_s", "required", "suffix"},
+                "map": {"pop"},
+            },
+        )
+        if self.map.pop:
+            told["pop"] = hashlib.sha256(self.map.pop.read_bytes()).hexdigest()
+        return hashlib.sha256(json.dumps(told, sort_keys=True).encode()).hexdigest()[:16]
+
+
+def read_site(path: str | Path) -> Site:
+    """Read and check a site file; raise ConfigError with every fault found, one a line."""
+    path = Path(path).absolute()
+    if path.is_dir():
+        raise ConfigError(f"{path} is a folder: name the site file in it")
+    try:
+        given = tomllib.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise ConfigError(f"{path}: cannot be read: {error.strerror}") from error
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise ConfigError(f"{path}: not valid TOML: {error}") from error
+    try:
+        site = Site.model_validate({**given, "path": path})
+    except ValidationError as error:
+        faults = [_explain(fault) for fault in error.errors()]
+        raise ConfigError("\n".join([f"{path}: {len(faults)} to mend", *faults])) from error
+    site = _absolute(site, path.parent)
+    faults = [f"  {key}: no such file: {file}" for key, file in _must_exist(site) if not file.is_file()]
+    if faults:
+        raise ConfigError("\n".join([f"{path}: {len(faults)} to mend", *faults]))
+    return site
+
+
+def _absolute(site: Site, folder: Path) -> Site:
+    """Return the site with every path taken from the folder of its file."""
+
+    def settle(section: Section) -> Section:
+        changed: dict[str, Any] = {}
+        for key in type(section).model_fields:
+            value = getattr(section, key)
+            if isinstance(value, Path):
+                changed[key] = folder / value.expanduser()
+            elif isinstance(value, Section):
+                changed[key] = settle(value)
+            elif isinstance(value, tuple):
+                changed[key] = tuple(settle(one) for one in value)
+        return section.model_copy(update=changed)
+
+    settled = settle(site)
+    assert isinstance(settled, Site)  # noqa: S101 - settle keeps the type
+    return settled
+
+
+def _must_exist(site: Site) -> list[tuple[str, Path]]:
+    files = [(f"sop[{i}].file", sop.file) for i, sop in enumerate(site.sop)]
+    if site.map.pop:
+        files.append(("map.pop", site.map.pop))
+    if isinstance(site.reference.scans, Path):
+        files.append(("reference.scans", site.reference.scans))
+    return files
+
+
+def _explain(fault: Any) -> str:  # noqa: ANN401 - pydantic's ErrorDetails, a plain dict
+    place = ".".join(str(part) for part in fault["loc"] if not _is_union_branch(part))
+    if fault["type"] == "extra_forbidden":
+        known = _keys_beside(fault["loc"])
+        near = difflib.get_close_matches(str(fault["loc"][-1]), known, n=1, cutoff=0.5)
+        hint = f"did you mean {near[0]!r}?" if near else f"known here: {', '.join(known)}"
+        return f"  {place}: no such key; {hint}"
+    if fault["type"] == "missing":
+        return f"  {place}: missing"
+    message = fault["msg"].removeprefix("Value error, ")
+    shown = "" if isinstance(fault["input"], dict) else f" (given: {fault['input']!r})"
+    return f"  {place or 'site file'}: {message}{shown}"
+
+
+def _is_union_branch(part: object) -> bool:
+    """Tell pydantic's own path steps (class names, constraint names) from keys of the file."""
+    return isinstance(part, str) and (not part.islower() or "[" in part or part in {"float", "int", "path"})
+
+
+def _keys_beside(place: tuple[str | int, ...]) -> list[str]:
+    model: type[BaseModel] = SiteFile
+    for part in place[:-1]:
+        field = model.model_fields.get(str(part)) if isinstance(part, str) else None
+        found = _models_in(field.annotation) if field else []
+        model = found[0] if found else model
+    return [field.alias or name for name, field in model.model_fields.items() if name != "path"]
+
+
+def _models_in(annotation: Any) -> list[type[BaseModel]]:  # noqa: ANN401 - any type annotation
+    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+        return [annotation]
+    return [model for part in getattr(annotation, "__args__", ()) for model in _models_in(part)]

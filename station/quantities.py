@@ -1,0 +1,167 @@
+"""The words of the science: frozen dataclasses of arrays, with the unit in every name.
+
+Angles are radians, lengths metres, temperatures °C, pressures hPa. `(n,)` counts shots, `(ny, nx)` cells
+with row 0 in the north.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+Floats = NDArray[np.float64]
+Floats32 = NDArray[np.float32]
+Ints = NDArray[np.int64]
+Bools = NDArray[np.bool_]
+
+
+@dataclass(frozen=True)
+class Shots:
+    """A block of laser echoes, in the frame of the scan (scanner's own or map).
+
+    `time_s` is in the scan's own time base, the one its inclination log uses; None where the scan has none.
+    """
+
+    x_m: Floats  # (n,)
+    y_m: Floats  # (n,)
+    z_m: Floats  # (n,)
+    time_s: Floats | None  # (n,)
+
+    def __len__(self) -> int:
+        """Return how many echoes there are."""
+        return len(self.x_m)
+
+
+@dataclass(frozen=True)
+class Scanner:
+    """What the instrument's maker and the papers say of it."""
+
+    model: str
+    wavelength_um: float
+    beam_divergence_rad: float  # full angle at 1/e²
+    exit_diameter_m: float
+    range_sigma_m: float  # of one shot
+    angle_resolution_rad: float  # full width of one encoder step
+    inclination_sigma_rad: float  # of one sample of the inclination log
+    range_max_m: float
+
+
+@dataclass(frozen=True)
+class InclinationLog:
+    """The lean of the scanner as its sensor wrote it, about 1 Hz, uncleaned.
+
+    Roll turns about the scanner's x axis, pitch about its y axis.
+    """
+
+    time_s: Floats  # (k,) in the scan's time base
+    roll_rad: Floats  # (k,)
+    pitch_rad: Floats  # (k,)
+
+
+@dataclass(frozen=True)
+class HeadTrack:
+    """Where the scanner's head looked when: azimuth about the scanner's z axis, counter-clockwise from x."""
+
+    time_s: Floats  # (k,) increasing
+    azimuth_rad: Floats  # (k,) unwrapped
+
+
+@dataclass(frozen=True)
+class Tilt:
+    """The lean to apply to each shot, by time in the scan's time base."""
+
+    time_s: Floats  # (k,) increasing
+    roll_rad: Floats  # (k,)
+    pitch_rad: Floats  # (k,)
+
+
+@dataclass(frozen=True)
+class Air:
+    """The air at the scanner."""
+
+    temperature_c: float
+    pressure_hpa: float
+    humidity_pct: float
+
+
+@dataclass(frozen=True)
+class WeatherLog:
+    """The station's weather record; NaN where a value is missing."""
+
+    time_utc_s: Floats  # (k,) seconds since 1970, increasing
+    temperature_c: Floats  # (k,)
+    pressure_hpa: Floats  # (k,)
+    humidity_pct: Floats  # (k,)
+
+
+@dataclass(frozen=True)
+class Grid:
+    """A fixed raster, pixel-exact: `west_m` and `north_m` are outer edges, rows run from north to south."""
+
+    west_m: float
+    north_m: float
+    cell_m: float
+    nx: int
+    ny: int
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Rows and columns."""
+        return (self.ny, self.nx)
+
+    @property
+    def x_m(self) -> Floats:
+        """Eastings of the cell centres (nx,)."""
+        return np.asarray(self.west_m + (np.arange(self.nx) + 0.5) * self.cell_m, dtype=np.float64)
+
+    @property
+    def y_m(self) -> Floats:
+        """Northings of the cell centres (ny,), descending."""
+        return np.asarray(self.north_m - (np.arange(self.ny) + 0.5) * self.cell_m, dtype=np.float64)
+
+
+@dataclass(frozen=True)
+class Shared:
+    """What all points of a scan have in common and nobody knows exactly (EQUATIONS 6.1).
+
+    `estimate` and `covariance` are in the parameters' own units, given by `units`.
+    """
+
+    names: tuple[str, ...]
+    units: tuple[str, ...]
+    estimate: Floats  # (p,)
+    covariance: Floats  # (p, p)
+
+
+@dataclass(frozen=True)
+class Surface:
+    """One scan on the grid.
+
+    `change_m` is the mean residual to the reference, NaN where there is none; everything is NaN (or zero
+    points) where the scan saw nothing. `random_variance_m2` is of the cell's mean and averages out over
+    cells; what does not average out is in `shared`, through the sensitivities of EQUATIONS 6.1.
+    """
+
+    grid: Grid
+    elevation_m: Floats  # (ny, nx)
+    change_m: Floats32  # (ny, nx)
+    count: NDArray[np.int32]  # (ny, nx)
+    spread_m: Floats32  # (ny, nx) standard deviation of the points in the cell
+    random_variance_m2: Floats32  # (ny, nx)
+
+
+@dataclass(frozen=True)
+class Reference:
+    """The master surface that change is measured from.
+
+    `elevation_m` is NaN where it is unknown. `position_m` is the scanner's (easting, northing, height).
+    """
+
+    grid: Grid
+    version: str
+    elevation_m: Floats  # (ny, nx)
+    random_variance_m2: Floats32  # (ny, nx)
+    shared: Shared | None  # None: given from outside, its shared errors unknown
+    scan_ids: tuple[str, ...]
