@@ -1,0 +1,1 @@
+"""The shell around the science: clocks, threads, signals, disks; knows no equation."""

@@ -1,0 +1,353 @@
+"""What was done with each scan: one row a name, in SQLite, never lost.
+
+WAL with `synchronous=FULL`: what a method has returned from survives `kill -9` and a power cut (STORE.md).
+Beside it, `set_aside/<name>.txt` tells a person why a scan could not be used.
+"""
+
+from __future__ import annotations
+
+import json
+import sqlite3
+import time
+from contextlib import contextmanager
+from dataclasses import dataclass, fields
+from enum import StrEnum
+from typing import TYPE_CHECKING, Self
+
+from station.errors import StoreError
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterable, Iterator, Mapping
+    from pathlib import Path
+
+FIRST_PAUSE_S = 30.0  # before a scan that was not ready is tried again; doubled each time
+LONGEST_PAUSE_S = 3600.0
+
+_SCHEMA = """
+CREATE TABLE IF NOT EXISTS scan (
+    name TEXT PRIMARY KEY,
+    size INTEGER NOT NULL,
+    mtime_ns INTEGER NOT NULL,
+    state TEXT NOT NULL CHECK (state IN ('waiting', 'stored', 'set_aside', 'later')),
+    waits_for TEXT NOT NULL DEFAULT '',
+    reason TEXT NOT NULL DEFAULT '',
+    sha256 TEXT,
+    outcome TEXT CHECK (outcome IN ('stored', 'set_aside')),
+    verdict TEXT,
+    epoch TEXT,
+    start_utc_s REAL,
+    revision INTEGER,
+    reference TEXT,
+    figures TEXT NOT NULL DEFAULT '{}',
+    attempts INTEGER NOT NULL DEFAULT 0,
+    next_try_utc_s REAL,
+    seen_utc_s REAL NOT NULL,
+    changed_utc_s REAL NOT NULL
+) STRICT;
+CREATE INDEX IF NOT EXISTS scan_by_sha256 ON scan (sha256);
+"""
+
+
+class State(StrEnum):
+    """Where a scan stands."""
+
+    WAITING = "waiting"
+    STORED = "stored"
+    SET_ASIDE = "set_aside"
+    LATER = "later"
+
+
+@dataclass(frozen=True)
+class Entry:
+    """One row of the journal.
+
+    `waits_for` says why it is not done yet. `sha256`, `outcome` and `reason` are of the content that was
+    last judged; `epoch` (relative to the data folder), `start_utc_s`, `revision`, `reference` and `figures`
+    of the content that was last stored: they stay when a worse file comes under the same name.
+    """
+
+    name: str
+    size: int
+    mtime_ns: int
+    state: State
+    waits_for: str
+    reason: str
+    sha256: str | None
+    outcome: State | None
+    verdict: str | None
+    epoch: str | None
+    start_utc_s: float | None
+    revision: int | None
+    reference: str | None
+    figures: dict[str, float | str]
+    attempts: int
+    next_try_utc_s: float | None
+    seen_utc_s: float
+    changed_utc_s: float
+
+
+_COLUMNS = ", ".join(field.name for field in fields(Entry))
+
+
+class Journal:
+    """The rows, and the words of the service for changing them.
+
+    Every method is one commit and raises StoreError where the file cannot be written or read. One thread, one
+    writing process (`lock.only_writer`); `read_only=True` is for everyone else, at any moment.
+    """
+
+    def __init__(
+        self, path: Path, *, read_only: bool = False, now_s: Callable[[], float] = time.time
+    ) -> None:
+        self._path = path
+        self._notes = path.parent / "set_aside"
+        self._now_s = now_s
+        try:
+            self._rows = _open_to_read(path) if read_only else _open_to_write(path)
+        except sqlite3.Error as error:
+            raise StoreError(_explain(path, error)) from error
+
+    def close(self) -> None:
+        """Let go of the file."""
+        self._rows.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    # ---- what the inbox says
+
+    def seen(self, files: Iterable[tuple[str, int, int, str]]) -> None:
+        """Note (name, size, mtime_ns, what it waits for) of scans that are new, or of which one has changed.
+
+        A new name, or another size or mtime under a known one, puts the scan to `waiting`; what was last
+        judged and stored under that name stays known.
+        """
+        now_s = self._now_s()
+        with self._commit():
+            self._rows.executemany(
+                """INSERT INTO scan (name, size, mtime_ns, waits_for, state, seen_utc_s, changed_utc_s)
+                   VALUES (?, ?, ?, ?, 'waiting', ?, ?)
+                   ON CONFLICT (name) DO UPDATE SET
+                       waits_for = excluded.waits_for, changed_utc_s = excluded.changed_utc_s,
+                       state = 'waiting', size = excluded.size, mtime_ns = excluded.mtime_ns,
+                       attempts = 0, next_try_utc_s = NULL
+                   WHERE size != excluded.size OR mtime_ns != excluded.mtime_ns
+                       OR (state = 'waiting' AND waits_for != excluded.waits_for)""",
+                [(*file, now_s, now_s) for file in files],
+            )
+
+    def gone(self, names: Iterable[str]) -> None:
+        """Forget scans that left the inbox before they were done; what is stored of them stays stored."""
+        listed = [(name,) for name in names]
+        with self._commit():
+            self._rows.executemany(
+                """UPDATE scan SET state = 'stored', waits_for = '',
+                   reason = 'left the inbox before it was done again'
+                   WHERE name = ? AND state IN ('waiting', 'later') AND epoch IS NOT NULL""",
+                listed,
+            )
+            self._rows.executemany(
+                "DELETE FROM scan WHERE name = ? AND state IN ('waiting', 'later')", listed
+            )
+
+    # ---- what the worker says
+
+    def stored(
+        self,
+        name: str,
+        *,
+        sha256: str,
+        verdict: str,
+        epoch: str,
+        start_utc_s: float,
+        revision: int,
+        reference: str | None = None,
+        reason: str = "",
+        figures: Mapping[str, float | str] | None = None,
+    ) -> None:
+        """Note that a scan is in the store; `figures` are what `station status` shows of it."""
+        with self._commit():
+            self._change(
+                name,
+                state=State.STORED,
+                outcome=State.STORED,
+                sha256=sha256,
+                verdict=verdict,
+                waits_for="",
+                reason=reason,
+                epoch=epoch,
+                start_utc_s=start_utc_s,
+                revision=revision,
+                reference=reference,
+                figures=json.dumps(dict(figures or {})),
+                attempts=0,
+                next_try_utc_s=None,
+            )
+        self._note(name).unlink(missing_ok=True)
+
+    def set_aside(self, name: str, reason: str, *, sha256: str | None = None) -> None:
+        """Note that a scan cannot be used, and why, here and in `set_aside/<name>.txt`."""
+        try:
+            self._notes.mkdir(exist_ok=True)
+            self._note(name).write_text(f"{name}: {reason}\n", encoding="utf-8")
+        except OSError as error:
+            raise StoreError(f"{self._notes}: the reason for {name} cannot be written: {error}") from error
+        with self._commit():
+            self._change(
+                name,
+                state=State.SET_ASIDE,
+                outcome=State.SET_ASIDE,
+                sha256=sha256,
+                waits_for="",
+                reason=reason,
+                attempts=0,
+                next_try_utc_s=None,
+            )
+
+    def later(self, name: str, reason: str) -> float:
+        """Note that a scan is not ready; return the pause until the next try [s]: 30 s, doubled up to 1 h."""
+        entry = self.entry(name)
+        attempts = entry.attempts + 1 if entry else 1
+        pause_s = min(FIRST_PAUSE_S * 2.0 ** min(attempts - 1, 20), LONGEST_PAUSE_S)
+        with self._commit():
+            self._change(
+                name,
+                state=State.LATER,
+                waits_for=reason,
+                attempts=attempts,
+                next_try_utc_s=self._now_s() + pause_s,
+            )
+        return pause_s
+
+    def same_again(self, name: str, sha256: str) -> bool:
+        """Tell whether this name was already judged with these bytes; if so it is back where it was."""
+        entry = self.entry(name)
+        if entry is None or entry.outcome is None or entry.sha256 != sha256:
+            return False
+        with self._commit():
+            self._change(name, state=entry.outcome, waits_for="", attempts=0, next_try_utc_s=None)
+        return True
+
+    def again(self, names: Iterable[str]) -> None:
+        """Have scans done again although their bytes are the same."""
+        now_s = self._now_s()
+        with self._commit():
+            self._rows.executemany(
+                """UPDATE scan SET state = 'waiting', outcome = NULL, attempts = 0,
+                   waits_for = 'to be done again', next_try_utc_s = NULL, changed_utc_s = ? WHERE name = ?""",
+                [(now_s, name) for name in names],
+            )
+
+    # ---- what everyone may ask
+
+    def entry(self, name: str) -> Entry | None:
+        """Return the row of one name."""
+        return next(iter(self._select("WHERE name = ?", name)), None)
+
+    def stored_as(self, sha256: str) -> Entry | None:
+        """Return the stored row with this content, whatever its name."""
+        return next(iter(self._select("WHERE sha256 = ? AND state = 'stored' LIMIT 1", sha256)), None)
+
+    def waiting(self) -> list[Entry]:
+        """Return the rows that are neither stored nor set aside, by name."""
+        return self._select("WHERE state IN ('waiting', 'later') ORDER BY name")
+
+    def last_stored(self) -> Entry | None:
+        """Return the row that was stored last."""
+        rows = self._select("WHERE state = 'stored' ORDER BY changed_utc_s DESC, start_utc_s DESC LIMIT 1")
+        return next(iter(rows), None)
+
+    def rows(self, state: State | None = None) -> list[Entry]:
+        """Return all rows, or those of one state, by name."""
+        if state is None:
+            return self._select("ORDER BY name")
+        return self._select("WHERE state = ? ORDER BY name", state)
+
+    def counts(self) -> dict[str, int]:
+        """Return how many scans stand where; every state is named."""
+        with self._faults():
+            found = dict(self._rows.execute("SELECT state, count(*) FROM scan GROUP BY state").fetchall())
+        return {state.value: int(found.get(state.value, 0)) for state in State}
+
+    # ---- SQLite
+
+    def _note(self, name: str) -> Path:
+        return self._notes / f"{name}.txt"
+
+    def _change(self, name: str, **values: object) -> None:
+        """Set columns of a row, which is made where the scan was never seen (`station process`)."""
+        values["changed_utc_s"] = self._now_s()
+        self._rows.execute(
+            """INSERT OR IGNORE INTO scan (name, size, mtime_ns, state, seen_utc_s, changed_utc_s)
+               VALUES (?, -1, -1, 'waiting', ?, ?)""",
+            (name, values["changed_utc_s"], values["changed_utc_s"]),
+        )
+        columns = ", ".join(f"{column} = ?" for column in values)
+        self._rows.execute(f"UPDATE scan SET {columns} WHERE name = ?", (*values.values(), name))  # noqa: S608 - own words
+
+    def _select(self, where: str, *values: object) -> list[Entry]:
+        with self._faults():
+            found = self._rows.execute(f"SELECT {_COLUMNS} FROM scan {where}", values).fetchall()  # noqa: S608 - own words
+        return [_entry(row) for row in found]
+
+    @contextmanager
+    def _commit(self) -> Iterator[None]:
+        with self._faults():
+            self._rows.execute("BEGIN IMMEDIATE")
+            try:
+                yield
+                self._rows.execute("COMMIT")
+            except BaseException:
+                if self._rows.in_transaction:
+                    self._rows.execute("ROLLBACK")
+                raise
+
+    @contextmanager
+    def _faults(self) -> Iterator[None]:
+        try:
+            yield
+        except sqlite3.Error as error:
+            raise StoreError(_explain(self._path, error)) from error
+
+
+def _open_to_write(path: Path) -> sqlite3.Connection:
+    rows = sqlite3.connect(path, isolation_level=None, timeout=20.0)
+    try:
+        rows.execute("PRAGMA journal_mode = WAL")
+        rows.execute("PRAGMA synchronous = FULL")
+        rows.executescript(_SCHEMA)
+    except sqlite3.Error:
+        rows.close()
+        raise
+    return rows
+
+
+def _open_to_read(path: Path) -> sqlite3.Connection:
+    """Open without leaving a file behind: a reader of another user must not own the writer's side files."""
+    if not path.exists():
+        empty = sqlite3.connect(":memory:", isolation_level=None)
+        empty.executescript(_SCHEMA)
+        return empty
+    side = path.with_name(path.name + "-wal")
+    quiet = not side.exists() or side.stat().st_size == 0
+    mode = "immutable=1" if quiet else "mode=ro"
+    return sqlite3.connect(f"{path.absolute().as_uri()}?{mode}", uri=True, isolation_level=None, timeout=20.0)
+
+
+def _explain(path: Path, error: sqlite3.Error) -> str:
+    if isinstance(error, sqlite3.OperationalError):
+        return f"{path}: the journal cannot be used: {error}: is the disk full, or the folder another user's?"
+    return (
+        f"{path}: the journal is damaged: {error}: move it and its -wal away, it is made anew from the epochs"
+    )
+
+
+def _entry(row: tuple[object, ...]) -> Entry:
+    values = dict(zip((field.name for field in fields(Entry)), row, strict=True))
+    values["state"] = State(str(values["state"]))
+    values["outcome"] = State(str(values["outcome"])) if values["outcome"] else None
+    values["figures"] = json.loads(str(values["figures"]))
+    return Entry(**values)  # type: ignore[arg-type] # the schema is STRICT: each column has its type
