@@ -7,6 +7,7 @@ with row 0 in the north.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from enum import IntFlag
 
 import numpy as np
 from numpy.typing import NDArray
@@ -150,6 +151,31 @@ class Surface:
     count: NDArray[np.int32]  # (ny, nx)
     spread_m: Floats32  # (ny, nx) standard deviation of the points in the cell
     random_variance_m2: Floats32  # (ny, nx)
+
+
+class Quality(IntFlag):
+    """What to know of a cell before using it."""
+
+    FEW_POINTS = 1  # fewer than three
+    HIGH_INCIDENCE = 2  # the beam grazes the surface at more than 80°
+    OUTSIDE_REFERENCE = 4  # seen, but there is nothing to measure its change from
+    STABLE_GROUND = 8
+    CHANGE_SIGNIFICANT = 16  # at the 95 % level
+
+
+@dataclass(frozen=True)
+class Measurement:
+    """What a scan says of the surface, and how sure that is; all (ny, nx).
+
+    `uncertainty_m` is of a single cell, everything included; `random_uncertainty_m` is the part of it that
+    averages out. `terms` holds the budget of the scan's own heights term by term, where asked for.
+    """
+
+    surface: Surface
+    uncertainty_m: Floats32
+    random_uncertainty_m: Floats32
+    quality: NDArray[np.uint8]  # bits of Quality
+    terms: dict[str, Floats32]
 
 
 @dataclass(frozen=True)

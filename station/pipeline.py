@@ -1,0 +1,335 @@
+"""One scan from shots to surface: the whole science on one page."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from station.quantities import (
+    Bools,
+    Floats,
+    Floats32,
+    Grid,
+    Measurement,
+    Quality,
+    Reference,
+    Scanner,
+    Shared,
+    Shots,
+    Surface,
+    Tilt,
+)
+from station.science import change, shared, uncertainty
+from station.science.air import AirCorrection, refraction_rise
+from station.science.grid import Gridder, slope_sampling_variance
+from station.science.pose import Frame, lean
+from station.science.terrain import smooth_gradient
+
+BAND_ROWS = 128  # the cells that are looked at together: what a store chunk is high
+MARGIN_ROWS = 4  # rows beyond a band that its smoothed gradient looks at
+FEW_POINTS = 3
+HIGH_INCIDENCE_COS = float(np.cos(np.radians(80.0)))
+
+Points = tuple[Floats, Floats, Floats]
+
+
+@dataclass(frozen=True)
+class Setup:
+    """What stays the same from scan to scan.
+
+    `position_m` is the scanner's place on the map, None where a map-frame scan does not tell it.
+    """
+
+    scanner: Scanner
+    grid: Grid
+    position_m: tuple[float, float, float] | None
+    min_points: int = 1
+    published_budget: bool = False  # Voordendag et al. (2023) instead of the corrected form
+    store_terms: bool = False
+
+
+@dataclass(frozen=True)
+class Pose:
+    """How the scanner stood: the way to the map, and the lean on top of it. No frame: already on the map."""
+
+    frame: Frame | None
+    tilt: Tilt | None
+    air: AirCorrection | None
+
+
+def survey(
+    blocks: Iterable[Shots],
+    setup: Setup,
+    pose: Pose,
+    reference: Reference | None,
+    progress: Callable[[], None],
+) -> Gridder:
+    """Lay every shot of a scan on the grid."""
+    gridder = Gridder(setup.grid, reference, setup.position_m[2] if setup.position_m else 0.0)
+    for shots in blocks:
+        lay(gridder, to_map(shots, pose), setup)
+        progress()
+    return gridder
+
+
+def to_map(shots: Shots, pose: Pose) -> Points:
+    """Easting, northing and height of shots [m]: lean, SOP, air, map."""
+    points = shots.x_m, shots.y_m, shots.z_m
+    if pose.frame is None:
+        return points
+    if pose.tilt is not None and shots.time_s is not None:
+        points = lean(points, shots.time_s, pose.tilt)
+    x_m, y_m, z_m = (
+        row[0] * points[0] + row[1] * points[1] + row[2] * points[2] for row in pose.frame.to_local[:3, :3]
+    )
+    if pose.air is not None:
+        scale = pose.air.range_scale(z_m)
+        x_m, y_m, z_m = x_m * scale, y_m * scale, z_m * scale
+        z_m -= refraction_rise(np.hypot(x_m, y_m), pose.air.refraction_coefficient)
+    return pose.frame.to_map((x_m, y_m, z_m))
+
+
+def lay(gridder: Gridder, points: Points, setup: Setup) -> None:
+    """Add points on the map to the grid, as residuals to the reference where it is known."""
+    inside, column, row = gridder.cells(points[0], points[1])
+    x_m, y_m, z_m = (axis[inside] for axis in points)
+    cell = gridder.flat(column, row)
+    below_m = np.full(len(cell), gridder.datum_m)
+    variance_m2 = np.zeros(len(cell))
+    if gridder.ground is not None:
+        known = gridder.known(cell)
+        under_m, east, north = gridder.ground.under(column[known], row[known])
+        below_m[known] = under_m
+        if setup.position_m is not None:
+            view = View.of((x_m[known], y_m[known], z_m[known]), setup.position_m, east, north)
+            variance_m2[known] = view.shot_variance(setup)
+        else:
+            variance_m2[known] = setup.scanner.range_sigma_m**2
+    gridder.add(cell, z_m - below_m, variance_m2)
+
+
+@dataclass(frozen=True)
+class View:
+    """How shots or cells (n,) are seen from the scanner."""
+
+    offset_m: Points
+    east_gradient: Floats
+    north_gradient: Floats
+    range_m: Floats
+    cos_incidence: Floats
+    cos_slope: Floats
+
+    @classmethod
+    def of(cls, points: Points, position_m: tuple[float, float, float], east: Floats, north: Floats) -> View:
+        """See map points with the given terrain gradients from a position."""
+        x_m, y_m, z_m = (axis - origin for axis, origin in zip(points, position_m, strict=True))
+        range_m = np.maximum(np.sqrt(x_m**2 + y_m**2 + z_m**2), 1e-3)
+        cos_slope = 1 / np.sqrt(1 + east**2 + north**2)
+        cos_incidence = np.abs(z_m - east * x_m - north * y_m) * cos_slope / range_m
+        return cls((x_m, y_m, z_m), east, north, range_m, np.minimum(cos_incidence, 1.0), cos_slope)
+
+    def shot_variance(self, setup: Setup) -> Floats:
+        """Random variance of one shot's height [m²], by the budget the site asks for."""
+        seen = self.range_m, self.cos_incidence, self.cos_slope
+        if setup.published_budget:
+            sin_rise = self.offset_m[2] / self.range_m
+            return uncertainty.shot_variance_voordendag(*seen, sin_rise, setup.scanner)
+        return uncertainty.shot_variance(*seen, setup.scanner)
+
+
+def measure(
+    gridder: Gridder, setup: Setup, unknown: Shared | None, reference: Reference | None
+) -> Measurement:
+    """Turn the sums of a scan into surface, change and their uncertainty.
+
+    `unknown` is what all points of the scan share; None where there is nothing to derive it from.
+    """
+    grid, ground = setup.grid, gridder.ground
+    mean_m = gridder.mean_residual()
+    mean_m[gridder.count.reshape(grid.shape) < setup.min_points] = np.nan
+    known = ground.known if ground is not None else np.zeros(grid.shape, bool)
+    change_m = np.where(known, mean_m, np.nan).astype(np.float32)
+    elevation_m = mean_m + (
+        np.where(known, ground.datum_m + ground.rise_m.astype(np.float64), gridder.datum_m)
+        if ground is not None
+        else gridder.datum_m
+    )
+    surface = Surface(
+        grid=grid,
+        elevation_m=elevation_m,
+        change_m=change_m,
+        count=gridder.count.reshape(grid.shape),
+        spread_m=gridder.spread(),
+        random_variance_m2=gridder.random_variance(),
+    )
+    result = Measurement(
+        surface=surface,
+        uncertainty_m=np.full(grid.shape, np.nan, np.float32),
+        random_uncertainty_m=np.full(grid.shape, np.nan, np.float32),
+        quality=np.zeros(grid.shape, np.uint8),
+        terms={
+            name: np.full(grid.shape, np.nan, np.float32)
+            for name in ("sigma_instrument", "sigma_atmosphere", "sigma_geometry")
+            if setup.store_terms and setup.position_m is not None
+        },
+    )
+    for band in _bands(grid):
+        _judge(result, band, setup, unknown, reference, known)
+    return result
+
+
+def _bands(grid: Grid) -> Iterator[slice]:
+    for first in range(0, grid.ny, BAND_ROWS):
+        yield slice(first, min(first + BAND_ROWS, grid.ny))
+
+
+def _judge(
+    result: Measurement,
+    band: slice,
+    setup: Setup,
+    unknown: Shared | None,
+    reference: Reference | None,
+    known: Bools,
+) -> None:
+    """Fill uncertainty, terms and quality of a band of rows."""
+    surface = result.surface
+    seen = np.isfinite(surface.elevation_m[band])
+    if not seen.any():
+        return
+    count = surface.count[band][seen].astype(np.float64)
+    measured = known[band][seen]
+    random_m2 = surface.random_variance_m2[band][seen].astype(np.float64)
+    shared_m2 = np.zeros(len(count))
+    flags = np.where(count < FEW_POINTS, Quality.FEW_POINTS, 0) | np.where(
+        measured, 0, Quality.OUTSIDE_REFERENCE
+    )
+    if setup.position_m is None:
+        spread_m2 = np.nan_to_num(surface.spread_m[band][seen].astype(np.float64)) ** 2
+        random_m2 = np.maximum(spread_m2, setup.scanner.range_sigma_m**2) / count
+    else:
+        view = _view(surface, band, seen, setup.position_m)
+        tan_slope = np.sqrt(np.maximum(view.cos_slope**-2 - 1, 0.0))
+        sampling_m2 = np.where(measured, 0.0, slope_sampling_variance(setup.grid.cell_m, tan_slope, count))
+        random_m2 = np.where(measured, random_m2, view.shot_variance(setup) / count + sampling_m2)
+        flags |= np.where(view.cos_incidence < HIGH_INCIDENCE_COS, Quality.HIGH_INCIDENCE, 0)
+        if unknown is not None and not setup.published_budget:
+            felt = shared.sensitivities(
+                shared.basis(setup.grid, setup.position_m),
+                view.offset_m,
+                view.east_gradient,
+                view.north_gradient,
+            )
+            shared_m2 = felt.variance(_covariance_of_change(unknown, reference))
+            for name, values in _terms(view, count, sampling_m2, felt, unknown, setup).items():
+                _put(result.terms, name, band, seen, values)
+        elif setup.published_budget:
+            for name, values in _terms_voordendag(view, setup).items():
+                _put(result.terms, name, band, seen, values)
+    if reference is not None:
+        random_m2 += np.where(measured, np.nan_to_num(reference.random_variance_m2[band][seen]), 0.0)
+    sigma_m = np.sqrt(random_m2 + shared_m2).astype(np.float32)
+    change_m = surface.change_m[band][seen]
+    flags |= np.where(change.significant(change_m, sigma_m), Quality.CHANGE_SIGNIFICANT, 0)
+    result.uncertainty_m[band][seen] = sigma_m
+    result.random_uncertainty_m[band][seen] = np.sqrt(random_m2)
+    result.quality[band][seen] = flags
+
+
+def _put(terms: dict[str, Floats32], name: str, band: slice, seen: Bools, values: Floats) -> None:
+    if name in terms:
+        terms[name][band][seen] = values
+
+
+def _view(surface: Surface, band: slice, seen: Bools, position_m: tuple[float, float, float]) -> View:
+    """See the cells of a band with the smoothed gradients of their own surface."""
+    first = max(band.start - MARGIN_ROWS, 0)
+    around = surface.elevation_m[first : band.stop + MARGIN_ROWS] - position_m[2]
+    east, north = (
+        np.nan_to_num(g[band.start - first :][: seen.shape[0]][seen].astype(np.float64))
+        for g in smooth_gradient(around, surface.grid.cell_m)
+    )
+    row, column = np.nonzero(seen)
+    points = surface.grid.x_m[column], surface.grid.y_m[band][row], surface.elevation_m[band][seen]
+    return View.of(points, position_m, east, north)
+
+
+def _covariance_of_change(unknown: Shared, reference: Reference | None) -> Floats:
+    """Covariance of what scan and reference do not share with each other."""
+    if reference is None or reference.shared is None:
+        return unknown.covariance
+    return unknown.covariance + reference.shared.covariance
+
+
+def _terms(
+    view: View,
+    count: Floats,
+    sampling_m2: Floats,
+    felt: shared.Sensitivities,
+    unknown: Shared,
+    setup: Setup,
+) -> dict[str, Floats]:
+    """Split the budget of a scan's own heights [m]: instrument, atmosphere, geometry.
+
+    Their squares add up to the variance as long as no adjustment has tied the shared parameters together.
+    """
+    if not setup.store_terms:
+        return {}
+    by_air = np.array([name.startswith(("range_scale", "refraction")) for name in unknown.names])
+    range_m2 = uncertainty.range_variance(view.cos_incidence, view.cos_slope, setup.scanner.range_sigma_m)
+    beam_m2 = uncertainty.angle_variance(
+        view.range_m, view.cos_incidence, view.cos_slope, uncertainty.sigma_angle(setup.scanner)
+    )
+    air_m2, other_m2 = (
+        felt.variance(np.where(np.outer(of, of), unknown.covariance, 0.0)) for of in (by_air, ~by_air)
+    )
+    return {
+        "sigma_instrument": np.sqrt(range_m2 / count + other_m2),
+        "sigma_atmosphere": np.sqrt(air_m2),
+        "sigma_geometry": np.sqrt(beam_m2 / count + sampling_m2),
+    }
+
+
+def _terms_voordendag(view: View, setup: Setup) -> dict[str, Floats]:
+    """Split the published budget [m], for one point as in the paper's figures."""
+    constant_m = np.full_like(view.range_m, uncertainty.SIGMA_ATMOSPHERE_VOORDENDAG_M)
+    return {
+        "sigma_instrument": uncertainty.sigma_instrument(view.range_m),
+        "sigma_atmosphere": constant_m,
+        "sigma_geometry": uncertainty.sigma_geometry(
+            view.range_m,
+            view.cos_incidence,
+            view.cos_slope,
+            view.offset_m[2] / view.range_m,
+            setup.scanner.beam_divergence_rad,
+        ),
+    }
+
+
+def master(
+    provisional: Reference, surveys: list[tuple[Measurement, Shared | None]], version: str
+) -> Reference:
+    """Average scans measured from a provisional surface into the surface that change is measured from.
+
+    Cells weigh by points; what the scans share among their own points is taken as independent from scan to
+    scan, so the mean of n scans has an nth of their mean covariance.
+    """
+    points = np.zeros(provisional.grid.shape)
+    total_m, total_m2 = np.zeros_like(points), np.zeros_like(points)
+    for measured, _ in surveys:
+        count = np.where(np.isfinite(measured.surface.change_m), measured.surface.count, 0)
+        points += count
+        total_m += count * np.nan_to_num(measured.surface.change_m.astype(np.float64))
+        total_m2 += count.astype(np.float64) ** 2 * np.nan_to_num(measured.surface.random_variance_m2)
+    seen = points > 0
+    elevation_m = np.full(points.shape, np.nan)
+    variance_m2 = np.full(points.shape, np.nan, np.float32)
+    elevation_m[seen] = provisional.elevation_m[seen] + total_m[seen] / points[seen]
+    variance_m2[seen] = total_m2[seen] / points[seen] ** 2
+    told = [unknown for _, unknown in surveys if unknown is not None]
+    common = None
+    if told:
+        covariance = sum((one.covariance for one in told), np.zeros_like(told[0].covariance)) / len(told) ** 2
+        common = Shared(told[0].names, told[0].units, np.zeros(len(covariance)), covariance)
+    return Reference(provisional.grid, version, elevation_m, variance_m2, common, provisional.scan_ids)

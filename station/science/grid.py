@@ -1,0 +1,99 @@
+"""Streaming cell statistics on a fixed grid, the same for any order and any split of the points."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from station.science.terrain import Ground, ground
+
+if TYPE_CHECKING:
+    from station.quantities import Bools, Floats, Floats32, Grid, Ints, Reference
+
+# Sums are of multiples of 2^-20 m (and m²), so that adding float64 is exact up to 2^33 and the order in
+# which points come cannot matter.
+QUANTUM = 2.0**20
+
+
+class Gridder:
+    """Counts, sums and squares per cell, of heights above the reference surface where there is one.
+
+    Averaging residuals rather than heights removes the sampling error of a slope, which is 0.11 m for one or
+    two points in a 1 m cell at 25° (EQUATIONS 4.10), and the loss of change that goes with it (6.5).
+    """
+
+    def __init__(self, grid: Grid, reference: Reference | None, datum_m: float) -> None:
+        """Heights in cells without reference are taken from `datum_m`, to keep their sums small."""
+        self.grid = grid
+        self.ground: Ground | None = ground(reference) if reference else None
+        self.datum_m = float(np.round(datum_m))
+        cells = grid.nx * grid.ny
+        self.count = np.zeros(cells, np.int32)
+        self._residual = np.zeros(cells)
+        self._square = np.zeros(cells)
+        self._variance = np.zeros(cells)
+
+    def cells(self, x_m: Floats, y_m: Floats) -> tuple[Bools, Floats, Floats]:
+        """Tell which points (n,) lie on the grid, and the column and row of those, in fractions of cells.
+
+        A point on an edge belongs to the cell east or south of it.
+        """
+        column = (x_m - self.grid.west_m) / self.grid.cell_m
+        row = (self.grid.north_m - y_m) / self.grid.cell_m
+        inside = (column >= 0) & (column < self.grid.nx) & (row >= 0) & (row < self.grid.ny)
+        return inside, column[inside], row[inside]
+
+    def flat(self, column: Floats, row: Floats) -> Ints:
+        """Index (n,) of each point's cell in the flattened grid."""
+        return row.astype(np.int64) * self.grid.nx + column.astype(np.int64)
+
+    def known(self, cell: Ints) -> Bools:
+        """Tell for each point (n,) whether the reference is known in its cell."""
+        if self.ground is None:
+            return np.zeros(len(cell), bool)
+        return np.asarray(self.ground.known.ravel()[cell])
+
+    def add(self, cell: Ints, residual_m: Floats, variance_m2: Floats) -> None:
+        """Add points (n,): their cell, height above reference or datum, and random variance."""
+        residual_m = np.rint(residual_m * QUANTUM) / QUANTUM
+        np.add.at(self.count, cell, 1)
+        np.add.at(self._residual, cell, residual_m)
+        np.add.at(self._square, cell, np.rint(residual_m**2 * QUANTUM) / QUANTUM)
+        np.add.at(self._variance, cell, np.rint(variance_m2 * QUANTUM) / QUANTUM)
+
+    def mean_residual(self) -> Floats:
+        """Mean height above reference or datum (ny, nx) [m], NaN in empty cells.
+
+        Source: Hartzell et al. (2015), Eq. 11, of residuals (EQUATIONS 6.5).
+        """
+        mean_m = np.full(len(self.count), np.nan)
+        np.divide(self._residual, self.count, out=mean_m, where=self.count > 0)
+        return mean_m.reshape(self.grid.shape)
+
+    def spread(self) -> Floats32:
+        """Standard deviation of the points in each cell (ny, nx) [m], NaN for fewer than two."""
+        spread_m = np.full(len(self.count), np.nan, np.float32)
+        several = np.flatnonzero(self.count > 1)
+        count = self.count[several].astype(np.float64)
+        centred = self._square[several] - self._residual[several] ** 2 / count
+        spread_m[several] = np.sqrt(np.maximum(centred, 0.0) / (count - 1))
+        return spread_m.reshape(self.grid.shape)
+
+    def random_variance(self) -> Floats32:
+        """Random variance of each cell's mean (ny, nx) [m²], NaN in empty cells.
+
+        Source: Hartzell et al. (2015), Eq. 12.
+        """
+        variance_m2 = np.full(len(self.count), np.nan, np.float32)
+        seen = np.flatnonzero(self.count)
+        variance_m2[seen] = self._variance[seen] / self.count[seen].astype(np.float64) ** 2
+        return variance_m2.reshape(self.grid.shape)
+
+
+def slope_sampling_variance(cell_m: float, tan_slope: Floats, count: Floats) -> Floats:
+    """Variance of a plain mean because the points do not sit at the middle of a sloping cell [m²].
+
+    Source: EQUATIONS 4.10; in none of the papers.
+    """
+    return np.asarray((cell_m * tan_slope) ** 2 / (12 * count))

@@ -1,0 +1,119 @@
+"""Slope, aspect and normals of a surface, and its height between the cells."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import ndimage
+
+from station.quantities import Bools, Floats, Floats32, Grid, Reference
+
+
+def normal(slope_rad: Floats, aspect_rad: Floats) -> Floats:
+    """Unit normal (n, 3) (east, north, up); aspect is the downslope direction, clockwise from north.
+
+    Source: Voordendag et al. (2023), Eq. 14.
+    """
+    across = np.sin(slope_rad)
+    return np.stack([np.sin(aspect_rad) * across, np.cos(aspect_rad) * across, np.cos(slope_rad)], axis=-1)
+
+
+def smooth_gradient(
+    elevation_m: Floats | Floats32, cell_m: float, cells: float = 1.5
+) -> tuple[Floats32, Floats32]:
+    """Rise per metre eastward and northward (ny, nx) of a surface smoothed over `cells` (one sigma).
+
+    NaN in the surface is passed over (normalised convolution of the differences); NaN where nothing is near.
+    """
+    east = (elevation_m[:, 2:] - elevation_m[:, :-2]) / np.float32(2 * cell_m)
+    north = (elevation_m[:-2] - elevation_m[2:]) / np.float32(2 * cell_m)
+    return (
+        _smooth(np.pad(east, ((0, 0), (1, 1)), constant_values=np.nan), cells),
+        _smooth(np.pad(north, ((1, 1), (0, 0)), constant_values=np.nan), cells),
+    )
+
+
+def _smooth(values: Floats | Floats32, cells: float) -> Floats32:
+    known = np.isfinite(values)
+    weight = ndimage.gaussian_filter(known.astype(np.float32), cells, truncate=2.0, mode="constant")
+    total = ndimage.gaussian_filter(
+        np.where(known, values, 0).astype(np.float32), cells, truncate=2.0, mode="constant"
+    )
+    return np.where(weight > 1e-3, total / np.maximum(weight, 1e-3), np.float32(np.nan)).astype(np.float32)
+
+
+@dataclass(frozen=True)
+class Ground:
+    """The reference surface as shots look it up: bilinear between cell centres.
+
+    `rise_m` (ny, nx) is height above `datum_m`, extended by one ring of cells beyond what is `known`.
+    """
+
+    grid: Grid
+    datum_m: float
+    rise_m: Floats32
+    known: Bools
+
+    def under(self, column: Floats, row: Floats) -> tuple[Floats, Floats, Floats]:
+        """Height [m] and rise per metre eastward and northward below points (n,).
+
+        Points are in cells from the north-west corner of the grid; the answer means something where the
+        point's own cell is known.
+        """
+        u = np.clip(column - 0.5, 0.0, self.grid.nx - 1.000001)
+        v = np.clip(row - 0.5, 0.0, self.grid.ny - 1.000001)
+        left, top = u.astype(np.intp), v.astype(np.intp)
+        u -= left
+        v -= top
+        flat = self.rise_m.ravel()
+        first = top * self.grid.nx + left
+        right = (left < self.grid.nx - 1).astype(np.intp)
+        below = np.where(top < self.grid.ny - 1, self.grid.nx, 0)
+        nw, ne = flat[first].astype(np.float64), flat[first + right].astype(np.float64)
+        sw, se = flat[first + below].astype(np.float64), flat[first + below + right].astype(np.float64)
+        north_side, south_side = nw + (ne - nw) * u, sw + (se - sw) * u
+        height_m = self.datum_m + north_side + (south_side - north_side) * v
+        east = ((ne - nw) * (1 - v) + (se - sw) * v) / self.grid.cell_m
+        north = (north_side - south_side) / self.grid.cell_m
+        return height_m, east, north
+
+
+def ground(reference: Reference) -> Ground:
+    """Prepare a master surface for looking up."""
+    known = np.isfinite(reference.elevation_m)
+    datum_m = float(np.round(np.mean(reference.elevation_m, where=known))) if known.any() else 0.0
+    rise_m = extend((reference.elevation_m - datum_m).astype(np.float32))
+    return Ground(reference.grid, datum_m, np.nan_to_num(rise_m, copy=False), known)
+
+
+def extend(values: Floats32) -> Floats32:
+    """Return a surface (ny, nx) with one more ring of cells around what is known.
+
+    Each is the mean of what its neighbours' slopes lead to, or of the neighbours where they have no slope:
+    between the centres of a known cell and its unknown neighbour a shot still needs a height.
+    """
+    ny, nx = values.shape
+    known = np.isfinite(values)
+    row, column = np.nonzero(ndimage.binary_dilation(known, np.ones((3, 3), bool)) & ~known)
+    total, sloped, flat, near = (np.zeros(len(row)) for _ in range(4))
+    for down in (-1, 0, 1):
+        for right in (-1, 0, 1):
+            if down == right == 0:
+                continue
+            first = _at(values, row + down, column + right, ny, nx)
+            second = _at(values, row + 2 * down, column + 2 * right, ny, nx)
+            has_slope, has_one = np.isfinite(first + second), np.isfinite(first)
+            total += np.where(has_slope, 2 * first - second, 0)
+            sloped += has_slope
+            flat += np.where(has_one, first, 0)
+            near += has_one
+    extended = values.copy()
+    extended[row, column] = np.where(sloped > 0, total / np.maximum(sloped, 1), flat / np.maximum(near, 1))
+    return extended
+
+
+def _at(values: Floats32, row: np.ndarray, column: np.ndarray, ny: int, nx: int) -> Floats:
+    inside = (row >= 0) & (row < ny) & (column >= 0) & (column < nx)
+    found = values[np.clip(row, 0, ny - 1), np.clip(column, 0, nx - 1)].astype(np.float64)
+    return np.where(inside, found, np.nan)
