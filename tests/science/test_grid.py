@@ -1,0 +1,85 @@
+"""Streaming statistics on the grid."""
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from station.quantities import Grid, Reference
+from station.science.grid import Gridder, slope_sampling_variance
+
+GRID = Grid(west_m=100.0, north_m=250.0, cell_m=2.5, nx=8, ny=6)
+
+
+def scatter(seed=0, count=500):
+    rng = np.random.default_rng(seed)
+    x_m, y_m = rng.uniform(98, 122, count), rng.uniform(233, 252, count)
+    return x_m, y_m, rng.normal(3000, 0.5, count)
+
+
+def gridded(points, reference=None, splits=()):
+    gridder = Gridder(GRID, reference, 3000.0)
+    for x_m, y_m, z_m in zip(*(np.split(axis, splits) for axis in points), strict=True):
+        inside, column, row = gridder.cells(x_m, y_m)
+        z_m = z_m[inside]  # noqa: PLW2901 - only what lies on the grid
+        gridder.add(gridder.flat(column, row), z_m - gridder.datum_m, np.full(len(z_m), 0.04))
+    return gridder
+
+
+def test_mean_count_and_spread_against_plain_loops():
+    x_m, y_m, z_m = scatter()
+    gridder = gridded((x_m, y_m, z_m))
+    for row in range(GRID.ny):
+        for column in range(GRID.nx):
+            north, west = GRID.north_m - row * GRID.cell_m, GRID.west_m + column * GRID.cell_m
+            inside = (x_m >= west) & (x_m < west + 2.5) & (y_m <= north) & (y_m > north - 2.5)
+            heights = z_m[inside]
+            assert gridder.count.reshape(GRID.shape)[row, column] == len(heights)
+            assert gridder.mean_residual()[row, column] + 3000 == pytest.approx(heights.mean(), abs=1e-6)
+            if len(heights) > 1:
+                assert gridder.spread()[row, column] == pytest.approx(heights.std(ddof=1), abs=1e-4)
+            assert gridder.random_variance()[row, column] == pytest.approx(0.04 / len(heights), rel=1e-4)
+
+
+@settings(max_examples=50, deadline=None)
+@given(st.permutations(range(60)), st.lists(st.integers(0, 60), max_size=5))
+def test_order_and_blocks_change_nothing_at_all(order, splits):
+    points = np.array(scatter(seed=1, count=60))
+    plain = gridded(points)
+    mixed = gridded(points[:, order], splits=sorted(splits))
+    assert np.array_equal(plain.mean_residual(), mixed.mean_residual(), equal_nan=True)
+    assert np.array_equal(plain.spread(), mixed.spread(), equal_nan=True)
+    assert np.array_equal(plain.random_variance(), mixed.random_variance(), equal_nan=True)
+
+
+def test_edges_belong_to_the_cell_east_and_south():
+    gridder = gridded((np.array([100.0, 102.5, 120.0]), np.array([250.0, 247.5, 240.0]), np.full(3, 3000.0)))
+    assert np.argwhere(gridder.count.reshape(GRID.shape)).tolist() == [[0, 0], [1, 1]]
+
+
+def test_residuals_to_a_sloping_reference_lose_the_sampling_error():
+    """EQUATIONS 4.10: a plain mean of points on a slope scatters by c tan s / sqrt(12 n)."""
+    rng = np.random.default_rng(5)
+    grid = Grid(0.0, 200.0, 1.0, 200, 200)
+    slope = math.tan(math.radians(25))
+    x_m, y_m = rng.uniform(0, 200, (2, 60_000))
+    z_m = slope * x_m
+    truth = slope * np.broadcast_to(grid.x_m, grid.shape)
+    flat = Gridder(grid, None, 0.0)
+    with_reference = Gridder(
+        grid, Reference(grid, "1", truth, np.zeros(grid.shape, np.float32), None, ()), 0.0
+    )
+    for gridder in (flat, with_reference):
+        _, column, row = gridder.cells(x_m, y_m)
+        below = gridder.ground.under(column, row)[0] if gridder.ground else 0.0
+        gridder.add(gridder.flat(column, row), z_m - below, np.zeros(len(z_m)))
+    count = flat.count.reshape(grid.shape)
+    single = count == 2
+    plain = (flat.mean_residual() - truth)[single].std()
+    assert plain == pytest.approx(
+        math.sqrt(slope_sampling_variance(1.0, np.array(slope), np.array(2))), rel=0.05
+    )
+    interior = single[:, 1:-1]
+    assert np.abs(with_reference.mean_residual()[:, 1:-1][interior]).max() < 1e-3

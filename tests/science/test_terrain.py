@@ -1,0 +1,55 @@
+"""Slope and normals, and the reference between its cells."""
+
+import math
+
+import numpy as np
+import pytest
+
+from station.quantities import Grid, Reference
+from station.science import beam, change, terrain
+
+GRID = Grid(0.0, 50.0, 1.0, 40, 50)
+
+
+def plane(east, north):
+    x_m, y_m = np.meshgrid(GRID.x_m, GRID.y_m)
+    return 2000 + east * x_m + north * y_m
+
+
+def test_normal_of_slope_and_aspect_is_that_of_the_gradient():
+    """V-14 against the gradient form (-dz/dx, -dz/dy, 1): a slope that falls towards the south-east."""
+    slope, aspect = math.radians(30.0), math.radians(135.0)
+    east, north = -math.tan(slope) * math.sin(aspect), -math.tan(slope) * math.cos(aspect)
+    told = terrain.normal(np.array(slope), np.array(aspect))
+    gradient_form = np.array([-east, -north, 1.0])
+    assert told == pytest.approx(gradient_form / np.linalg.norm(gradient_form))
+    assert beam.cos_incidence(np.array([0.0, 0.0, -1.0]), told) == pytest.approx(math.cos(slope))
+
+
+def test_smooth_gradient_of_a_plane_with_holes():
+    surface = plane(0.4, -0.1)
+    surface[10:14, 20:23] = np.nan
+    east, north = terrain.smooth_gradient(surface, 1.0)
+    seen = np.isfinite(east)
+    assert seen[11, 21]
+    assert east[seen] == pytest.approx(0.4, abs=1e-4)
+    assert north[seen] == pytest.approx(-0.1, abs=1e-4)
+
+
+def test_ground_is_bilinear_between_centres_and_goes_on_to_the_edge():
+    surface = plane(0.5, 0.25)
+    surface[20:, 30:] = np.nan
+    ground = terrain.ground(Reference(GRID, "1", surface, np.zeros(GRID.shape, np.float32), None, ()))
+    x_m, y_m = np.random.default_rng(0).uniform([[0.5], [0.5]], [[39.5], [49.5]], (2, 4000))
+    known = ground.known[(50 - y_m).astype(int), x_m.astype(int)]
+    height_m, east, north = ground.under(x_m[known], 50 - y_m[known])
+    assert height_m == pytest.approx(2000 + 0.5 * x_m[known] + 0.25 * y_m[known], abs=1e-4)
+    assert east == pytest.approx(0.5, abs=1e-3)
+    assert north == pytest.approx(0.25, abs=1e-3)
+
+
+def test_significance_at_95_percent():
+    sigma = np.full(100_000, 0.1, np.float32)
+    noise = np.random.default_rng(1).normal(0, 0.1, 100_000).astype(np.float32)
+    assert change.significant(noise, sigma).mean() == pytest.approx(0.05, abs=0.003)
+    assert not change.significant(np.array([np.nan], np.float32), sigma[:1])[0]
