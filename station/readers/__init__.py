@@ -1,0 +1,1 @@
+"""Bytes to arrays: knows formats, knows no equation."""

@@ -1,0 +1,239 @@
+"""LAS and LAZ scans: 1.0 to 1.4, all point formats, by laspy and lazrs."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, ClassVar, Self
+
+import numpy as np
+from laspy import DecompressionSelection, LasHeader, LasReader, LazBackend
+from numpy.typing import NDArray
+
+from station.errors import NotReadyError, ScanError
+from station.quantities import Floats, HeadTrack, Shots
+from station.readers.las_layout import Layout, read_layout
+from station.readers.scan import WEEK_S, ScanHeader, foreign_code
+
+NEEDED = DecompressionSelection.base().decompress_z().decompress_gps_time()  # heeded in formats 6 and up
+BLOCKS_AT_ONCE = 8  # decoded together, a chunk a core; conversion still goes block by block, in the cache
+LONGEST_SCAN_S = 86_400.0
+GLANCE = 16  # points looked at in one place
+FEW_CHUNKS = 20  # with fewer, chunk starts are too far apart to follow the head
+
+Records = NDArray[np.void]
+
+
+class LasScan:
+    """A LAS/LAZ file whose headers agree with each other and with its size (see `ScanReader`).
+
+    Holds no open file between calls; a file that is replaced meanwhile gives NotReadyError.
+    """
+
+    suffixes: ClassVar[tuple[str, ...]] = (".las", ".laz")
+
+    def __init__(self, path: Path, *, range_max_m: float | None = None) -> None:
+        self.path = path
+        self._range_max_m = range_max_m
+        with foreign_code("cannot be opened"), path.open("rb") as file:
+            status = os.fstat(file.fileno())
+            self._identity = _identity(status)
+            self._layout = read_layout(file, status.st_size)
+            file.seek(0)
+            crs_wkt = _crs_wkt(LasHeader.read_from(file))
+        self._time_range_s: tuple[float, float] | None = None
+        low_m, high_m = self._layout.low_m, self._layout.high_m
+        self.header = ScanHeader(
+            point_count=self._layout.count,
+            low_m=(float(low_m[0]), float(low_m[1]), float(low_m[2])),
+            high_m=(float(high_m[0]), float(high_m[1]), float(high_m[2])),
+            has_time=self._layout.has_time,
+            standard_time=self._layout.standard_time,
+            crs_wkt=crs_wkt,
+            software=self._layout.software,
+        )
+        nearest_m = float(np.linalg.norm(np.clip(0.0, low_m, high_m)))
+        if range_max_m is not None and nearest_m > range_max_m:
+            raise ScanError(
+                f"the nearest point is {nearest_m:,.0f} m from the origin, beyond scanner.range_max_m ="
+                f' {range_max_m:g}: not in the scanner\'s own frame; is it scans.frame = "map"?'
+            )
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *fault: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Nothing is open between calls."""
+
+    def blocks(self, size: int = 50_000) -> Iterator[Shots]:
+        """Give all echoes in the order of the file, `size` at a time; memory does not grow with the file.
+
+        Raises ScanError where fewer points are there than the header counts, or one lies outside the header's
+        box, farther than `range_max_m`, or has no finite time.
+        """
+        timed = self.time_range_s() is not None
+        check = _Check(self._layout, self._range_max_m)
+        left = self._layout.count
+        with self._points(LazBackend.LazrsParallel) as reader:
+            while left:
+                records = _read(reader, min(left, BLOCKS_AT_ONCE * size))
+                left -= len(records)
+                for first in range(0, len(records), size):
+                    yield check.shots(records[first : first + size], timed=timed)
+
+    def time_range_s(self) -> tuple[float, float] | None:
+        """Give the earliest and latest time stamp [s], from the chunks' starts and the end of the file.
+
+        None where the format has no time or all stamps are zero.
+        """
+        if not self._layout.has_time:
+            return None
+        if self._time_range_s is None:
+            check = _Check(self._layout, self._range_max_m)
+            for _ in self._glances(50, check):
+                pass  # the check keeps the time it has seen
+            self._time_range_s = (check.earliest_s, check.latest_s)
+        return self._time_range_s if any(self._time_range_s) else None
+
+    def head_track(self, samples: int = 200) -> HeadTrack | None:
+        """Give where the head looked when, from a few points in about `samples` places.
+
+        Decodes no more than chunk starts where there are enough of them. None for a scan without time or not
+        in the scanner's frame.
+        """
+        if self._range_max_m is None or self.time_range_s() is None:
+            return None
+        chunks = self._layout.chunk_starts
+        if chunks is not None and len(chunks) < FEW_CHUNKS:
+            places = self.blocks(max(self._layout.count // samples, GLANCE))
+        else:
+            places = self._glances(samples, _Check(self._layout, self._range_max_m))
+        seen = []
+        for shots in places:
+            assert shots.time_s is not None  # noqa: S101 - asked for
+            few = slice(GLANCE)
+            seen.append((shots.time_s[few].mean(), shots.x_m[few].sum(), shots.y_m[few].sum()))
+        time_s, x_m, y_m = np.array(seen).T
+        time_s, first = np.unique(time_s, return_index=True)
+        if len(time_s) < 2:
+            return None
+        return HeadTrack(time_s, np.unwrap(np.arctan2(y_m[first], x_m[first])))
+
+    def _glances(self, samples: int, check: _Check) -> Iterator[Shots]:
+        """Give a few echoes each from about `samples` places, the first and the last of the file included."""
+        count = self._layout.count
+        starts = self._layout.chunk_starts
+        if starts is None:
+            starts = np.linspace(0, count - 1, samples).astype(np.int64)
+        chosen = starts[np.linspace(0, len(starts) - 1, min(samples, len(starts))).astype(np.int64)]
+        with self._points(LazBackend.Lazrs) as reader:
+            for start in np.unique([*chosen, max(count - GLANCE, 0)]).tolist():
+                with foreign_code(f"corrupt near point {start:,}"):
+                    reader.seek(start)
+                yield check.shots(_read(reader, min(GLANCE, count - start)), timed=True)
+
+    @contextmanager
+    def _points(self, backend: LazBackend) -> Iterator[LasReader]:
+        """Open the points, at the first; passes see the file that was checked or NotReadyError."""
+        with foreign_code("cannot be opened again"):
+            file = self.path.open("rb")
+        with file:
+            if _identity(os.fstat(file.fileno())) != self._identity:
+                raise NotReadyError("has changed since it was opened")
+            with foreign_code("cannot be opened again"):
+                reader = LasReader(
+                    file,
+                    closefd=False,
+                    laz_backend=backend,
+                    read_evlrs=False,
+                    decompression_selection=NEEDED,
+                )
+            yield reader
+
+
+class _Check:
+    """Turns records into shots and holds them against what the header says."""
+
+    def __init__(self, layout: Layout, range_max_m: float | None) -> None:
+        self._layout = layout
+        slack_m = layout.scale  # writers round the box before or after the points
+        self._low_m, self._high_m = layout.low_m - slack_m, layout.high_m + slack_m
+        self._scanner_frame = range_max_m is not None
+        # the box is enough where its farthest corner is in range
+        corner_m = np.linalg.norm(np.maximum(np.abs(layout.low_m), np.abs(layout.high_m)))
+        self._range_max_m = range_max_m if range_max_m is not None and corner_m > range_max_m else None
+        self._first_s: float | None = None
+        self.earliest_s = np.inf
+        self.latest_s = -np.inf
+
+    def shots(self, records: Records, *, timed: bool) -> Shots:
+        """Give the echoes of some records, contiguous (n,), with their times if `timed`."""
+        x_m, y_m, z_m = (self._coordinate(records, axis) for axis in range(3))
+        if self._range_max_m is not None:
+            farthest_m = float(np.sqrt((x_m * x_m + y_m * y_m + z_m * z_m).max()))
+            if farthest_m > self._range_max_m:
+                raise ScanError(
+                    f"an echo {farthest_m:,.0f} m away, beyond scanner.range_max_m = {self._range_max_m:g}:"
+                    " corrupt, or another unit, frame or scanner than the site file says"
+                )
+        return Shots(x_m, y_m, z_m, self._times(records) if timed else None)
+
+    def _coordinate(self, records: Records, axis: int) -> Floats:
+        values = records["XYZ"[axis]] * self._layout.scale[axis]
+        values += self._layout.offset[axis]
+        if values.min() < self._low_m[axis] or values.max() > self._high_m[axis]:
+            raise ScanError(
+                f"corrupt, or written by a faulty program: {'xyz'[axis]} = {values.min():.3f} to"
+                f" {values.max():.3f} m leaves the header's {self._layout.low_m[axis]:.3f} to"
+                f" {self._layout.high_m[axis]:.3f} m"
+            )
+        return np.asarray(values)
+
+    def _times(self, records: Records) -> Floats:
+        time_s = np.ascontiguousarray(records["gps_time"], dtype=np.float64)
+        low_s, high_s = float(time_s.min()), float(time_s.max())
+        if not (np.isfinite(low_s) and np.isfinite(high_s)):
+            raise ScanError("a time stamp is not a number: corrupt, or written by a faulty program")
+        if self._first_s is None:
+            self._first_s = float(time_s[0])
+        if low_s < self._first_s - WEEK_S / 2 and low_s >= 0 and self._first_s < WEEK_S:
+            time_s = np.where(time_s < self._first_s - WEEK_S / 2, time_s + WEEK_S, time_s)
+            low_s, high_s = float(time_s.min()), float(time_s.max())
+        self.earliest_s, self.latest_s = min(self.earliest_s, low_s), max(self.latest_s, high_s)
+        if self._scanner_frame and self.latest_s - self.earliest_s > LONGEST_SCAN_S:
+            raise ScanError(
+                f"time stamps from {self.earliest_s:.3f} to {self.latest_s:.3f} s, more than a day apart:"
+                " corrupt, or several scans in one file"
+            )
+        return time_s
+
+
+def _read(reader: LasReader, count: int) -> Records:
+    """Decode the next `count` records; they must be there."""
+    before = reader.points_read
+    with foreign_code(f"corrupt after point {before:,}"):
+        records: Any = reader.read_points(count).array
+    if len(records) != count:
+        raise ScanError(
+            f"cut off: {before + len(records):,} of {reader.header.point_count:,} points are there"
+        )
+    return np.asarray(records)
+
+
+def _crs_wkt(header: LasHeader) -> str | None:
+    """Give the coordinate system a file names, None where it names none that can be understood."""
+    try:
+        with foreign_code("coordinate system"):
+            crs = header.parse_crs()
+            return None if crs is None else crs.to_wkt()
+    except ScanError:
+        return None
+
+
+def _identity(status: os.stat_result) -> tuple[int, int, int, int]:
+    return status.st_dev, status.st_ino, status.st_size, status.st_mtime_ns
