@@ -1,0 +1,164 @@
+"""Write what a station's scanner, sensor, weather mast and owner would leave in its folder."""
+
+from __future__ import annotations
+
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+
+import laspy
+import numpy as np
+
+from station.quantities import Floats, Grid, InclinationLog, WeatherLog
+from station.simulation.air import SCANNER_SETTING
+from station.simulation.scan import Recorded
+from station.simulation.scenario import Scenario
+from station.simulation.truth import CRS, HEIGHT_M, LATITUDE_DEG, LONGITUDE_DEG
+
+NAME = "%y%m%d_%H%M%S"  # RIEGL's habit: start of the scan in UTC
+SCALE_M = 0.00025  # RIEGL's habit
+
+
+def stem(scenario: Scenario, scan: int) -> str:
+    """Return the name of one scan, without a suffix."""
+    return f"{datetime.fromtimestamp(scenario.scan_start_utc_s(scan), UTC):{NAME}}"
+
+
+def write_scan(path: Path, scan: Recorded, start_utc_s: float) -> None:
+    """Write LAZ 1.4, point format 6: scanner's frame, scanner's seconds, one echo a shot."""
+    header = laspy.LasHeader(point_format=6, version="1.4")
+    header.scales = np.full(3, SCALE_M)
+    header.offsets = np.zeros(3)
+    header.system_identifier = "station simulate"
+    header.generating_software = "station simulate"
+    header.creation_date = datetime.fromtimestamp(start_utc_s, UTC).date()
+    las = laspy.LasData(header)
+    las.x, las.y, las.z = scan.x_m, scan.y_m, scan.z_m
+    las.gps_time = scan.time_s
+    las.intensity = np.rint(65535 * scan.brightness).astype(np.uint16)
+    las.return_number = np.ones(len(scan.x_m), dtype=np.uint8)
+    las.number_of_returns = np.ones(len(scan.x_m), dtype=np.uint8)
+    las.write(path)
+
+
+def write_inclination(path: Path, log: InclinationLog) -> None:
+    """Write the inclination log as RIEGL's tools do: seconds, degrees at 0.001°."""
+    rows = np.stack((log.time_s, np.degrees(log.roll_rad), np.degrees(log.pitch_rad)), axis=1)
+    with path.open("w", encoding="ascii", newline="\n") as out:
+        out.write("Time,Roll,Pitch\n")
+        np.savetxt(out, rows, fmt=("%.4f", "%.3f", "%.3f"), delimiter=",")
+
+
+def write_weather(path: Path, log: WeatherLog) -> None:
+    """Write a Campbell TOA5 table: four header lines, CRLF, times in UTC without a zone."""
+    lines = [
+        '"TOA5","082_im_hinteren_eis","CR3000","11527","CR3000.Std.29","CPU:simulated.CR3","6258","LowFreq"',
+        '"TIMESTAMP","RECORD","TAact_2m_Avg","RHact_2m_Avg","Pact","batt_volt_Avg"',
+        '"TS","RN","C","%","mbar","V"',
+        '"","","Avg","Avg","Smp","Avg"',
+    ]
+    rows = zip(log.time_utc_s, log.temperature_c, log.humidity_pct, log.pressure_hpa, strict=True)
+    for number, (time_s, temperature_c, humidity_pct, pressure_hpa) in enumerate(rows):
+        moment = datetime.fromtimestamp(float(time_s), UTC)
+        measured = f"{temperature_c:.4f},{humidity_pct:.3f},{pressure_hpa:.4f}"
+        lines.append(f'"{moment:%Y-%m-%d %H:%M:%S}",{number},{measured},12.6')
+    path.write_text("\r\n".join([*lines, ""]), encoding="ascii", newline="")
+
+
+def write_sop(path: Path, matrix: Floats) -> None:
+    """Write a 4 x 4 matrix as text."""
+    np.savetxt(path, matrix, fmt="%.16f", header="scanner's frame to east-north-up at the mark")
+
+
+def write_site(path: Path, scenario: Scenario, grid: Grid) -> None:
+    """Write the commented site file of the simulated station."""
+    told = SITE.format(
+        first=stem(scenario, 0),
+        sop_from=f"{scenario.start.astimezone(UTC) - timedelta(hours=1):%Y-%m-%dT%H:%M:%SZ}",
+        crs=CRS,
+        latitude=LATITUDE_DEG,
+        longitude=LONGITUDE_DEG,
+        height=HEIGHT_M,
+        west=grid.west_m,
+        south=grid.north_m - grid.ny * grid.cell_m,
+        east=grid.west_m + grid.nx * grid.cell_m,
+        north=grid.north_m,
+        cell=grid.cell_m,
+        divergence=scenario.beam_divergence_mrad,
+        range_sigma=max(scenario.range_noise_m, 0.001),
+        sensor_sigma=max(scenario.log_noise_deg, 0.0005),
+        reach=scenario.range_max_m,
+        reference=scenario.reference_scans,
+    )
+    path.write_text(told + (WEATHER if scenario.air else ""), encoding="utf-8")
+
+
+SITE = """\
+# A simulated station. What is true there stands in truth.nc, which the station never reads.
+# Paths are relative to this file; units stand in the key names.
+
+[station]
+id = "simulated"
+name = "Simulated Hintereisferner"
+institution = "station simulate"
+data = "data"                      # everything the station writes lies below
+
+[scans]
+inbox = "inbox"                    # scans and their logs arrive here and are never changed
+name = "%y%m%d_%H%M%S"             # start of the scan in UTC
+frame = "scanner"                  # points are in the scanner's own frame
+settle_s = 2                       # a file that has not grown for so long is whole
+expected_every_s = 3600
+
+[scanner]
+model = "riegl-vz-6000"            # the rest of the instrument follows from the model
+beam_divergence_mrad = {divergence}
+range_sigma_m = {range_sigma}
+inclination_sigma_deg = {sensor_sigma}
+range_max_m = {reach}
+
+[[sop]]
+from = {sop_from}        # the newest that has begun applies
+file = "sop.dat"                   # scanner's frame to east-north-up at the mark below
+scan = "{first}"            # the scan it was solved from: its lean is the zero of relative lean
+
+[map]
+crs = "{crs}"
+origin = {{ latitude_deg = {latitude}, longitude_deg = {longitude}, height_m = {height} }}
+vertical_datum = "WGS 84 ellipsoid"
+
+[grid]
+bounds_m = {{ west = {west}, south = {south}, east = {east}, north = {north} }}
+cell_m = {cell}
+min_points = 1
+
+[inclination]
+suffix = "-incl.txt"               # <scan>-incl.txt beside each scan
+required = true
+wait_s = 900
+filter = "blackman"
+cutoff_hz = "auto"                 # from the log's own spectrum
+mode = "relative"                  # the SOP already holds the lean of its own scan
+
+[adjustment]
+method = "none"
+
+[uncertainty]
+model = "rigorous"
+
+[reference]
+scans = {reference}                          # change is measured from the mean of the first so many
+"""
+
+WEATHER = f"""
+[weather]
+file = "weather.dat"
+format = "toa5"
+max_age_s = 3600
+utc_offset_h = 0
+columns = {{ temperature_c = "TAact_2m_Avg", humidity_pct = "RHact_2m_Avg", pressure_hpa = "Pact" }}
+
+[air]                              # what the scanner turned travel times into ranges with
+scanner_setting = {{ temperature_c = {SCANNER_SETTING.temperature_c}, \
+pressure_hpa = {SCANNER_SETTING.pressure_hpa}, humidity_pct = {SCANNER_SETTING.humidity_pct} }}
+scanner_corrects = true
+"""

@@ -1,0 +1,159 @@
+"""What a simulated station lives through: one magnitude per error, zero switches it off."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from datetime import UTC, datetime
+
+from station.errors import ConfigError
+
+# Everything without_errors() sets to zero: what stands between a shot and the point it should give.
+ERRORS = (
+    "air", "refraction_sigma", "refraction_azimuth_sigma", "lapse_sigma_k_per_m", "path_temperature_sigma_k",
+    "lean_drift_deg", "lean_within_scan_deg", "sway_deg", "line_jitter_deg", "heading_deg", "position_m",
+    "range_bias_m", "range_noise_m", "beam_divergence_mrad", "echo_loss",
+    "log_noise_deg", "log_bias_deg", "log_cyclic_deg", "log_cyclic_change", "log_clock_s",
+    "melt_m_per_h", "snowfall_m", "avalanche_m",
+)  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Scenario:
+    """A station, its hours, and the size of everything that goes wrong there.
+
+    Errors are standard deviations unless they say otherwise; angles are degrees, as in a site file.
+    """
+
+    seed: int = 1
+    start: datetime = datetime(2025, 7, 15, tzinfo=UTC)
+    hours: int = 24  # one scan each
+
+    # the place
+    size: float = 1.0  # of the valley against the real one; the heights shrink with it
+    terrain_step_m: float = 2.0
+    roughness_m: float = 0.10
+    roughness_length_m: float = 80.0  # shortest wavelength of the roughness
+    cell_m: float = 5.0
+    extent_m: tuple[float, float, float, float] = (-3700.0, 480.0, 1100.0, 2780.0)  # W S E N, times size
+
+    # the scanner's work
+    lines: int = 2700
+    shots_per_line: int = 1000
+    scan_s: float = 900.0
+    azimuth_deg: tuple[float, float] = (97.0, 245.0)  # first and last, about the scanner's z axis from its x
+    elevation_deg: tuple[float, float] = (-31.0, 9.0)  # lowest and highest, from the scanner's xy plane
+    incidence_max_deg: float = 85.0  # no echo beyond
+    range_max_m: float = 6000.0
+    reference_scans: int = 8
+
+    # the mount, all of it contained in the SOP
+    mount_roll_deg: float = 2.1
+    mount_pitch_deg: float = -1.3
+    mount_heading_deg: float = -75.0  # of the scanner's x axis, counter-clockwise from east
+    mount_position_m: tuple[float, float, float] = (0.42, -0.31, 1.63)  # east, north, up of the mark
+
+    # the air; without it light is as fast as the scanner assumes, nothing bends, and there is no weather log
+    air: bool = True
+    refraction_sigma: float = 0.07  # of k from scan to scan, about what temperature and pressure tell
+    refraction_azimuth_sigma: float = 0.02  # of k over azimuth within a scan
+    lapse_sigma_k_per_m: float = 0.0015
+    path_temperature_sigma_k: float = 0.7  # of the air over the glacier against the thermometer's
+
+    # how the scanner moves
+    lean_drift_deg: float = 0.004  # over hours; against the first scan 1.4 times that
+    lean_within_scan_deg: float = 0.0018  # over minutes
+    sway_deg: float = 0.0010  # over seconds
+    line_jitter_deg: float = 0.0008  # of each line's elevation; no sensor sees it
+    heading_deg: float = 0.0010  # of each scan
+    position_m: float = 0.002  # of each scan, each axis
+
+    # how it measures
+    range_bias_m: float = 0.004  # of each scan
+    range_noise_m: float = 0.010
+    beam_divergence_mrad: float = 0.12
+    echo_loss: float = 0.02  # share of shots without an echo
+
+    # its inclination sensor
+    log_noise_deg: float = 0.008
+    log_bias_deg: float = 0.0015  # of each scan
+    log_cyclic_deg: float = 0.035  # amplitude of the wave over one turn
+    log_cyclic_change: float = 0.15  # share by which the wave changes from scan to scan
+    log_clock_s: float = 2.0  # offset of each scan's log, cut at 5 s
+
+    # how the surface changes
+    melt_m_per_h: float = 0.0  # of ice at the end of the tongue; none 450 m (times size) higher
+    snowfall_m: float = 0.0  # in all, between the hours below
+    snow_hours: tuple[float, float] = (4.0, 12.0)
+    avalanche_m: float = 0.0  # height of the deposit
+    avalanche_hour: float = 15.0
+
+    def __post_init__(self) -> None:
+        """Refuse what cannot be simulated."""
+        if self.hours < 1 or self.lines < 2 or self.shots_per_line < 2:
+            raise ConfigError("a simulated station needs at least 1 hour, 2 lines and 2 shots a line")
+        if not 0 < self.scan_s <= 3000:
+            raise ConfigError("scan_s must lie above 0 and leave time before the next hour (3000)")
+        if self.start.tzinfo is None:
+            raise ConfigError("start needs a time zone: datetime(..., tzinfo=UTC)")
+
+    def without_errors(self) -> Scenario:
+        """Return the same station with every error and every change switched off."""
+        return replace(self, **{name: type(getattr(self, name))(0) for name in ERRORS})
+
+    @property
+    def start_utc_s(self) -> float:
+        """Start of the first scan, seconds since 1970."""
+        return self.start.timestamp()
+
+    @property
+    def beam_sigma_rad(self) -> float:
+        """Scatter of the echo's true direction in each angle: a quarter of the full 1/e² width."""
+        return self.beam_divergence_mrad * 1e-3 / 4
+
+    def scan_start_utc_s(self, scan: int) -> float:
+        """Start of one scan, seconds since 1970."""
+        return self.start_utc_s + 3600.0 * scan
+
+    @property
+    def azimuth_rad(self) -> tuple[float, float]:
+        """First and last azimuth of the head."""
+        return math.radians(self.azimuth_deg[0]), math.radians(self.azimuth_deg[1])
+
+
+def demo(hours: int = 24, seed: int = 1) -> Scenario:
+    """Give a day of hourly scans with every error, melt on the tongue and an avalanche in hour 15."""
+    return Scenario(
+        seed=seed,
+        hours=hours,
+        terrain_step_m=5.0,
+        roughness_length_m=120.0,
+        cell_m=10.0,
+        extent_m=(-2700.0, 480.0, 900.0, 2780.0),
+        azimuth_deg=(105.0, 239.0),
+        lines=470,
+        shots_per_line=530,
+        reference_scans=min(8, max(1, hours // 3)),
+        melt_m_per_h=0.02,
+        avalanche_m=3.0,
+    )
+
+
+def tiny(hours: int = 3, seed: int = 1) -> Scenario:
+    """Give a valley a fifth as large with few points, for tests."""
+    return Scenario(
+        seed=seed,
+        hours=hours,
+        size=0.2,
+        terrain_step_m=2.0,
+        roughness_m=0.03,
+        roughness_length_m=40.0,
+        cell_m=5.0,
+        lines=180,
+        shots_per_line=200,
+        scan_s=300.0,
+        reference_scans=1,
+        melt_m_per_h=0.02,
+        avalanche_m=1.5,
+        avalanche_hour=2.0,
+    )
