@@ -261,6 +261,7 @@ class UncertaintySection(Section):
     """Which budget is computed, and whether its terms are stored."""
 
     model: Literal["rigorous", "voordendag2023"] = "rigorous"
+    registration_sigma_m: NotNegative = 0.0  # of the published budget only
     store_terms: bool = False
 
 

@@ -47,6 +47,7 @@ class Setup:
     position_m: tuple[float, float, float] | None
     min_points: int = 1
     published_budget: bool = False  # Voordendag et al. (2023) instead of the corrected form
+    registration_sigma_m: float = 0.0  # of the published budget
     store_terms: bool = False
 
 
@@ -59,19 +60,18 @@ class Pose:
     air: AirCorrection | None
 
 
+def gridder_for(setup: Setup, reference: Reference | None) -> Gridder:
+    """Return an empty grid that measures from a reference, if there is one."""
+    return Gridder(setup.grid, reference, setup.position_m[2] if setup.position_m else 0.0)
+
+
 def survey(
-    blocks: Iterable[Shots],
-    setup: Setup,
-    pose: Pose,
-    reference: Reference | None,
-    progress: Callable[[], None],
-) -> Gridder:
+    gridder: Gridder, blocks: Iterable[Shots], setup: Setup, pose: Pose, progress: Callable[[], None]
+) -> None:
     """Lay every shot of a scan on the grid."""
-    gridder = Gridder(setup.grid, reference, setup.position_m[2] if setup.position_m else 0.0)
     for shots in blocks:
         lay(gridder, to_map(shots, pose), setup)
         progress()
-    return gridder
 
 
 def to_map(shots: Shots, pose: Pose) -> Points:
@@ -79,8 +79,9 @@ def to_map(shots: Shots, pose: Pose) -> Points:
     points = shots.x_m, shots.y_m, shots.z_m
     if pose.frame is None:
         return points
-    if pose.tilt is not None and shots.time_s is not None:
-        points = lean(points, shots.time_s, pose.tilt)
+    if pose.tilt is not None:
+        time_s = np.zeros(len(shots)) if shots.time_s is None else shots.time_s
+        points = lean(points, time_s, pose.tilt)
     x_m, y_m, z_m = (
         row[0] * points[0] + row[1] * points[1] + row[2] * points[2] for row in pose.frame.to_local[:3, :3]
     )
@@ -229,7 +230,9 @@ def _judge(
                 _put(result.terms, name, band, seen, values)
     if reference is not None:
         random_m2 += np.where(measured, np.nan_to_num(reference.random_variance_m2[band][seen]), 0.0)
-    sigma_m = np.sqrt(random_m2 + shared_m2).astype(np.float32)
+    sigma_m = np.sqrt(random_m2 + shared_m2)
+    if setup.published_budget:
+        sigma_m = uncertainty.sigma_total_voordendag(sigma_m, setup.registration_sigma_m)
     change_m = surface.change_m[band][seen]
     flags |= np.where(change.significant(change_m, sigma_m), Quality.CHANGE_SIGNIFICANT, 0)
     result.uncertainty_m[band][seen] = sigma_m
@@ -307,29 +310,23 @@ def _terms_voordendag(view: View, setup: Setup) -> dict[str, Floats]:
     }
 
 
-def master(
-    provisional: Reference, surveys: list[tuple[Measurement, Shared | None]], version: str
-) -> Reference:
-    """Average scans measured from a provisional surface into the surface that change is measured from.
+def provisional(gridder: Gridder, setup: Setup, scan_ids: tuple[str, ...]) -> Reference:
+    """Return the plain mean of all points of some scans: good enough to take residuals from."""
+    elevation_m = gridder.mean_residual() + gridder.datum_m
+    nothing = np.zeros(setup.grid.shape, np.float32)
+    return Reference(setup.grid, "provisional", elevation_m, nothing, None, scan_ids)
 
-    Cells weigh by points; what the scans share among their own points is taken as independent from scan to
-    scan, so the mean of n scans has an nth of their mean covariance.
+
+def master(gridder: Gridder, base: Reference, unknown: list[Shared | None], version: str) -> Reference:
+    """Return the surface that change is measured from: scans averaged as residuals to a provisional one.
+
+    What a scan's points share is taken as independent from scan to scan, so that the mean of n scans has an
+    nth of their mean covariance.
     """
-    points = np.zeros(provisional.grid.shape)
-    total_m, total_m2 = np.zeros_like(points), np.zeros_like(points)
-    for measured, _ in surveys:
-        count = np.where(np.isfinite(measured.surface.change_m), measured.surface.count, 0)
-        points += count
-        total_m += count * np.nan_to_num(measured.surface.change_m.astype(np.float64))
-        total_m2 += count.astype(np.float64) ** 2 * np.nan_to_num(measured.surface.random_variance_m2)
-    seen = points > 0
-    elevation_m = np.full(points.shape, np.nan)
-    variance_m2 = np.full(points.shape, np.nan, np.float32)
-    elevation_m[seen] = provisional.elevation_m[seen] + total_m[seen] / points[seen]
-    variance_m2[seen] = total_m2[seen] / points[seen] ** 2
-    told = [unknown for _, unknown in surveys if unknown is not None]
+    elevation_m = base.elevation_m + gridder.mean_residual()
+    told = [one for one in unknown if one is not None]
     common = None
     if told:
         covariance = sum((one.covariance for one in told), np.zeros_like(told[0].covariance)) / len(told) ** 2
         common = Shared(told[0].names, told[0].units, np.zeros(len(covariance)), covariance)
-    return Reference(provisional.grid, version, elevation_m, variance_m2, common, provisional.scan_ids)
+    return Reference(base.grid, version, elevation_m, gridder.random_variance(), common, base.scan_ids)

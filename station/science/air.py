@@ -70,6 +70,13 @@ def path_mean_refractivity(air: Air, rise_m: Floats, wavelength_um: float) -> Fl
     return np.asarray((ends + 4 * refractivity_above(air, rise_m / 2, wavelength_um)) / 6)
 
 
+def standard_air(height_m: float) -> Air:
+    """Air of the ICAO standard atmosphere at a height, half saturated; for want of a measurement."""
+    sea_level = Air(15.0, 1013.25, 50.0)
+    thinning = (1 - LAPSE_K_PER_M * height_m / (15.0 + KELVIN)) ** (HYDROSTATIC_K_PER_M / LAPSE_K_PER_M)
+    return Air(15.0 - LAPSE_K_PER_M * height_m, sea_level.pressure_hpa * thinning, sea_level.humidity_pct)
+
+
 @dataclass(frozen=True)
 class AirCorrection:
     """What the air did to a scan and the scanner did not know.

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 
-from station.quantities import Bools, Floats32
+from station.quantities import Bools, Floats, Floats32
 
 SIGNIFICANT_SIGMAS = 1.959964  # two-sided 95 % of a normal distribution
 
 
-def significant(change_m: Floats32, uncertainty_m: Floats32) -> Bools:
+def significant(change_m: Floats | Floats32, uncertainty_m: Floats | Floats32) -> Bools:
     """Tell which changes (ny, nx) are not explained by their uncertainty at the 95 % level.
 
     NaN is not significant.

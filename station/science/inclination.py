@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy import ndimage, signal
@@ -67,6 +67,11 @@ def _waves(azimuth_rad: Floats) -> Floats:
 def head_azimuth(track: HeadTrack, time_s: Floats) -> Floats:
     """Azimuth of the scanner's head at times (n,) [rad]; held still before and after the scan."""
     return np.interp(time_s, track.time_s, track.azimuth_rad)
+
+
+def head_speed(track: HeadTrack) -> float:
+    """Mean speed of the scanner's head [rad/s]."""
+    return float(abs(np.ptp(track.azimuth_rad)) / np.ptp(track.time_s))
 
 
 def fit_cycle(log: InclinationLog, track: HeadTrack, sigma_rad: float) -> Cycle:
@@ -176,6 +181,13 @@ class Lean:
     cutoff_hz: float
     offset_s: float
     gap_s: float
+
+
+def without_time(lean: Lean) -> Lean:
+    """Return one mean lean for a scan whose points carry no time."""
+    roll_rad, pitch_rad = lean.tilt.roll_rad.mean(), lean.tilt.pitch_rad.mean()
+    still = Tilt(np.zeros(1), np.array([roll_rad]), np.array([pitch_rad]))
+    return replace(lean, tilt=still)
 
 
 def relative_lean(

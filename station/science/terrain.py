@@ -61,15 +61,14 @@ class Ground:
         Points are in cells from the north-west corner of the grid; the answer means something where the
         point's own cell is known.
         """
-        u = np.clip(column - 0.5, 0.0, self.grid.nx - 1.000001)
-        v = np.clip(row - 0.5, 0.0, self.grid.ny - 1.000001)
-        left, top = u.astype(np.intp), v.astype(np.intp)
-        u -= left
-        v -= top
+        nx, ny = self.grid.nx, self.grid.ny
+        # Half a cell within the border of the grid the last slope goes on.
+        left = np.clip((column - 0.5).astype(np.intp), 0, max(nx - 2, 0))
+        top = np.clip((row - 0.5).astype(np.intp), 0, max(ny - 2, 0))
+        u, v = column - 0.5 - left, row - 0.5 - top
         flat = self.rise_m.ravel()
-        first = top * self.grid.nx + left
-        right = (left < self.grid.nx - 1).astype(np.intp)
-        below = np.where(top < self.grid.ny - 1, self.grid.nx, 0)
+        first = top * nx + left
+        right, below = min(nx - 1, 1), min(ny - 1, 1) * nx
         nw, ne = flat[first].astype(np.float64), flat[first + right].astype(np.float64)
         sw, se = flat[first + below].astype(np.float64), flat[first + below + right].astype(np.float64)
         north_side, south_side = nw + (ne - nw) * u, sw + (se - sw) * u

@@ -40,7 +40,7 @@ def test_ground_is_bilinear_between_centres_and_goes_on_to_the_edge():
     surface = plane(0.5, 0.25)
     surface[20:, 30:] = np.nan
     ground = terrain.ground(Reference(GRID, "1", surface, np.zeros(GRID.shape, np.float32), None, ()))
-    x_m, y_m = np.random.default_rng(0).uniform([[0.5], [0.5]], [[39.5], [49.5]], (2, 4000))
+    x_m, y_m = np.random.default_rng(0).uniform([[0.0], [0.01]], [[39.99], [50.0]], (2, 4000))
     known = ground.known[(50 - y_m).astype(int), x_m.astype(int)]
     height_m, east, north = ground.under(x_m[known], 50 - y_m[known])
     assert height_m == pytest.approx(2000 + 0.5 * x_m[known] + 0.25 * y_m[known], abs=1e-4)

@@ -1,0 +1,131 @@
+"""The commands; no logic. Data goes to stdout, logs and progress to stderr."""
+
+from __future__ import annotations
+
+import json
+import sys
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from station.errors import StationError
+
+app = typer.Typer(
+    name="station",
+    help="Runs a permanently mounted laser scanner as a measuring instrument:"
+    " elevation change with an uncertainty that can be trusted.",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    rich_markup_mode=None,
+)
+
+SiteArgument = Annotated[Path, typer.Argument(metavar="SITE", help="The site file (TOML).", show_default=False)]
+Json = Annotated[bool, typer.Option("--json", help="Print JSON.")]
+
+
+def main() -> None:
+    """Run a command; end with the exit status its error carries (0 done, 1 failed, 2 wrong usage, 3 some scan
+    set aside, 74 cannot write, 75 try again later, 78 bad config).
+    """
+    try:
+        app()
+    except StationError as error:
+        print(f"station: {error}", file=sys.stderr)
+        sys.exit(error.exit_status)
+    except KeyboardInterrupt:
+        sys.exit(130)
+
+
+@app.command()
+def init(
+    folder: Annotated[Path, typer.Argument(metavar="DIR", help="Where to write it.", show_default=False)],
+    like: Annotated[str, typer.Option(help="hef: glacier, VZ-6000. mammoth: snow field, VZ-400i.")] = "hef",
+) -> None:
+    """Write a commented site file to start from."""
+    from station.sites import write_site
+
+    print(write_site(folder, like))
+
+
+@app.command()
+def check(site: SiteArgument, *, json_: Json = False) -> None:
+    """Tell everything that can be known before going live; exit 1 if something must be mended."""
+    from station.service.health import check as look
+
+    findings = look(site)
+    if json_:
+        print(json.dumps(findings, indent=2))
+    else:
+        for finding in findings:
+            print(f"{finding['level']:7} {finding['what']}: {finding['says']}")
+    if any(finding["level"] == "fault" for finding in findings):
+        sys.exit(1)
+
+
+@app.command()
+def process(
+    site: SiteArgument,
+    scans: Annotated[list[Path], typer.Argument(metavar="SCAN...", help="Scan files.", show_default=False)],
+) -> None:
+    """Measure these scans, now: verdict and one line each; exit 3 if some scan was set aside."""
+    from station.service.once import process_scans
+
+    sys.exit(process_scans(site, scans))
+
+
+@app.command()
+def run(site: SiteArgument) -> None:
+    """Be the service: catch up with the inbox, then watch it, hour by hour."""
+    from station.service.daemon import run as serve
+
+    sys.exit(serve(site))
+
+
+@app.command()
+def status(site: SiteArgument, *, json_: Json = False) -> None:
+    """Tell what was done, what waits, what was set aside and why, and how good the last scan was."""
+    from station.config import read_site
+    from station.service.health import describe, status as look
+
+    found = look(read_site(site))
+    print(json.dumps(found, indent=2) if json_ else describe(found))
+
+
+@app.command()
+def simulate(
+    folder: Annotated[Path, typer.Argument(metavar="DIR", help="Where to build it.", show_default=False)],
+    hours: Annotated[int, typer.Option(min=1, max=2000, help="How many hourly scans.")] = 24,
+    seed: Annotated[int, typer.Option(help="The same seed gives the same station.")] = 1,
+) -> None:
+    """Build a small station with a known truth: scans, logs, weather, SOP, site file."""
+    from station.simulation.station import demo_station
+
+    print(demo_station(folder, hours=hours, seed=seed))
+
+
+@app.command()
+def demo(
+    folder: Annotated[Path, typer.Argument(metavar="[DIR]", help="Where to run it.")] = Path("station-demo"),
+    hours: Annotated[int, typer.Option(min=1, max=2000, help="How many hourly scans.")] = 24,
+) -> None:
+    """Simulate a station, process its scans and tell what changed: the whole thing in about a minute."""
+    from station.service.demo import run_demo
+
+    sys.exit(run_demo(folder, hours))
+
+
+@app.callback(invoke_without_command=True)
+def _version(
+    version: Annotated[bool, typer.Option("--version", help="Print the version.", is_eager=True)] = False,
+) -> None:
+    if version:
+        from station import __version__
+
+        print(__version__)
+        raise typer.Exit
+
+
+if __name__ == "__main__":
+    main()

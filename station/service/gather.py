@@ -1,0 +1,280 @@
+"""What a scan needs beside its shots: SOP, lean, air; and what was lacking."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+from dataclasses import asdict, dataclass
+from datetime import datetime, timedelta
+from pathlib import Path
+
+import numpy as np
+from pyproj import CRS, Transformer
+
+from station.config import Origin, Site, SopSection
+from station.errors import ConfigError, ScanError
+from station.pipeline import Pose, Setup
+from station.quantities import Air, HeadTrack, InclinationLog, Shared
+from station.readers.inclination import read_inclination
+from station.readers.scan import ScanReader, open_scan
+from station.readers.sop import read_matrix, sop_for
+from station.readers.weather import air_at, read_weather
+from station.science import inclination, pose, shared
+from station.science.air import air_correction, standard_air
+from station.science.inclination import LEVEL, Cycle, Lean
+
+MOST_OF_THE_SCAN = 0.8  # of its time a log must cover to be the scan's log
+FEWEST_ROWS = 20  # of a log that is worth filtering
+
+
+@dataclass(frozen=True)
+class Gathered:
+    """Everything known of a scan before its shots are read."""
+
+    setup: Setup
+    pose: Pose
+    unknown: Shared | None
+    lean: Lean | None
+    air: Air | None
+    lacking: tuple[str, ...]
+    provenance: dict[str, str]
+
+
+def gather(site: Site, reader: ScanReader, log_path: Path | None, start: datetime, end: datetime) -> Gathered:
+    """Gather what goes with a scan; raise ScanError or ConfigError where it cannot be placed at all."""
+    if site.scans.frame == "map":
+        setup = setup_of(site, _map_position(site))
+        return Gathered(setup, Pose(None, None, None), None, None, None, (), {})
+    sop = sop_for(site.sop, start)
+    frame, sop_id = frame_of(site, sop), sop_identity(sop)
+    lacking: list[str] = []
+    track = reader.head_track() if site.scans.point_time == "auto" else None
+    if track is None and site.scans.point_time == "auto":
+        lacking.append("no time per point: one mean lean for the whole scan")
+    log = _log(site, log_path, track, lacking)
+    zero = _zero_lean(site, sop, sop_id, reader, log, track, lacking)
+    lean = _lean(site, log, track, zero, lacking)
+    air, weather_known = _air(site, start + (end - start) / 2, frame.position_m[2], lacking)
+    assumed = air if site.air.scanner_setting == "weather" else site.air.scanner_setting.air
+    setup = setup_of(site, frame.position_m)
+    of = shared.basis(setup.grid, frame.position_m)
+    speed_rad_s = shared.HEAD_SPEED_RAD_S if track is None else inclination.head_speed(track)
+    unknown = shared.covariance_without_adjustment(
+        of, lean, zero or LEVEL, _in_scanner(of, frame), speed_rad_s, weather_known=weather_known
+    )
+    correction = air_correction(
+        air, assumed if site.air.scanner_corrects else None, site.instrument.wavelength_um
+    )
+    provenance = {"sop_id": sop_id, "lean_zero": json.dumps(asdict(zero)) if zero else ""}
+    if lean is not None:
+        provenance["log_offset_s"] = f"{lean.offset_s:.2f}"
+        provenance["log_cutoff_hz"] = f"{lean.cutoff_hz:.5f}"
+    tilt = lean.tilt if lean is not None else None
+    return Gathered(
+        setup,
+        Pose(frame, tilt, correction),
+        unknown,
+        lean,
+        air if weather_known else None,
+        tuple(lacking),
+        provenance,
+    )
+
+
+def setup_of(site: Site, position_m: tuple[float, float, float] | None) -> Setup:
+    """Return what stays the same from scan to scan."""
+    return Setup(
+        scanner=site.instrument,
+        grid=site.grid_cells,
+        position_m=position_m,
+        min_points=site.grid.min_points,
+        published_budget=site.uncertainty.model == "voordendag2023",
+        registration_sigma_m=site.uncertainty.registration_sigma_m,
+        store_terms=site.uncertainty.store_terms,
+    )
+
+
+def sop_identity(sop: SopSection) -> str:
+    """Return a name that changes with the SOP's content."""
+    return f"{sop.file.stem}-{hashlib.sha256(sop.file.read_bytes()).hexdigest()[:8]}"
+
+
+def frame_of(site: Site, sop: SopSection) -> pose.Frame:
+    """Return the way from the scanner to the map under an SOP; raise ConfigError where there is none."""
+    matrix = read_matrix(sop.file)
+    reach_m = site.scanner.range_max_m
+    if site.map.crs is None:
+        return pose.frame_in_local_map(matrix)
+    if site.map.pop is not None:
+        return pose.frame_by_pop(matrix, read_matrix(site.map.pop), site.map.crs, reach_m)
+    if site.map.origin is not None:
+        return pose.frame_by_origin(matrix, _degrees(site.map.origin), site.map.crs, reach_m)
+    _require_on_map(site.map.crs, matrix[:3, 3].tolist(), sop.file)
+    return pose.frame_on_map(matrix, site.map.crs, reach_m)
+
+
+def _degrees(origin: Origin) -> tuple[float, float, float]:
+    return origin.latitude_deg, origin.longitude_deg, origin.height_m
+
+
+def _require_on_map(crs: str, position_m: list[float], file: Path) -> None:
+    """Refuse an SOP that leads nowhere near the map: it most likely leads to a local frame."""
+    horizontal = pose.horizontal_crs(crs)
+    area = CRS.from_user_input(crs).area_of_use
+    to_degrees = Transformer.from_crs(horizontal, horizontal.geodetic_crs, always_xy=True)
+    longitude, latitude = to_degrees.transform(position_m[0], position_m[1])
+    if area is None:
+        return
+    inside = area.west - 3 <= longitude <= area.east + 3 and area.south - 3 <= latitude <= area.north + 3
+    if not inside:
+        raise ConfigError(
+            f"{file}: places the scanner at easting {position_m[0]:g}, northing {position_m[1]:g}, outside"
+            f" {crs} ({area.name}). If it leads to a local frame, give map.origin or map.pop, or leave"
+            " map.crs out"
+        )
+
+
+def _map_position(site: Site) -> tuple[float, float, float] | None:
+    if site.map.origin is None or site.map.crs is None:
+        return None
+    to_map = Transformer.from_crs(pose.GEOGRAPHIC, pose.horizontal_crs(site.map.crs), always_xy=True)
+    latitude, longitude, height_m = _degrees(site.map.origin)
+    east_m, north_m, up_m = to_map.transform(longitude, latitude, height_m)
+    return float(east_m), float(north_m), float(up_m)
+
+
+def _in_scanner(of: shared.Basis, frame: pose.Frame) -> np.ndarray[tuple[int], np.dtype[np.float64]]:
+    """Azimuth of the knots in the scanner's own frame [rad]."""
+    outward = np.stack([np.sin(of.azimuth_rad), np.cos(of.azimuth_rad), np.zeros(of.count)])
+    x, y, _ = frame.to_local[:3, :3].T @ outward
+    return np.asarray(np.arctan2(y, x))
+
+
+def _log(site: Site, path: Path | None, track: HeadTrack | None, lacking: list[str]) -> InclinationLog | None:
+    """Return the scan's clean log, or None; what is wrong with it goes to `lacking`."""
+    if site.inclination is None:
+        return None
+    if path is None:
+        lacking.append("inclination log missing")
+        return None
+    try:
+        log, dropped = inclination.clean(read_inclination(path))
+    except ScanError as error:
+        lacking.append(f"inclination log unusable: {error}")
+        return None
+    rows = len(log.time_s)
+    if rows < FEWEST_ROWS:
+        lacking.append(f"inclination log has {rows} good rows")
+        return None
+    if dropped > 0.1 * (dropped + rows):
+        lacking.append(f"inclination log bad: {dropped} of {dropped + rows} rows dropped")
+    return log if track is None or _covers(log, track, lacking) else None
+
+
+def _covers(log: InclinationLog, track: HeadTrack, lacking: list[str]) -> bool:
+    """Tell whether a log is of the scan's time at all."""
+    first_s, last_s = track.time_s[0], track.time_s[-1]
+    covered_s = min(last_s, log.time_s[-1]) - max(first_s, log.time_s[0])
+    if covered_s <= 0:
+        lacking.append(f"inclination log is of another time: {first_s - log.time_s[0]:+.0f} s off")
+        return False
+    if covered_s < MOST_OF_THE_SCAN * (last_s - first_s):
+        lacking.append(f"inclination log covers {covered_s:.0f} of {last_s - first_s:.0f} s")
+    return True
+
+
+def _lean(
+    site: Site,
+    log: InclinationLog | None,
+    track: HeadTrack | None,
+    zero: Cycle | None,
+    lacking: list[str],
+) -> Lean | None:
+    """Return the lean to apply, None where nothing says it."""
+    if log is None or zero is None or site.inclination is None:
+        return None
+    cutoff_hz = None if site.inclination.cutoff_hz == "auto" else site.inclination.cutoff_hz
+    sigma_rad = site.instrument.inclination_sigma_rad
+    filtered = site.inclination.filter == "blackman"
+    lean = inclination.relative_lean(log, track, zero, sigma_rad, cutoff_hz, filtered=filtered)
+    if lean.gap_s > 2 * lean.memory_s:
+        lacking.append(f"inclination log has a gap of {lean.gap_s:.0f} s")
+    if track is None:
+        return inclination.without_time(lean)
+    return lean
+
+
+def _zero_lean(
+    site: Site,
+    sop: SopSection,
+    sop_id: str,
+    reader: ScanReader,
+    log: InclinationLog | None,
+    track: HeadTrack | None,
+    lacking: list[str],
+) -> Cycle | None:
+    """Return the lean the SOP already holds: that of the scan it was solved from, kept once known.
+
+    Without `sop.scan` it is the first scan processed under the SOP.
+    """
+    if site.inclination is None:
+        return None
+    if site.inclination.mode == "absolute":
+        return LEVEL
+    kept = site.station.data / "lean_zero" / f"{sop_id}.json"
+    if kept.is_file():
+        told = json.loads(kept.read_text())
+        return Cycle(tuple(told["roll_rad"]), tuple(told["pitch_rad"]))
+    source = reader.path.stem
+    if sop.scan is not None and sop.scan != source:
+        source = sop.scan
+        log, track = _log_of(site, sop.scan)
+    if log is None:
+        if sop.scan is not None:
+            lacking.append(f"log of {source}, the scan of the SOP, not found: lean left uncorrected")
+        return None
+    zero = _fit(log, track, site.instrument.inclination_sigma_rad)
+    kept.parent.mkdir(parents=True, exist_ok=True)
+    beside = kept.with_name(f".{kept.name}.{os.getpid()}")
+    beside.write_text(json.dumps({**asdict(zero), "scan": source}))
+    beside.replace(kept)
+    return zero
+
+
+def _log_of(site: Site, stem: str) -> tuple[InclinationLog | None, HeadTrack | None]:
+    """Read log and head track of an earlier scan in the inbox."""
+    assert site.inclination is not None  # noqa: S101 - the caller's case
+    log_path = site.scans.inbox / f"{stem}{site.inclination.suffix}"
+    scans = [path for path in site.scans.inbox.glob(f"{stem}.*") if path != log_path]
+    if not log_path.is_file() or not scans:
+        return None, None
+    with open_scan(scans[0], range_max_m=site.scanner.range_max_m) as reader:
+        track = reader.head_track()
+    return inclination.clean(read_inclination(log_path))[0], track
+
+
+def _fit(log: InclinationLog, track: HeadTrack | None, sigma_rad: float) -> Cycle:
+    if track is not None:
+        return inclination.fit_cycle(log, track, sigma_rad)
+    return Cycle((float(log.roll_rad.mean()), 0.0, 0.0), (float(log.pitch_rad.mean()), 0.0, 0.0))
+
+
+def _air(site: Site, moment: datetime, height_m: float, lacking: list[str]) -> tuple[Air, bool]:
+    """Return the air of the scan and whether it was measured."""
+    setting = site.air.scanner_setting
+    if site.weather is not None:
+        given = site.weather
+        try:
+            log = read_weather(
+                given.file, format=given.format, columns=given.columns, utc_offset_h=given.utc_offset_h
+            )
+            air = air_at(log, moment.timestamp(), given.max_age_s)
+        except (ScanError, OSError) as error:
+            lacking.append(f"weather unusable: {error}")
+            air = None
+        if air is not None:
+            return air, True
+        age = timedelta(seconds=given.max_age_s)
+        lacking.append(f"weather missing within {age} of {moment:%Y-%m-%d %H:%M} UTC")
+    return (standard_air(height_m) if setting == "weather" else setting.air), False

@@ -1,0 +1,149 @@
+"""One scan from shots to surface, against shots made here from first principles."""
+
+import math
+
+import numpy as np
+import pytest
+
+from station.pipeline import Pose, Setup, gridder_for, master, measure, provisional, survey
+from station.quantities import Grid, Quality, Reference, Scanner, Shots
+from station.science.inclination import LEVEL
+from station.science.pose import frame_in_local_map
+from station.science.shared import basis, covariance_without_adjustment
+
+VZ6000 = Scanner("vz", 1.064, 0.12e-3, 0.0, 0.010, math.radians(0.0005), math.radians(0.008), 6000.0)
+GRID = Grid(west_m=1500.0, north_m=600.0, cell_m=4.0, nx=150, ny=300)
+SCANNER = (0.0, 0.0, 3245.0)
+SLOPE = (0.25, -0.1)
+
+
+def height(x_m, y_m):
+    """A slope that rises away from the scanner, 650 m below it at its near edge, with gentle waves."""
+    return 2600 + SLOPE[0] * (x_m - 1500) + SLOPE[1] * y_m + 2 * np.sin(x_m / 60) * np.cos(y_m / 45)
+
+
+def shots_at(x_m, y_m, seed=0, *, noise=True):
+    """Echoes whose true beam is scattered within the divergence, and whose range is noisy."""
+    rng = np.random.default_rng(seed)
+    true = np.stack([x_m, y_m, height(x_m, y_m)]) - np.array(SCANNER)[:, None]
+    range_m = np.linalg.norm(true, axis=0)
+    if not noise:
+        return Shots(*true, None)
+    along = true / range_m
+    side = np.cross(along.T, [0, 0, 1]).T
+    side /= np.linalg.norm(side, axis=0)
+    upward = np.cross(side.T, along.T).T
+    jitter = rng.normal(0, 0.12e-3 / 4, (2, len(x_m)))
+    jitter[1] += rng.normal(0, math.radians(0.0008), len(x_m))
+    recorded = along + jitter[0] * side + jitter[1] * upward
+    recorded *= (range_m + rng.normal(0, 0.010, len(x_m))) / np.linalg.norm(recorded, axis=0)
+    return Shots(*recorded, None)
+
+
+def spots(count, seed):
+    rng = np.random.default_rng(seed)
+    return rng.uniform(1490, 2110, count), rng.uniform(-610, 610, count)
+
+
+def truth():
+    x_m, y_m = np.meshgrid(GRID.x_m, GRID.y_m)
+    return Reference(GRID, "truth", height(x_m, y_m), np.zeros(GRID.shape, np.float32), None, ())
+
+
+def scanned(shots, reference, unknown=None, **settings):
+    sop = np.eye(4)
+    sop[:3, 3] = SCANNER
+    setup = Setup(VZ6000, GRID, SCANNER, **settings)
+    gridder = gridder_for(setup, reference)
+    survey(gridder, [shots], setup, Pose(frame_in_local_map(sop), None, None), lambda: None)
+    return measure(gridder, setup, unknown, reference), gridder, setup
+
+
+def test_without_errors_the_surface_is_the_truth():
+    measured, *_ = scanned(shots_at(*spots(200_000, 1), noise=False), truth())
+    inner = measured.surface.change_m[1:-1, 1:-1]
+    assert np.abs(inner[np.isfinite(inner)]).max() < 0.01  # bilinear against waves of 2 m
+
+
+def test_random_uncertainty_is_calibrated():
+    """Standard deviation of error over stated sigma, over all cells and by number of points."""
+    measured, *_ = scanned(shots_at(*spots(150_000, 2)), truth())
+    surface = measured.surface
+    z = surface.change_m / measured.random_uncertainty_m
+    assert np.nanstd(z) == pytest.approx(1.0, abs=0.05)
+    for points in (1, 3, 6):
+        assert np.nanstd(z[surface.count == points]) == pytest.approx(1.0, abs=0.1)
+
+
+def test_a_plain_mean_without_reference_knows_its_slope():
+    measured, *_ = scanned(shots_at(*spots(150_000, 3)), None)
+    several = measured.surface.count >= 2
+    x_m, y_m = np.meshgrid(GRID.x_m, GRID.y_m)
+    z = (measured.surface.elevation_m - height(x_m, y_m)) / measured.random_uncertainty_m
+    assert np.isnan(measured.surface.change_m).all()
+    assert np.std(z[several & np.isfinite(z)]) == pytest.approx(1.0, abs=0.15)
+    assert (measured.quality[several] & Quality.OUTSIDE_REFERENCE).all()
+
+
+def test_a_master_from_scans_is_better_than_each():
+    pose_shots = [shots_at(*spots(100_000, seed), seed=seed) for seed in range(4, 10)]
+    _, gridder, setup = scanned(pose_shots[0], None)
+    sop = np.eye(4)
+    sop[:3, 3] = SCANNER
+    pose = Pose(frame_in_local_map(sop), None, None)
+    survey(gridder, pose_shots[1:], setup, pose, lambda: None)
+    base = provisional(gridder, setup, ("a",))
+    fine = gridder_for(setup, base)
+    survey(fine, pose_shots, setup, pose, lambda: None)
+    made = master(fine, base, [None], "1")
+    x_m, y_m = np.meshgrid(GRID.x_m, GRID.y_m)
+    error = made.elevation_m - height(x_m, y_m)
+    assert np.nanstd(error) < 0.8 * np.nanstd(base.elevation_m - height(x_m, y_m))
+    measured, *_ = scanned(shots_at(*spots(100_000, 30), seed=30), made)
+    assert np.nanstd(measured.surface.change_m) < 0.1
+
+
+def test_shared_errors_go_into_the_cell_and_its_terms():
+    of = basis(GRID, SCANNER)
+    unknown = covariance_without_adjustment(
+        of, None, LEVEL, np.zeros(of.count), math.radians(0.13), weather_known=True
+    )
+    measured, *_ = scanned(shots_at(*spots(50_000, 4)), truth(), unknown, store_terms=True)
+    total = np.sqrt(sum(np.square(term) for term in measured.terms.values()))
+    seen = np.isfinite(measured.uncertainty_m)
+    assert measured.uncertainty_m[seen] == pytest.approx(total[seen], rel=1e-3)
+    assert (measured.uncertainty_m > measured.random_uncertainty_m)[seen].all()
+
+
+def test_published_budget_on_request():
+    """Voordendag et al. (2023), Eq. 1, 2 and 3 at a cell, from the same shots."""
+    measured, *_ = scanned(
+        shots_at(*spots(50_000, 5)),
+        truth(),
+        published_budget=True,
+        store_terms=True,
+        registration_sigma_m=0.02,
+    )
+    terms = measured.terms
+    point = np.sqrt(sum(np.square(terms[name]) for name in terms))
+    wanted = point / np.sqrt(measured.surface.count, where=measured.surface.count > 0, out=None) + 0.02
+    seen = np.isfinite(measured.uncertainty_m)
+    assert measured.uncertainty_m[seen] == pytest.approx(wanted[seen], rel=0.05)
+    x_m, y_m = np.meshgrid(GRID.x_m, GRID.y_m)
+    range_m = np.sqrt(x_m**2 + y_m**2 + (height(x_m, y_m) - 3245) ** 2)
+    assert terms["sigma_instrument"][seen] == pytest.approx(
+        range_m[seen] * math.sin(math.radians(0.008)), rel=1e-3
+    )
+
+
+def test_a_real_change_is_found_and_flagged():
+    x_m, y_m = spots(150_000, 6)
+    shots = shots_at(x_m, y_m, seed=6)
+    raised = (x_m > 1700) & (x_m < 1800) & (np.abs(y_m) < 50)
+    shots = Shots(shots.x_m, shots.y_m, shots.z_m + np.where(raised, 0.5, 0.0), None)
+    measured, *_ = scanned(shots, truth())
+    inside = measured.surface.change_m[140:160, 55:70]
+    assert np.nanmean(inside) == pytest.approx(0.5, abs=0.02)
+    flagged = (measured.quality & Quality.CHANGE_SIGNIFICANT) > 0
+    assert flagged[140:160, 55:70].mean() > 0.9
+    assert flagged[:60][np.isfinite(measured.surface.change_m[:60])].mean() == pytest.approx(0.05, abs=0.02)
