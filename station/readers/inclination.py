@@ -1,0 +1,59 @@
+"""The inclination log a scanner writes beside each scan."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from station.errors import ScanError
+from station.quantities import Floats, InclinationLog
+from station.readers.scan import WEEK_S, foreign_code
+
+COLUMNS = ("time", "roll", "pitch")
+MOST_BYTES = 1 << 26  # 1 Hz for a month
+
+
+def read_inclination(path: Path) -> InclinationLog:
+    """Read `Time,Roll,Pitch` in degrees, as written, in radians; a row that cannot be read is all NaN.
+
+    Such rows stay, so that who cleans the log can count them. A last line without its end is one of them:
+    half a number is a wrong number. GPS seconds of the week run on past the week's end, as the scan's do.
+    Raises ScanError where no row can be read, NotReadyError where the disk or its rights fail.
+    """
+    with foreign_code(f"{path.name} cannot be read"), path.open("rb") as file:
+        raw = file.read(MOST_BYTES + 1)
+    if len(raw) > MOST_BYTES:
+        raise ScanError(f"{path.name}: too large for an inclination log")
+    whole, _, cut = raw.decode("utf-8-sig", "replace").rpartition("\n")
+    lines = [line for line in whole.split("\n") if line.strip()]
+    if not lines:
+        raise ScanError(f"{path.name}: holds no row")
+    names = [name.strip(' "\r').lower() for name in lines[0].split(",")]
+    if not set(COLUMNS) <= set(names):
+        raise ScanError(f"{path.name}: its first line is not Time,Roll,Pitch but {lines[0][:60]!r}")
+    places = [names.index(name) for name in COLUMNS]
+    rows = np.array([_numbers(line, places) for line in [*lines[1:], *([cut] if cut.strip() else [])]])
+    if cut.strip():
+        rows[-1] = np.nan
+    readable = np.isfinite(rows).all(axis=-1)
+    if not readable.any():
+        raise ScanError(f"{path.name}: no row of {len(rows)} can be read")
+    rows[~readable] = np.nan
+    time_s = _past_week(rows[:, 0], rows[readable][0, 0])
+    return InclinationLog(time_s, np.radians(rows[:, 1]), np.radians(rows[:, 2]))
+
+
+def _numbers(line: str, places: list[int]) -> tuple[float, ...]:
+    """Return the numbers in these places of a line, NaN for each where one is lacking."""
+    fields = line.split(",")
+    try:
+        return tuple(float(fields[place]) for place in places)
+    except (ValueError, IndexError):
+        return (np.nan,) * len(places)
+
+
+def _past_week(time_s: Floats, first_s: float) -> Floats:
+    """Let week seconds that fall back to zero run on."""
+    fallen = (time_s >= 0) & (time_s < first_s - WEEK_S / 2) & (first_s < WEEK_S)
+    return np.where(fallen, time_s + WEEK_S, time_s)
