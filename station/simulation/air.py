@@ -81,14 +81,15 @@ def stretch(air: AirOfScan | None, rise_m: Floats) -> Floats:
 
 def weather(scenario: Scenario, time_utc_s: Floats) -> WeatherLog:
     """Return temperature, pressure and humidity at the scanner at these times, what a log would hold."""
+    series_s = time_utc_s - scenario.start_utc_s
     daily = np.cos(2 * np.pi * ((time_utc_s / 3600 - 14.0) / 24))  # warmest at 14 h
     slow = [wander(stream(scenario.seed, 40, number), 1.0, 3 * 3600, 60 * 3600) for number in range(3)]
     quick = wander(stream(scenario.seed, 40, 3), 0.25, 240, 3600)
     return WeatherLog(
         time_utc_s,
-        temperature_c=2.0 + 2.5 * daily + 1.2 * slow[0](time_utc_s) + quick(time_utc_s),
-        pressure_hpa=688.0 + 1.8 * slow[1](time_utc_s),
-        humidity_pct=np.clip(62.0 - 10.0 * daily + 9.0 * slow[2](time_utc_s), 5.0, 100.0),
+        temperature_c=2.0 + 2.5 * daily + 1.2 * slow[0](series_s) + quick(series_s),
+        pressure_hpa=688.0 + 1.8 * slow[1](series_s),
+        humidity_pct=np.clip(62.0 - 10.0 * daily + 9.0 * slow[2](series_s), 5.0, 100.0),
     )
 
 

@@ -98,7 +98,7 @@ def cast(
 ) -> Hits:
     """Follow each ray to the first ground it meets, to a hundredth of a millimetre of height.
 
-    Rays that only graze the ground, within a node's spacing of a crest, may miss it: no echo.
+    Crests are seen from distances a node's spacing apart, so a ray that only grazes one may pass it.
     """
     look = fan(ground, eye_m, (float(bearing_rad.min()), float(bearing_rad.max())), reach_m, coefficient_at)
     along_m = look.first_crossing(bearing_rad, climb)

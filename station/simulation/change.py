@@ -17,8 +17,8 @@ from station.simulation.scenario import Scenario
 from station.simulation.terrain import Heights, Valley, bumps
 
 # Where the avalanche breaks off and where it stops: east, north, half length, half width, times size [m]
-RELEASE = (-730.0, 2150.0, 110.0, 90.0)
-DEPOSIT = (-700.0, 1690.0, 150.0, 120.0)
+RELEASE = (-730.0, 1950.0, 110.0, 90.0)
+DEPOSIT = (-700.0, 1500.0, 150.0, 120.0)
 SLAB_SHARE = 0.5  # height of the slab that leaves against that of the deposit
 
 

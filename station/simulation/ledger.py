@@ -35,14 +35,14 @@ def _per_scan(values: list[Any], units: str, meaning: str, *more: str) -> tuple[
 
 def _motion(scenario: Scenario, now: list[Conditions], lean: tuple[motion.Axis, motion.Axis]) -> xr.Dataset:
     into_s = np.arange(0, scenario.scan_s + 0.5)
-    starts = [scenario.scan_start_utc_s(one.scan) for one in now]
+    starts = [scenario.scan_start_s(one.scan) for one in now]
     roll, pitch = (np.degrees([axis.lean(start + into_s) for start in starts]) for axis in lean)
     series = ("time", "into_scan")
     relative = "true, relative to the SOP's scan"
     return xr.Dataset(
         {
-            "roll": (series, roll, {"units": "degree", "long_name": f"lean about x, {relative}"}),
-            "pitch": (series, pitch, {"units": "degree", "long_name": f"lean about y, {relative}"}),
+            "relative_roll": (series, roll, {"units": "degree", "long_name": f"lean about x, {relative}"}),
+            "relative_pitch": (series, pitch, {"units": "degree", "long_name": f"lean about y, {relative}"}),
             "line_jitter": _per_scan(
                 [np.degrees(one.jitter_rad) for one in now], "degree", "how much higher a line points", "line"
             ),

@@ -23,14 +23,14 @@ SPACING_S = 0.1  # the lean is interpolated between such times: sway has periods
 
 @dataclass(frozen=True)
 class Axis:
-    """The lean about one axis of the scanner, radians by seconds since 1970."""
+    """The lean about one axis of the scanner, by seconds since the first scan began."""
 
     parts: tuple[Wander, ...]
     zero_rad: float
 
-    def lean(self, time_utc_s: Floats) -> Floats:
+    def lean(self, series_s: Floats) -> Floats:
         """Return the lean relative to the scan of the SOP [rad]."""
-        return np.asarray(sum((part(time_utc_s) for part in self.parts), -self.zero_rad * np.ones(1)))
+        return np.asarray(sum((part(series_s) for part in self.parts), -self.zero_rad * np.ones(1)))
 
 
 @dataclass(frozen=True)
@@ -53,8 +53,7 @@ class SensorFaults:
 
 def axes(scenario: Scenario) -> tuple[Axis, Axis]:
     """Return the true lean of the series about the scanner's x (roll) and y (pitch)."""
-    first, last = scenario.start_utc_s, scenario.start_utc_s + scenario.scan_s
-    during = np.linspace(first, last, int(scenario.scan_s / SPACING_S) + 1)
+    during = np.linspace(0, scenario.scan_s, int(scenario.scan_s / SPACING_S) + 1)
     found = []
     for number in range(2):
         rng = stream(scenario.seed, 30, number)
@@ -114,7 +113,7 @@ def sensor_log(
     mount_rad = np.radians([scenario.mount_roll_deg, scenario.mount_pitch_deg])
     read = [
         mount_rad[number]
-        + axis.lean(scenario.scan_start_utc_s(scan) + into_s)
+        + axis.lean(scenario.scan_start_s(scan) + into_s)
         + faults.bias_rad[number]
         + faults.cyclic_rad[number] * np.sin(head_rad + faults.phase_rad[number])
         + np.radians(scenario.log_noise_deg) * rng.standard_normal(count)

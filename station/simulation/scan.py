@@ -49,13 +49,13 @@ def conditions(scenario: Scenario, scan: int, lean: tuple[motion.Axis, motion.Ax
     """Return what holds for all shots of one scan."""
     rng = stream(scenario.seed, 50, scan)
     into_s = np.linspace(0, scenario.scan_s, int(scenario.scan_s / motion.SPACING_S) + 2)
-    start = scenario.scan_start_utc_s(scan)
+    start_s = scenario.scan_start_s(scan)
     return Conditions(
         scan=scan,
         scanner_start_s=float(np.round(rng.uniform(30, 110), 3)),  # it counts from when it was switched on
         air=air_of_scan(scenario, scan),
         lean_time_s=into_s,
-        lean_rad=np.stack([axis.lean(start + into_s) for axis in lean]),
+        lean_rad=np.stack([axis.lean(start_s + into_s) for axis in lean]),
         jitter_rad=motion.line_jitter(scenario, scan),
         moves=motion.moves(scenario, scan),
         range_bias_m=float(scenario.range_bias_m * rng.standard_normal()),

@@ -35,7 +35,7 @@ class Scenario:
     roughness_m: float = 0.10
     roughness_length_m: float = 80.0  # shortest wavelength of the roughness
     cell_m: float = 5.0
-    extent_m: tuple[float, float, float, float] = (-3700.0, 480.0, 1100.0, 2780.0)  # W S E N, times size
+    extent_m: tuple[float, float, float, float] = (-3700.0, 350.0, 1100.0, 2650.0)  # W S E N, times size
 
     # the scanner's work
     lines: int = 2700
@@ -111,9 +111,13 @@ class Scenario:
         """Scatter of the echo's true direction in each angle: a quarter of the full 1/e² width."""
         return self.beam_divergence_mrad * 1e-3 / 4
 
+    def scan_start_s(self, scan: int) -> float:
+        """Return the start of one scan in seconds since the first began."""
+        return 3600.0 * scan
+
     def scan_start_utc_s(self, scan: int) -> float:
-        """Start of one scan, seconds since 1970."""
-        return self.start_utc_s + 3600.0 * scan
+        """Return the start of one scan in seconds since 1970."""
+        return self.start_utc_s + self.scan_start_s(scan)
 
     @property
     def azimuth_rad(self) -> tuple[float, float]:
@@ -129,7 +133,7 @@ def demo(hours: int = 24, seed: int = 1) -> Scenario:
         terrain_step_m=5.0,
         roughness_length_m=120.0,
         cell_m=10.0,
-        extent_m=(-2700.0, 480.0, 900.0, 2780.0),
+        extent_m=(-2700.0, 350.0, 900.0, 2650.0),
         azimuth_deg=(105.0, 239.0),
         lines=470,
         shots_per_line=530,

@@ -30,6 +30,7 @@ class Station:
 
     def __init__(self, scenario: Scenario) -> None:
         self.scenario = scenario
+        self._conditions: dict[int, Conditions] = {}
 
     @cached_property
     def place(self) -> Valley:
@@ -62,7 +63,9 @@ class Station:
 
     def conditions(self, scan: int) -> Conditions:
         """Return what holds for all shots of one scan."""
-        return conditions(self.scenario, scan, self.lean)
+        if scan not in self._conditions:
+            self._conditions[scan] = conditions(self.scenario, scan, self.lean)
+        return self._conditions[scan]
 
     def scan(self, scan: int) -> Recorded:
         """Shoot one scan."""

@@ -1,6 +1,6 @@
 """A valley like that of Hintereisferner, and how snow, melt and avalanches change it.
 
-East-north-up at the station's mark on the ridge: the glacier comes down from the west, 0.6-1.6 km north of
+East-north-up at the station's mark on the ridge: the glacier comes down from the west, 0.5-1.5 km north of
 the scanner and 500 m below it, its tongue ends in the north-east, rock walls stand all round. Lengths below
 are those of the valley at full size.
 """
@@ -89,8 +89,8 @@ def valley(seed: int, size: float, step_m: float, roughness_m: float, roughness_
 
 def _landforms(x: Floats, y: Floats, waves: list[Floats]) -> tuple[Floats, Floats]:
     """Return height [m] and share of ice from axis, crests, ribs and glacier."""
-    axis = 1280 + 170 * np.sin(x / 830 + 0.5)
-    floor = -585 - 0.10 * x + 25 * np.sin(x / 420)
+    axis = 1080 + 170 * np.sin(x / 830 + 0.5)
+    floor = -500 - 0.10 * x + 25 * np.sin(x / 420)
     south_crest = CREST_M - 150 * (1 - np.cos(x / 760))
     south_top = -4 + 260 * (1 - np.exp(-((x / 1500) ** 2))) * np.where(x < 0, 1, -0.9)
     north_crest = axis + 1330 + 150 * np.sin(x / 610 + 2)

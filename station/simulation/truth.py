@@ -20,7 +20,7 @@ from station.simulation.terrain import Heights, Valley
 CRS = "EPSG:32632"
 LATITUDE_DEG, LONGITUDE_DEG, HEIGHT_M = 46.7958, 10.7828, 3245.0  # the scanner above Hintereisferner
 KNOTS_M = 250.0  # of the plumb lines: between them a cubic errs by less than a nanometre
-FINENESS = 2.5  # points of a cell's mean per node of the ground, each way
+FINENESS = 4.0  # points of a cell's mean per node of the ground, each way
 STRIP_POINTS = 400_000  # at once, which bounds the memory
 
 
