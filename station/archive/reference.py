@@ -1,0 +1,101 @@
+"""`reference.nc`: the master surface that change is measured from."""
+
+from __future__ import annotations
+
+import os
+
+import netCDF4
+import numpy as np
+
+from station.archive.layout import Series, attributes, lay_out, put_raster, written_whole
+from station.archive.variables import FILL, Variable
+from station.errors import StoreError
+from station.quantities import Reference, Shared
+
+_ROWS = (
+    Variable(
+        "reference_elevation", ("y", "x"), "f4", "elevation of the reference surface", "m",
+        "surface_altitude", 3, "area: mean",
+    ),
+    Variable(
+        "reference_random_uncertainty", ("y", "x"), "f4", "random uncertainty of the reference surface", "m",
+        None, 4, None, "one standard deviation, of a single cell",
+    ),
+    Variable(
+        "shared_parameter_covariance", ("parameter", "parameter_2"), "f8",
+        "covariance of what all points of the reference share",
+        comment="units are products of parameter_unit",
+    ),
+)  # fmt: skip
+
+
+def write_reference(series: Series, reference: Reference) -> None:
+    """Write a version of the reference for good, and `reference.nc` as another name of the newest.
+
+    Raises StoreError where it cannot.
+    """
+    kept = series.folder / f"reference_{reference.version}.nc"
+    with written_whole(kept) as beside, netCDF4.Dataset(beside, "w", clobber=False) as file:
+        shared = reference.shared
+        parameters = (shared.names, shared.units) if shared is not None else ((), ())
+        lay_out(file, series, f"Reference surface of {series.name or series.station_id}", None, parameters)
+        file.setncatts({"reference_version": reference.version, "scan_ids": " ".join(reference.scan_ids)})
+        values = {
+            "reference_elevation": reference.elevation_m,
+            "reference_random_uncertainty": np.sqrt(reference.random_variance_m2),
+        }
+        for row in _ROWS:
+            if any(dim not in file.dimensions for dim in row.dims):
+                continue
+            variable = file.createVariable(
+                row.name, row.dtype, row.dims, compression="zlib", complevel=1, shuffle=True,
+                fill_value=FILL, least_significant_digit=row.digits,
+            )  # fmt: skip
+            variable.setncatts(attributes(row, mapped=series.crs is not None))
+            if row.is_raster:
+                put_raster(variable, None, values[row.name])
+            elif shared is not None:
+                variable[:] = shared.covariance
+    with written_whole(series.folder / "reference.nc") as beside:
+        os.link(kept, beside)
+
+
+def read_reference(series: Series) -> Reference | None:
+    """Read `reference.nc`; None where there is none yet; StoreError where it does not fit the grid."""
+    path = series.folder / "reference.nc"
+    if not path.is_file():
+        return None
+    try:
+        with netCDF4.Dataset(path) as file:
+            return _read(file, series)
+    except (OSError, RuntimeError, KeyError, IndexError) as error:
+        raise StoreError(f"{path}: cannot be read: {error}") from error
+
+
+def _read(file: netCDF4.Dataset, series: Series) -> Reference:
+    grid = series.grid
+    if (
+        file["x"].shape != (grid.nx,)
+        or file["y"].shape != (grid.ny,)
+        or (abs(file["x"][0] - grid.x_m[0]) + abs(file["y"][0] - grid.y_m[0]) > 1e-6)
+    ):
+        raise StoreError(f"{file.filepath()}: is of another grid: move it away or restore [grid]")
+    file.set_auto_chartostring(False)
+    shared = None
+    if "parameter_name" in file.variables:
+        names, units = (
+            tuple(netCDF4.chartostring(file[name][:], encoding="ascii").tolist())
+            for name in ("parameter_name", "parameter_unit")
+        )
+        covariance = np.asarray(file["shared_parameter_covariance"][:], dtype=np.float64)
+        shared = Shared(names, units, np.zeros(len(names)), covariance)
+    return Reference(
+        grid=grid,
+        version=str(file.reference_version),
+        elevation_m=np.asarray(file["reference_elevation"][:].filled(np.nan), dtype=np.float64),
+        random_variance_m2=np.asarray(
+            file["reference_random_uncertainty"][:].filled(np.nan) ** 2, dtype=np.float32
+        ),
+        shared=shared,
+        scan_ids=tuple(str(file.scan_ids).split()),
+    )

@@ -1,0 +1,151 @@
+"""Epochs, the series over them, the reference: written, read back, replaced, killed, out of room."""
+
+import multiprocessing
+import os
+import resource
+import signal
+import time
+
+import netCDF4
+import numpy as np
+import pytest
+import xarray as xr
+
+import station
+from station.archive import reference, store
+from station.archive.series import build_series, rows
+from station.errors import StoreError
+from station.quantities import Reference, Shared
+
+
+def build(series, epoch, hours):
+    for hour in hours:
+        store.write_epoch(series, epoch(hour))
+    return build_series(series)
+
+
+def test_an_epoch_comes_back_to_the_stored_digit(series, epoch):
+    written = store.write_epoch(series, epoch(5, terms=True))
+    assert written.path.relative_to(series.folder).as_posix() == "epochs/2025/11/21/hef_20251121T050000Z.nc"
+    given = epoch(5).measurement
+    with xr.open_dataset(written.path) as told:
+        assert float(told.time[0].astype("datetime64[s]").astype(int)) == epoch(5).start_s + 450
+        for name, values in (
+            ("elevation", given.surface.elevation_m),
+            ("elevation_change", given.surface.change_m),
+            ("elevation_change_uncertainty", given.uncertainty_m),
+        ):
+            assert np.array_equal(np.isnan(told[name][0]), np.isnan(values))
+            assert np.nanmax(np.abs(told[name][0] - values)) <= 0.5 / 1024 + 1e-4
+        assert told.point_count[0].sum() == given.surface.count.sum()
+        assert told.scan_id.values[0] == "251121_050000"
+        assert told.sop_id.values[0] == "sop-1"
+        assert float(told.air_temperature[0]) == -3.5
+        assert np.isnan(told.relative_humidity[0])
+        assert told.shared_parameter_covariance.values[0].diagonal() == pytest.approx([1e-10, 2e-10, 1.6e-5])
+        assert "sigma_geometry" in told
+        assert "sigma_instrument" not in told
+
+
+def test_the_series_is_in_the_order_of_time_and_holds_the_newest_revision(series, epoch):
+    build(series, epoch, [7, 3, 5])
+    again = store.write_epoch(series, epoch(5, value=9.0))
+    assert again.revision == 2
+    build_series(series)
+    with station.open(series.folder) as told:
+        assert np.all(np.diff(told.time.values.astype(np.int64)) > 0)
+        assert told.elevation_change[:, 3, 3].values == pytest.approx([0.03, 9.0, 0.07], abs=1e-3)
+        assert [str(name) for name in told.epoch_file.values] == [
+            "hef_20251121T030000Z.nc",
+            "hef_20251121T050000Z_r2.nc",
+            "hef_20251121T070000Z.nc",
+        ]
+        assert np.isnan(told.elevation_change[0, 3, -1])
+
+
+def test_nothing_stored_is_said(series):
+    with pytest.raises(StoreError, match="no series yet"):
+        station.open(series.folder)
+    with pytest.raises(StoreError, match="nothing is stored"):
+        build_series(series)
+
+
+def test_a_damaged_epoch_is_named(series, epoch):
+    build(series, epoch, [1, 2])
+    broken = store.epochs(series)[0].path
+    broken.write_bytes(broken.read_bytes()[:3000])
+    with pytest.raises(StoreError, match=broken.name):
+        build_series(series)
+
+
+def test_empty_chunks_are_not_written(series, epoch):
+    import h5py
+
+    written = store.write_epoch(series, epoch(1))
+    with h5py.File(written.path) as file:
+        assert file["elevation_change"].id.get_num_chunks() == 2  # of four: the east is empty
+        assert file["elevation_change"].chunks == (1, 128, 128)
+
+
+def test_the_reference_comes_back_and_its_versions_stay(series):
+    elevation = np.full(series.grid.shape, 2900.125)
+    elevation[:5] = np.nan
+    variance = np.where(np.isnan(elevation), np.nan, 0.0004).astype(np.float32)
+    common = Shared(("tilt_east",), ("rad",), np.zeros(1), np.array([[3e-11]]))
+    for version in ("1", "2"):
+        made = Reference(series.grid, version, elevation, variance, common, ("a", "b"))
+        reference.write_reference(series, made)
+    told = reference.read_reference(series)
+    assert told.version == "2"
+    assert told.scan_ids == ("a", "b")
+    assert np.array_equal(told.elevation_m, elevation, equal_nan=True)
+    assert told.random_variance_m2 == pytest.approx(variance, rel=0.01, nan_ok=True)
+    assert told.shared.covariance[0, 0] == 3e-11
+    assert (series.folder / "reference_1.nc").is_file()
+
+
+def out_of_room(series, epoch, written):
+    resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, 20_000))
+    signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+    try:
+        store.write_epoch(series, epoch)
+        written.send("written")
+    except StoreError as error:
+        written.send(str(error))
+
+
+def test_no_room_leaves_nothing_behind(series, epoch):
+    rng = np.random.default_rng(0)
+    noisy = epoch(1)
+    noisy.measurement.surface.change_m[:] = rng.normal(size=series.grid.shape)
+    here, there = multiprocessing.Pipe()
+    child = multiprocessing.get_context("fork").Process(target=out_of_room, args=(series, noisy, there))
+    child.start()
+    assert "cannot be written" in here.recv()
+    child.join()
+    assert not [path for path in series.folder.rglob("*") if path.is_file()]
+
+
+def keep_writing(series, epoch):
+    for hour in range(10_000):
+        store.write_epoch(series, epoch(hour))
+        build_series(series)
+
+
+def test_kill_at_any_moment_leaves_a_whole_series(series, epoch):
+    fork = multiprocessing.get_context("fork")
+    rng = np.random.default_rng(20251121)
+    build(series, epoch, [0])
+    for _ in range(12):
+        child = fork.Process(target=keep_writing, args=(series, epoch))
+        child.start()
+        time.sleep(rng.uniform(0.02, 0.4))
+        os.kill(child.pid, signal.SIGKILL)
+        child.join()
+        with station.open(series.folder) as told:
+            hours = (told.time.values.astype("datetime64[s]").astype(np.int64) - 450 - 1_763_683_200) / 3600
+            assert np.all(np.diff(hours) > 0)
+            assert told.elevation_change[:, 100, 10].values == pytest.approx(hours / 100, abs=1e-3)
+        for one in rows(series):
+            with netCDF4.Dataset(one.path) as file:
+                assert file["elevation_change"][0, 139, 0] == pytest.approx(one.start.hour / 100, abs=25)
