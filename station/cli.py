@@ -21,7 +21,9 @@ app = typer.Typer(
     rich_markup_mode=None,
 )
 
-SiteArgument = Annotated[Path, typer.Argument(metavar="SITE", help="The site file (TOML).", show_default=False)]
+SiteArgument = Annotated[
+    Path, typer.Argument(metavar="SITE", help="The site file (TOML).", show_default=False)
+]
 Json = Annotated[bool, typer.Option("--json", help="Print JSON.")]
 
 

@@ -25,7 +25,7 @@ from station.science import change, shared, uncertainty
 from station.science.air import AirCorrection, refraction_rise
 from station.science.grid import Gridder, slope_sampling_variance
 from station.science.pose import Frame, lean
-from station.science.terrain import smooth_gradient
+from station.science.terrain import cell_means, smooth_gradient
 
 BAND_ROWS = 128  # the cells that are looked at together: what a store chunk is high
 MARGIN_ROWS = 4  # rows beyond a band that its smoothed gradient looks at
@@ -153,7 +153,7 @@ def measure(
     known = ground.known if ground is not None else np.zeros(grid.shape, bool)
     change_m = np.where(known, mean_m, np.nan).astype(np.float32)
     elevation_m = mean_m + (
-        np.where(known, ground.datum_m + ground.rise_m.astype(np.float64), gridder.datum_m)
+        np.where(known, ground.datum_m + cell_means(ground.rise_m), gridder.datum_m)
         if ground is not None
         else gridder.datum_m
     )
@@ -311,7 +311,7 @@ def _terms_voordendag(view: View, setup: Setup) -> dict[str, Floats]:
 
 
 def provisional(gridder: Gridder, setup: Setup, scan_ids: tuple[str, ...]) -> Reference:
-    """Return the plain mean of all points of some scans: good enough to take residuals from."""
+    """Return the plain mean of all points of some scans as nodes: good enough to take residuals from."""
     elevation_m = gridder.mean_residual() + gridder.datum_m
     nothing = np.zeros(setup.grid.shape, np.float32)
     return Reference(setup.grid, "provisional", elevation_m, nothing, None, scan_ids)

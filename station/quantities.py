@@ -182,7 +182,7 @@ class Measurement:
 class Reference:
     """The master surface that change is measured from.
 
-    `elevation_m` is NaN where it is unknown. `position_m` is the scanner's (easting, northing, height).
+    `elevation_m` holds nodes at the cell centres, NaN where unknown; between them the surface is bilinear.
     """
 
     grid: Grid

@@ -14,8 +14,8 @@ from station.quantities import Reference, Shared
 
 _ROWS = (
     Variable(
-        "reference_elevation", ("y", "x"), "f4", "elevation of the reference surface", "m",
-        "surface_altitude", 3, "area: mean",
+        "reference_elevation", ("y", "x"), "f4", "elevation of the reference surface at the cell centre", "m",
+        "surface_altitude", 3, None, "bilinear between cell centres",
     ),
     Variable(
         "reference_random_uncertainty", ("y", "x"), "f4", "random uncertainty of the reference surface", "m",

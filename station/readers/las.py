@@ -18,7 +18,7 @@ from station.readers.las_layout import Layout, read_layout
 from station.readers.scan import WEEK_S, ScanHeader, foreign_code
 
 NEEDED = DecompressionSelection.base().decompress_z().decompress_gps_time()  # heeded in formats 6 and up
-BLOCKS_AT_ONCE = 8  # decoded together, a chunk a core; conversion still goes block by block, in the cache
+BLOCKS_AT_ONCE = 4  # decoded together, a chunk a core; conversion still goes block by block, in the cache
 LONGEST_SCAN_S = 86_400.0
 GLANCE = 16  # points looked at in one place
 FEW_CHUNKS = 20  # with fewer, chunk starts are too far apart to follow the head

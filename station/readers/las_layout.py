@@ -238,8 +238,9 @@ def _read_laszip(record: bytes, record_bytes: int) -> _LasZip:
     kinds = [struct.unpack_from("<HHH", record, LASZIP.size + 6 * item)[:2] for item in range(items)]
     if sum(size for _, size in kinds) != record_bytes:
         raise ScanError("corrupt LASzip record: its items do not add up to a point")
-    if chunk_points == 0:
-        raise ScanError("corrupt LASzip record: chunks of no points")
+    fixed = chunk_points != VARIABLE_CHUNKS
+    if chunk_points == 0 or (fixed and chunk_points * record_bytes > MOST_CHUNK_BYTES):
+        raise ScanError(f"corrupt LASzip record: chunks of {chunk_points:,} points")
     layers = sum(size if kind == BYTE14 else LAYERS.get(kind, 0) for kind, size in kinds)
     return _LasZip(record, layers if compressor == LAYERED else 0, chunk_points)
 

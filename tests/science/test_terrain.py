@@ -48,6 +48,24 @@ def test_ground_is_bilinear_between_centres_and_goes_on_to_the_edge():
     assert north == pytest.approx(0.25, abs=1e-3)
 
 
+def test_cell_means_of_a_curved_surface_and_back():
+    """A paraboloid of radius 1 km on 10 m cells: bilinear nodes stand 12.5 mm off per direction."""
+    rng = np.random.default_rng(2)
+    grid = Grid(0.0, 300.0, 10.0, 30, 30)
+    x_m, y_m = np.meshgrid(grid.x_m, grid.y_m)
+    nodes = x_m**2 / 2000
+    surface = terrain.Ground(grid, 0.0, nodes.astype(np.float32), np.ones(grid.shape, bool))
+    column, row = rng.uniform(14, 15, (2, 200_000))
+    assert terrain.cell_means(nodes)[14, 14] == pytest.approx(surface.under(column, row)[0].mean(), abs=1e-3)
+    assert terrain.cell_means(nodes)[14, 14] - nodes[14, 14] == pytest.approx(0.0125, abs=1e-6)
+    means = nodes + 1.0
+    assert terrain.cell_means(terrain.nodes_for(means))[3:-3, 3:-3] == pytest.approx(
+        means[3:-3, 3:-3], abs=1e-9
+    )
+    means[10, 10] = np.nan
+    assert np.array_equal(np.isnan(terrain.nodes_for(means)), np.isnan(means))
+
+
 def test_significance_at_95_percent():
     sigma = np.full(100_000, 0.1, np.float32)
     noise = np.random.default_rng(1).normal(0, 0.1, 100_000).astype(np.float32)
