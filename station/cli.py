@@ -46,7 +46,7 @@ def init(
     like: Annotated[str, typer.Option(help="hef: glacier, VZ-6000. mammoth: snow field, VZ-400i.")] = "hef",
 ) -> None:
     """Write a commented site file to start from."""
-    from station.sites import write_site
+    from station.config import write_site
 
     print(write_site(folder, like))
 
@@ -69,12 +69,18 @@ def check(site: SiteArgument, *, json_: Json = False) -> None:
 @app.command()
 def process(
     site: SiteArgument,
-    scans: Annotated[list[Path], typer.Argument(metavar="SCAN...", help="Scan files.", show_default=False)],
+    scans: Annotated[
+        list[Path],
+        typer.Argument(
+            metavar="SCAN...", help="Scan files.", exists=True, dir_okay=False, show_default=False
+        ),
+    ],
 ) -> None:
     """Measure these scans, now: verdict and one line each; exit 3 if some scan was set aside."""
-    from station.service.once import process_scans
+    from station.config import read_site
+    from station.service.once import one_line, process_scans
 
-    sys.exit(process_scans(site, scans))
+    sys.exit(process_scans(read_site(site), scans, lambda entry: print(one_line(entry), flush=True)))
 
 
 @app.command()
@@ -102,9 +108,11 @@ def simulate(
     seed: Annotated[int, typer.Option(help="The same seed gives the same station.")] = 1,
 ) -> None:
     """Build a small station with a known truth: scans, logs, weather, SOP, site file."""
-    from station.simulation.station import demo_station
+    from station.simulation.station import demo as scenario
+    from station.simulation.station import simulate as build
 
-    print(demo_station(folder, hours=hours, seed=seed))
+    build(folder, scenario(hours=hours, seed=seed))
+    print(folder / "site.toml")
 
 
 @app.command()

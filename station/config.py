@@ -355,6 +355,25 @@ class Site(SiteFile):
         return hashlib.sha256(json.dumps(told, sort_keys=True).encode()).hexdigest()[:16]
 
 
+def write_site(folder: Path, like: str) -> Path:
+    """Write the commented site file of a known station as `site.toml`; raise ConfigError if one is there."""
+    names = {"hef": "hintereisferner", "mammoth": "mammoth"}
+    if like not in names:
+        raise ConfigError(f"--like {like}: take one of {', '.join(names)}")
+    installed = Path(__file__).parent / "sites"
+    source = installed if installed.is_dir() else Path(__file__).parents[1] / "config"
+    path = folder / "site.toml"
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with path.open("x", encoding="utf-8") as file:
+            file.write((source / f"{names[like]}.toml").read_text(encoding="utf-8"))
+    except FileExistsError as error:
+        raise ConfigError(f"{path}: is there already; nothing is overwritten") from error
+    except OSError as error:
+        raise ConfigError(f"{path}: cannot be written: {error.strerror}") from error
+    return path
+
+
 def read_site(path: str | Path) -> Site:
     """Read and check a site file; raise ConfigError with every fault found, one a line."""
     path = Path(path).absolute()

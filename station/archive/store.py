@@ -94,7 +94,7 @@ def said(path: Path) -> dict[str, str]:
     try:
         with netCDF4.Dataset(path) as file:
             return {
-                row.name: str(netCDF4.chartostring(file[row.name][0]))
+                row.name: str(file[row.name][0])
                 for row in VARIABLES
                 if row.dtype == "S1" and row.name in file.variables
             } | {"verdict": VERDICTS[int(file["verdict"][0])]}

@@ -13,7 +13,7 @@ import numpy as np
 from pyproj import CRS, Transformer
 
 from station.config import Origin, Site, SopSection
-from station.errors import ConfigError, ScanError
+from station.errors import ConfigError, NotReadyError, ScanError
 from station.pipeline import Pose, Setup
 from station.quantities import Air, HeadTrack, InclinationLog, Shared
 from station.readers.inclination import read_inclination
@@ -67,9 +67,6 @@ def gather(site: Site, reader: ScanReader, log_path: Path | None, start: datetim
         air, assumed if site.air.scanner_corrects else None, site.instrument.wavelength_um
     )
     provenance = {"sop_id": sop_id, "lean_zero": json.dumps(asdict(zero)) if zero else ""}
-    if lean is not None:
-        provenance["log_offset_s"] = f"{lean.offset_s:.2f}"
-        provenance["log_cutoff_hz"] = f"{lean.cutoff_hz:.5f}"
     tilt = lean.tilt if lean is not None else None
     return Gathered(
         setup,
@@ -264,13 +261,17 @@ def _air(site: Site, moment: datetime, height_m: float, lacking: list[str]) -> t
     """Return the air of the scan and whether it was measured."""
     setting = site.air.scanner_setting
     if site.weather is not None:
-        given = site.weather
+        given, moment_s = site.weather, moment.timestamp()
         try:
             log = read_weather(
-                given.file, format=given.format, columns=given.columns, utc_offset_h=given.utc_offset_h
+                given.file,
+                format=given.format,
+                columns=given.columns,
+                utc_offset_h=given.utc_offset_h,
+                window_utc_s=(moment_s - given.max_age_s, moment_s + given.max_age_s),
             )
-            air = air_at(log, moment.timestamp(), given.max_age_s)
-        except (ScanError, OSError) as error:
+            air = air_at(log, moment_s, given.max_age_s)
+        except (ScanError, NotReadyError) as error:  # a scan does not wait for ever for its weather
             lacking.append(f"weather unusable: {error}")
             air = None
         if air is not None:

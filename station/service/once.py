@@ -1,0 +1,60 @@
+"""Scans processed now, without a service: `station process` and `station demo`."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from pathlib import Path
+
+from station.config import Site
+from station.errors import NotReadyError, ScanError
+from station.service.inbox import Arrival
+from station.service.journal import Entry, Journal, State
+from station.service.lock import only_writer
+from station.service.worker import Worker
+
+Tell = Callable[[Entry], None]
+
+
+def process_scans(site: Site, scans: Sequence[Path], tell: Tell) -> int:
+    """Process scans in the order of their names, `tell` the journal row of each; return the exit status.
+
+    Those that the reference was built from are done again when it is there, and told again.
+    """
+    site.station.data.mkdir(parents=True, exist_ok=True)
+    with only_writer(site.station.data), Journal(site.station.data / "journal.sqlite") as journal:
+        worker = Worker(site, journal)
+        arrivals = {path.name: _arrival(site, path) for path in sorted(scans, key=lambda path: path.name)}
+        journal.seen((one.name, one.size, one.mtime_ns, "") for one in arrivals.values())
+        todo: Iterable[Arrival] = arrivals.values()
+        while todo:
+            for arrival in todo:
+                worker.take(arrival)
+                entry = journal.entry(arrival.name)
+                assert entry is not None  # noqa: S101 - it was just taken
+                tell(entry)
+            again = {row.name for row in journal.waiting() if row.state is State.WAITING}
+            todo = [one for name, one in arrivals.items() if name in again]
+        states = {row.state for row in journal.rows() if row.name in arrivals}
+    if State.SET_ASIDE in states:
+        return ScanError.exit_status
+    return NotReadyError.exit_status if State.LATER in states else 0
+
+
+def _arrival(site: Site, path: Path) -> Arrival:
+    log = None
+    if site.inclination is not None:
+        beside = path.with_name(f"{path.stem}{site.inclination.suffix}")
+        log = beside.absolute() if beside.is_file() else None
+    status = path.lstat()
+    return Arrival(path.name, path.absolute(), log, status.st_size, status.st_mtime_ns)
+
+
+def one_line(entry: Entry) -> str:
+    """Say what became of a scan, in one line."""
+    figures = " ".join(f"{key}={value}" for key, value in entry.figures.items())
+    if entry.state is State.STORED:
+        measured = f" reference={entry.reference}" if entry.reference else " (no reference yet)"
+        reason = f" ({entry.reason})" if entry.reason else ""
+        return f"{entry.name}: {entry.verdict}{reason} {figures}{measured}"
+    why = entry.reason if entry.state is State.SET_ASIDE else entry.waits_for
+    return f"{entry.name}: {entry.state.value.replace('_', ' ')}: {why}"

@@ -1,0 +1,426 @@
+"""One scan from the inbox into the archive; the only place that touches both.
+
+The functions run in child processes; `Worker` runs them and commits to the journal.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import logging
+import math
+import os
+import stat
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import TypeVar
+
+import numpy as np
+
+from station import __version__
+from station.archive import join, store
+from station.archive.layout import Series
+from station.archive.reference import read_reference, write_reference
+from station.archive.series import build_series
+from station.config import Site
+from station.errors import NotReadyError, ScanError
+from station.pipeline import gridder_for, master, measure, provisional, survey
+from station.quantities import Measurement, Quality, Reference
+from station.readers.raster import read_geotiff
+from station.readers.scan import ScanReader, open_scan, utc_interval
+from station.science.terrain import nodes_for
+from station.service import child
+from station.service.gather import Gathered, gather
+from station.service.inbox import Arrival
+from station.service.journal import Entry, Journal, State
+
+log = logging.getLogger("station")
+Progress = Callable[[], None]
+T = TypeVar("T")
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What became of a scan that was stored."""
+
+    start_utc_s: float
+    sha256: str
+    epoch: str  # relative to the data folder
+    revision: int
+    verdict: str
+    reason: str
+    reference: str | None
+    figures: dict[str, float | str]
+
+
+def series_of(site: Site) -> Series:
+    """Return the store of a site."""
+    return Series(
+        folder=site.station.data,
+        station_id=site.station.id,
+        grid=site.grid_cells,
+        crs=site.map.crs,
+        vertical_datum=site.map.vertical_datum,
+        name=site.station.name,
+        institution=site.station.institution,
+    )
+
+
+def process(site: Site, arrival: Arrival, progress: Progress) -> Outcome:
+    """Measure a scan and store its epoch, unless just this is stored.
+
+    Raises ScanError where the scan cannot be used.
+    """
+    began_s = time.monotonic()
+    series = series_of(site)
+    with _held_still(arrival.path) as scan_sha256, _opened(site, arrival.path) as reader:
+        progress()
+        start, end, _ = utc_interval(reader, site.scans.name)
+        gathered = gather(site, reader, arrival.log, start, end)
+        reference = reference_of(site, series)
+        provenance = {
+            "scan_sha256": scan_sha256,
+            "log_sha256": _sha256(arrival.log) if arrival.log else "",
+            "science_hash": site.science_hash,
+            "reference_version": reference.version if reference else "",
+            "software_version": __version__,
+            **gathered.provenance,
+        }
+        gridder = gridder_for(gathered.setup, reference)
+        survey(gridder, reader.blocks(), gathered.setup, gathered.pose, progress)
+    if not gridder.count.any():
+        raise ScanError("no point falls on the grid: wrong scans.frame, SOP, CRS or units?")
+    measured = measure(gridder, gathered.setup, gathered.unknown, reference)
+    progress()
+    epoch = store.Epoch(
+        start_s=start.timestamp(),
+        end_s=end.timestamp(),
+        scan_id=arrival.path.stem,
+        measurement=measured,
+        shared=gathered.unknown,
+        verdict="degraded" if gathered.lacking else "good",
+        verdict_reason="; ".join(gathered.lacking),
+        numbers=_numbers(measured, gathered, reader.header.point_count),
+        provenance=provenance,
+    )
+    written = _same_as(series, epoch) or store.write_epoch(series, epoch)
+    return Outcome(
+        start_utc_s=epoch.start_s,
+        sha256=scan_sha256,
+        epoch=str(written.path.relative_to(series.folder)),
+        revision=written.revision,
+        verdict=epoch.verdict,
+        reason=epoch.verdict_reason,
+        reference=reference.version if reference else None,
+        figures=_figures(measured, reader.header.point_count, time.monotonic() - began_s),
+    )
+
+
+def _same_as(series: Series, epoch: store.Epoch) -> store.Stored | None:
+    """Return the stored epoch of this start if it was made from the same inputs in the same way.
+
+    So a scan whose epoch was written just before the power went is not stored twice.
+    """
+    held = store.revisions(series, datetime.fromtimestamp(epoch.start_s, UTC))
+    if not held:
+        return None
+    said = store.said(held[-1].path)
+    same = all(said.get(key) == value for key, value in epoch.provenance.items() if key in said)
+    return held[-1] if same and said.get("scan_id") == epoch.scan_id else None
+
+
+def build_reference(site: Site, arrivals: list[Arrival], version: str, progress: Progress) -> str:
+    """Make the master surface from scans and store it; return its version.
+
+    Twice over the scans: their plain mean first, then their residuals to it.
+    """
+    series = series_of(site)
+    base: Reference | None = None
+    for _ in range(2):
+        gridder, unknown, setup = None, [], None
+        for arrival in arrivals:
+            with _opened(site, arrival.path) as reader:
+                start, end, _ = utc_interval(reader, site.scans.name)
+                gathered = gather(site, reader, arrival.log, start, end)
+                setup = setup or gathered.setup
+                gridder = gridder or gridder_for(setup, base)
+                survey(gridder, reader.blocks(), setup, gathered.pose, progress)
+                unknown.append(gathered.unknown)
+        if gridder is None or setup is None:
+            raise NotReadyError("no scans to make a reference from")
+        if base is None:
+            base = provisional(gridder, setup, tuple(arrival.path.stem for arrival in arrivals))
+        else:
+            write_reference(series, master(gridder, base, unknown, version))
+    return version
+
+
+def reference_of(site: Site, series: Series) -> Reference | None:
+    """Return the master surface; one given as a file is taken into the store at first use."""
+    held = read_reference(series)
+    given = site.reference.scans
+    if not isinstance(given, Path):
+        return held
+    version = f"{given.stem}-{_sha256(given)[:8]}"
+    if held is None or held.version != version:
+        elevation_m = nodes_for(read_geotiff(given, series.grid, series.crs))
+        exact = np.where(np.isfinite(elevation_m), 0.0, np.nan).astype(np.float32)
+        write_reference(series, Reference(series.grid, version, elevation_m, exact, None, ()))
+        held = read_reference(series)
+    return held
+
+
+def publish(site: Site, progress: Progress) -> None:
+    """Build `series.nc` anew over the epochs that exist."""
+    build_series(series_of(site))
+    progress()
+
+
+def join_epochs(site: Site, progress: Progress) -> int:
+    """Join closed days and months; return how many files that made."""
+    series = series_of(site)
+    return join.join_closed(series, datetime.now(UTC), progress) if store.epochs(series) else 0
+
+
+def sweep_store(site: Site, progress: Progress) -> int:
+    """Delete what the series has not named for two days; return how many files went."""
+    progress()
+    return len(join.sweep(series_of(site), datetime.now(UTC)))
+
+
+def stored_epochs(site: Site, progress: Progress) -> dict[str, str]:
+    """Return the newest epoch file of each scan id (path relative to the data folder)."""
+    series = series_of(site)
+    progress()
+    return {
+        store.said(one.path)["scan_id"]: str(one.path.relative_to(series.folder))
+        for one in store.epochs(series)
+    }
+
+
+@contextmanager
+def _opened(site: Site, path: Path) -> Iterator[ScanReader]:
+    range_max_m = site.scanner.range_max_m if site.scans.frame == "scanner" else None
+    with open_scan(path, range_max_m=range_max_m) as reader:
+        yield reader
+
+
+@contextmanager
+def _held_still(path: Path) -> Iterator[str]:
+    """Give the SHA-256 of a regular file; raise NotReadyError if it changed meanwhile."""
+    before = _fingerprint(path)
+    yield _sha256(path)
+    if _fingerprint(path) != before:
+        raise NotReadyError("the file changed while it was read")
+
+
+def _fingerprint(path: Path) -> tuple[int, int, int]:
+    try:
+        status = path.lstat()
+    except FileNotFoundError as error:
+        raise NotReadyError("the file is gone") from error
+    except OSError as error:
+        raise NotReadyError(f"the file cannot be looked at: {error.strerror}") from error
+    if not stat.S_ISREG(status.st_mode):
+        raise ScanError("not a regular file: links, pipes and devices are refused")
+    return status.st_ino, status.st_size, status.st_mtime_ns
+
+
+def _sha256(path: Path) -> str:
+    try:
+        with os.fdopen(os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK), "rb") as file:
+            return hashlib.file_digest(file, "sha256").hexdigest()
+    except OSError as error:
+        raise NotReadyError(f"{path.name} cannot be read: {error.strerror}") from error
+
+
+def _numbers(measured: Measurement, gathered: Gathered, points: int) -> dict[str, float]:
+    """Return what the store keeps once per scan."""
+    lean, air = gathered.lean, gathered.air
+    told = {
+        "point_total": float(points),
+        "coverage": float(np.mean(measured.surface.count > 0)),
+    }
+    if lean is not None:
+        told["platform_roll"] = math.degrees(lean.mean_roll_rad)
+        told["platform_pitch"] = math.degrees(lean.mean_pitch_rad)
+        told["tilt_residual"] = math.degrees(lean.noise_rad)
+        told["log_offset"] = lean.offset_s
+    if air is not None:
+        told["air_temperature"] = air.temperature_c
+        told["air_pressure"] = air.pressure_hpa
+        told["relative_humidity"] = air.humidity_pct
+    return told
+
+
+def _figures(measured: Measurement, points: int, seconds: float) -> dict[str, float | str]:
+    """Return what the log line and the status show of a scan."""
+    seen = np.isfinite(measured.uncertainty_m)
+    told: dict[str, float | str] = {
+        "points": points,
+        "cells": int(seen.sum()),
+        "sigma_median_m": round(float(np.median(measured.uncertainty_m[seen])), 4)
+        if seen.any()
+        else math.nan,
+    }
+    change_m = measured.surface.change_m[np.isfinite(measured.surface.change_m)]
+    if len(change_m):
+        told["change_median_m"] = round(float(np.median(change_m)), 4)
+        significant = (measured.quality & Quality.CHANGE_SIGNIFICANT) > 0
+        told["significant_pct"] = round(100 * float(significant.sum()) / len(change_m), 1)
+    told["seconds"] = round(seconds, 2)
+    return told
+
+
+class Worker:
+    """Takes scans one by one: child process, journal, series, reference."""
+
+    def __init__(
+        self,
+        site: Site,
+        journal: Journal,
+        *,
+        on_progress: Progress = lambda: None,
+        should_stop: Callable[[], bool] = lambda: False,
+    ) -> None:
+        self._site = site
+        self._journal = journal
+        self._on_progress = on_progress
+        self._should_stop = should_stop
+        self._taken: dict[str, Arrival] = {}
+
+    def take(self, arrival: Arrival) -> bool:
+        """Measure and store a scan, and say so in the journal and in one log line; tell whether it is stored.
+
+        Raises StoreError where the store cannot be written; the scan stays waiting then.
+        """
+        self._taken[arrival.name] = arrival
+        try:
+            outcome = self._run(process, arrival)
+        except ScanError as error:
+            self._journal.set_aside(arrival.name, str(error))
+            log.warning("scan=%s verdict=set_aside reason=%s", arrival.name, _quoted(str(error)))
+            return False
+        except NotReadyError as error:
+            pause_s = self._journal.later(arrival.name, str(error))
+            log.info(
+                "scan=%s verdict=later reason=%s retry_s=%.0f", arrival.name, _quoted(str(error)), pause_s
+            )
+            return False
+        self._run(publish)
+        self._journal.stored(
+            arrival.name,
+            sha256=outcome.sha256,
+            verdict=outcome.verdict,
+            epoch=outcome.epoch,
+            start_utc_s=outcome.start_utc_s,
+            revision=outcome.revision,
+            reference=outcome.reference,
+            reason=outcome.reason,
+            figures=outcome.figures,
+        )
+        _say(arrival.name, outcome)
+        self._make_reference_when_due()
+        return True
+
+    def recover(self) -> None:
+        """Make journal and files agree: epochs without their journal row are redone, the series is rebuilt.
+
+        An epoch written just before a power cut is found by `process` as the same and not stored twice.
+        """
+        data = self._site.station.data
+        lost = [row.name for row in self._journal.rows(State.STORED) if row.epoch and not self._is_there(row)]
+        for name in lost:
+            log.warning("scan=%s reason=%s", name, _quoted("its epoch is missing from the store: done again"))
+        self._journal.again(lost)
+        if any((data / "epochs").glob("*/*/*/*.nc")):
+            self._run(publish)
+
+    def join_closed(self) -> None:
+        """Join closed days and months."""
+        self._run(join_epochs)
+
+    def sweep(self) -> None:
+        """Delete what no longer serves."""
+        self._run(sweep_store)
+
+    def _is_there(self, row: Entry) -> bool:
+        """Tell whether a stored epoch still is: as itself, or joined into its day or month."""
+        data = self._site.station.data
+        start = datetime.fromtimestamp(row.start_utc_s or 0.0, UTC)
+        if (data / str(row.epoch)).is_file():
+            return True
+        days = (data / "days" / start.strftime("%Y/%m")).glob(f"*_{start:%Y%m%d}_r*.nc")
+        months = (data / "months" / start.strftime("%Y")).glob(f"*_{start:%Y%m}_r*.nc")
+        return any(days) or any(months)
+
+    def _make_reference_when_due(self) -> None:
+        """Build the master surface once enough usable scans are stored, and have them measured from it."""
+        wanted = self._site.reference.scans
+        if isinstance(wanted, Path) or (self._site.station.data / "reference.nc").exists():
+            return
+        usable = [row for row in self._journal.rows(State.STORED) if row.verdict == "good"]
+        usable.sort(key=lambda row: row.start_utc_s or 0.0)
+        if len(usable) < wanted:
+            return
+        arrivals = [self._arrival(row.name) for row in usable[:wanted]]
+        missing = [arrival.name for arrival in arrivals if not arrival.path.is_file()]
+        if missing:
+            log.warning(
+                "reference=waiting reason=%s", _quoted(f"no longer in the inbox: {', '.join(missing)}")
+            )
+            return
+        try:
+            version = self._run(build_reference, arrivals, "1")
+        except (ScanError, NotReadyError) as error:
+            log.warning("reference=failed reason=%s", _quoted(str(error)))
+            return
+        log.info("reference=%s scans=%d", version, wanted)
+        self._journal.again(row.name for row in self._journal.rows(State.STORED) if row.reference != version)
+
+    def _arrival(self, name: str) -> Arrival:
+        """Find a scan again: where it was taken from, or in the inbox."""
+        if name in self._taken:
+            return self._taken[name]
+        path = self._site.scans.inbox / name
+        log_path = None
+        if self._site.inclination is not None:
+            beside = path.with_name(f"{path.stem}{self._site.inclination.suffix}")
+            log_path = beside if beside.is_file() else None
+        status = path.stat() if path.is_file() else None
+        return Arrival(
+            name=name,
+            path=path,
+            log=log_path,
+            size=status.st_size if status else 0,
+            mtime_ns=status.st_mtime_ns if status else 0,
+        )
+
+    def _run(self, task: Callable[..., T], *args: object) -> T:
+        return child.run(
+            task,
+            self._site,
+            *args,
+            memory_gb=self._site.service.memory_gb,
+            timeout_s=self._site.scans.timeout_s,
+            on_progress=self._on_progress,
+            should_stop=self._should_stop,
+        )
+
+
+def _say(name: str, outcome: Outcome) -> None:
+    """Log the one line of a scan."""
+    words = [f"scan={name}", f"verdict={outcome.verdict}"]
+    words += [f"{key}={value}" for key, value in outcome.figures.items()]
+    words.append(f"reference={outcome.reference or 'none'}")
+    if outcome.reason:
+        words.append(f"reason={_quoted(outcome.reason)}")
+    log.log(logging.INFO if outcome.verdict == "good" else logging.WARNING, "%s", " ".join(words))
+
+
+def _quoted(text: str) -> str:
+    plain = text.replace('"', "'").replace("\n", " ")
+    return f'"{plain}"'
