@@ -33,9 +33,9 @@ def read_inclination(path: Path) -> InclinationLog:
     if not set(COLUMNS) <= set(names):
         raise ScanError(f"{path.name}: its first line is not Time,Roll,Pitch but {lines[0][:60]!r}")
     places = [names.index(name) for name in COLUMNS]
-    rows = np.array([_numbers(line, places) for line in [*lines[1:], *([cut] if cut.strip() else [])]])
+    rows = np.array([_numbers(line, places) for line in lines[1:]]).reshape(-1, 3)
     if cut.strip():
-        rows[-1] = np.nan
+        rows = np.vstack([rows, [np.nan] * 3])
     readable = np.isfinite(rows).all(axis=-1)
     if not readable.any():
         raise ScanError(f"{path.name}: no row of {len(rows)} can be read")

@@ -1,15 +1,21 @@
-"""LAS and LAZ scans: 1.0 to 1.4, all point formats, by laspy and lazrs."""
+"""LAS and LAZ scans: 1.0 to 1.4, all point formats.
+
+lazrs decodes, laspy tells the coordinate system. Points are not read through laspy, for it refuses a scan
+over any odd letter in a record that nobody needs.
+"""
 
 from __future__ import annotations
 
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager
+from io import BufferedReader
 from pathlib import Path
-from typing import Any, ClassVar, Self
+from typing import BinaryIO, ClassVar, Self
 
+import lazrs
 import numpy as np
-from laspy import DecompressionSelection, LasHeader, LasReader, LazBackend
+from laspy import DecompressionSelection, LasHeader
 from numpy.typing import NDArray
 
 from station.errors import NotReadyError, ScanError
@@ -42,7 +48,7 @@ class LasScan:
             self._identity = _identity(status)
             self._layout = read_layout(file, status.st_size)
             file.seek(0)
-            crs_wkt = _crs_wkt(LasHeader.read_from(file))
+            crs_wkt = _crs_wkt(file)
         self._time_range_s: tuple[float, float] | None = None
         low_m, high_m = self._layout.low_m, self._layout.high_m
         self.header = ScanHeader(
@@ -79,9 +85,9 @@ class LasScan:
         timed = self.time_range_s() is not None
         check = _Check(self._layout, self._range_max_m)
         left = self._layout.count
-        with self._points(LazBackend.LazrsParallel) as reader:
+        with self._points(all_cores=True) as points:
             while left:
-                records = _read(reader, min(left, BLOCKS_AT_ONCE * size))
+                records = points.read(min(left, BLOCKS_AT_ONCE * size))
                 left -= len(records)
                 for first in range(0, len(records), size):
                     yield check.shots(records[first : first + size], timed=timed)
@@ -108,8 +114,7 @@ class LasScan:
         """
         if self._range_max_m is None or self.time_range_s() is None:
             return None
-        chunks = self._layout.chunk_starts
-        if chunks is not None and len(chunks) < FEW_CHUNKS:
+        if self._layout.laszip is not None and len(self._layout.chunk_starts) < FEW_CHUNKS:
             places = self.blocks(max(self._layout.count // samples, GLANCE))
         else:
             places = self._glances(samples, _Check(self._layout, self._range_max_m))
@@ -128,32 +133,58 @@ class LasScan:
         """Give a few echoes each from about `samples` places, the first and the last of the file included."""
         count = self._layout.count
         starts = self._layout.chunk_starts
-        if starts is None:
+        if self._layout.laszip is None:
             starts = np.linspace(0, count - 1, samples).astype(np.int64)
         chosen = starts[np.linspace(0, len(starts) - 1, min(samples, len(starts))).astype(np.int64)]
-        with self._points(LazBackend.Lazrs) as reader:
+        with self._points(all_cores=False) as points:
             for start in np.unique([*chosen, max(count - GLANCE, 0)]).tolist():
-                with foreign_code(f"corrupt near point {start:,}"):
-                    reader.seek(start)
-                yield check.shots(_read(reader, min(GLANCE, count - start)), timed=True)
+                points.seek(start)
+                yield check.shots(points.read(min(GLANCE, count - start)), timed=True)
 
     @contextmanager
-    def _points(self, backend: LazBackend) -> Iterator[LasReader]:
+    def _points(self, *, all_cores: bool) -> Iterator[_Points]:
         """Open the points, at the first; passes see the file that was checked or NotReadyError."""
         with foreign_code("cannot be opened again"):
             file = self.path.open("rb")
         with file:
             if _identity(os.fstat(file.fileno())) != self._identity:
                 raise NotReadyError("has changed since it was opened")
-            with foreign_code("cannot be opened again"):
-                reader = LasReader(
-                    file,
-                    closefd=False,
-                    laz_backend=backend,
-                    read_evlrs=False,
-                    decompression_selection=NEEDED,
-                )
-            yield reader
+            yield _Points(file, self._layout, all_cores=all_cores)
+
+
+class _Points:
+    """The records of an open file, one after the other from wherever one seeks."""
+
+    def __init__(self, file: BufferedReader, layout: Layout, *, all_cores: bool) -> None:
+        self._file = file
+        self._layout = layout
+        self._at = 0
+        self._decompressor = None
+        file.seek(layout.points_at)
+        if layout.laszip is not None:
+            with foreign_code("cannot be decompressed"):
+                decompressor = lazrs.ParLasZipDecompressor if all_cores else lazrs.LasZipDecompressor
+                self._decompressor = decompressor(file, layout.laszip, NEEDED.to_lazrs())
+
+    def seek(self, number: int) -> None:
+        """Go to a point."""
+        self._at = number
+        with foreign_code(f"corrupt near point {number:,}"):
+            if self._decompressor is None:
+                self._file.seek(self._layout.points_at + number * self._layout.record_bytes)
+            else:
+                self._decompressor.seek(number)
+
+    def read(self, count: int) -> Records:
+        """Decode the next `count` records; they must be there."""
+        raw = bytearray(count * self._layout.record_bytes)
+        with foreign_code(f"corrupt after point {self._at:,}"):
+            if self._decompressor is not None:
+                self._decompressor.decompress_many(raw)
+            elif self._file.readinto(raw) != len(raw):
+                raise ScanError(f"cut off: ends before point {self._at + count:,} of {self._layout.count:,}")
+        self._at += count
+        return np.frombuffer(raw, dtype=self._layout.record)
 
 
 class _Check:
@@ -213,23 +244,11 @@ class _Check:
         return time_s
 
 
-def _read(reader: LasReader, count: int) -> Records:
-    """Decode the next `count` records; they must be there."""
-    before = reader.points_read
-    with foreign_code(f"corrupt after point {before:,}"):
-        records: Any = reader.read_points(count).array
-    if len(records) != count:
-        raise ScanError(
-            f"cut off: {before + len(records):,} of {reader.header.point_count:,} points are there"
-        )
-    return np.asarray(records)
-
-
-def _crs_wkt(header: LasHeader) -> str | None:
+def _crs_wkt(file: BinaryIO) -> str | None:
     """Give the coordinate system a file names, None where it names none that can be understood."""
     try:
         with foreign_code("coordinate system"):
-            crs = header.parse_crs()
+            crs = LasHeader.read_from(file).parse_crs()
             return None if crs is None else crs.to_wkt()
     except ScanError:
         return None

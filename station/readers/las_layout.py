@@ -39,23 +39,34 @@ BYTE14 = 14  # item type with one layer a byte
 
 @dataclass(frozen=True)
 class Layout:
-    """What the points of a LAS/LAZ file must amount to, and where a decoder can enter."""
+    """What the points of a LAS/LAZ file must amount to, and where and how a decoder can enter."""
 
     point_format: int
     record_bytes: int
     count: int
+    points_at: int  # byte
     scale: Floats  # (3,)
     offset: Floats  # (3,)
     low_m: Floats  # (3,)
     high_m: Floats  # (3,)
     standard_time: bool
     software: str
-    chunk_starts: Ints | None  # (chunks,) number of the first point of each; None: not compressed
+    laszip: bytes | None  # the record that tells how the points are compressed; None: they are not
+    chunk_starts: Ints  # (chunks,) number of the first point of each, none where not compressed
 
     @property
     def has_time(self) -> bool:
         """Whether the point format has a field for the time."""
         return self.point_format in TIMED
+
+    @property
+    def record(self) -> np.dtype[np.void]:
+        """Where in a point its whole numbers X, Y, Z and its gps_time stand."""
+        names, kinds, places = ["X", "Y", "Z"], ["<i4"] * 3, [0, 4, 8]
+        if self.has_time:
+            names, kinds = [*names, "gps_time"], [*kinds, "<f8"]
+            places = [*places, 22 if self.point_format >= 6 else 20]
+        return np.dtype({"names": names, "formats": kinds, "offsets": places, "itemsize": self.record_bytes})
 
 
 @dataclass(frozen=True)
@@ -92,23 +103,25 @@ def read_layout(file: BinaryIO, size: int) -> Layout:
     _check_sizes(header, size)
     scale, offset, low_m, high_m = _check_numbers(header.box)
     laszip = _find_laszip(file, header)
-    chunk_starts = None
     if not header.compressed:
         _check_room(header)
+        record, chunk_starts = None, np.empty(0, dtype=np.int64)
     elif laszip is None:
         raise ScanError("compressed, but the record that says how (LASzip VLR) is missing")
     else:
-        chunk_starts = _check_chunks(file, header, laszip)
+        record, chunk_starts = laszip.record, _check_chunks(file, header, laszip)
     return Layout(
         point_format=header.point_format,
         record_bytes=header.record_bytes,
         count=header.count,
+        points_at=header.points_at,
         scale=scale,
         offset=offset,
         low_m=low_m,
         high_m=high_m,
         standard_time=bool(header.flags & 1),
         software=header.software,
+        laszip=record,
         chunk_starts=chunk_starts,
     )
 

@@ -1,0 +1,90 @@
+"""The log of lean, with what scanners and transfers do to it."""
+
+import os
+
+import numpy as np
+import pytest
+
+from station.errors import NotReadyError, ScanError
+from station.readers.inclination import read_inclination
+
+
+def written(tmp_path, text):
+    path = tmp_path / "s-incl.txt"
+    path.write_bytes(text if isinstance(text, bytes) else text.encode())
+    return path
+
+
+def test_a_real_log_is_read(shared_data):
+    log = read_inclination(shared_data / "riegl/140123_202748-incl.txt")
+    assert len(log.time_s) == 10
+    assert log.time_s[[0, -1]] == pytest.approx([91.8223, 100.8962])
+    assert np.degrees(log.roll_rad[:3]) == pytest.approx([-0.286, -0.285, -0.288])
+    assert np.degrees(log.pitch_rad[-1]) == pytest.approx(-0.277)
+
+
+def test_bad_rows_stay_to_be_counted_and_order_is_left(tmp_path):
+    rows = (
+        "1,0.1,0.2\nbad row\n2,0.1\n2,nan,0.2\n2,0.1,0.2\n2,0.1,0.2\n1.5,0.1,0.2\n\n3,,0.2\n4,0.3,0.4,extra\n"
+    )
+    log = read_inclination(written(tmp_path, "Time,Roll,Pitch\n" + rows))
+    assert log.time_s == pytest.approx([1, np.nan, np.nan, np.nan, 2, 2, 1.5, np.nan, 4], nan_ok=True)
+    assert np.array_equal(np.isnan(log.roll_rad), np.isnan(log.time_s))
+    assert np.degrees(log.pitch_rad[-1]) == pytest.approx(0.4)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "Time,Roll,Pitch\r\n1,0.1,0.2\r\n2,0.1,0.2\r\n",
+        "\ufeffTime,Roll,Pitch\n1,0.1,0.2\n2,0.1,0.2\n",
+        ' time , "Roll", pitch\n1,0.1,0.2\n2,0.1,0.2\n',
+        "Pitch,Time,Roll,Temp\n0.2,1,0.1,7\n0.2,2,0.1,7\n",
+    ],
+)
+def test_dialects_of_the_header(tmp_path, text):
+    log = read_inclination(written(tmp_path, text))
+    assert list(log.time_s) == [1, 2]
+    assert np.degrees(log.pitch_rad) == pytest.approx([0.2, 0.2])
+    assert np.degrees(log.roll_rad) == pytest.approx([0.1, 0.1])
+
+
+def test_half_a_number_is_not_taken_for_a_whole_one(tmp_path):
+    log = read_inclination(written(tmp_path, "Time,Roll,Pitch\n1,0.1,-0.275\n2,0.1,-0.2"))
+    assert log.time_s == pytest.approx([1, np.nan], nan_ok=True)
+
+
+def test_the_week_runs_on(tmp_path):
+    log = read_inclination(written(tmp_path, "Time,Roll,Pitch\n604799.5,0,0\n0.5,0,0\n1.5,0,0\n"))
+    assert list(log.time_s) == [604_799.5, 604_800.5, 604_801.5]
+
+
+@pytest.mark.parametrize(
+    ("text", "reason"),
+    [
+        ("", "holds no row"),
+        ("\n\n", "holds no row"),
+        ("Time,Roll,Pitch\n", "no row of 0"),
+        ("Time,Roll,Pitch\nx,y,z\n", "no row of 1"),
+        ("Time,X,Y\n1,2,3\n", "is not Time,Roll,Pitch but 'Time,X,Y'"),
+        ("1,2,3\n", "is not Time,Roll,Pitch"),
+        (bytes(range(256)) * 10, "is not Time,Roll,Pitch"),
+        (b"\0" * 1000, "holds no row"),
+    ],
+)
+def test_a_log_of_nothing_usable_is_refused(tmp_path, text, reason):
+    with pytest.raises(ScanError, match=reason):
+        read_inclination(written(tmp_path, text))
+
+
+def test_an_endless_log_is_refused(tmp_path):
+    path = tmp_path / "s-incl.txt"
+    with path.open("wb") as file:
+        os.truncate(file.fileno(), 1 << 34)
+    with pytest.raises(ScanError, match="too large"):
+        read_inclination(path)
+
+
+def test_a_lost_log_waits(tmp_path):
+    with pytest.raises(NotReadyError, match="No such file"):
+        read_inclination(tmp_path / "none-incl.txt")

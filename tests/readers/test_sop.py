@@ -1,0 +1,110 @@
+"""Matrices as people write them, and which holds when."""
+
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from station.config import SopSection
+from station.errors import ConfigError, ScanError
+from station.readers.sop import read_matrix, sop_for
+
+TURN = Rotation.from_euler("xyz", [0.1, 0.59, -1.2]).as_matrix()
+
+
+def written(tmp_path, rotation, *, last="0 0 0 1", head="# solved from 241001_120000\n", digits=16):
+    rows = [f"{a:.{digits}f} {b:.{digits}f}\t{c:.{digits}f}  12.5" for a, b, c in rotation]
+    path = tmp_path / "sop.dat"
+    path.write_text(head + "\n".join(rows) + f"  # right\n\n{last}\n")
+    return path
+
+
+def test_a_matrix_is_read_as_it_stands(tmp_path):
+    matrix = read_matrix(written(tmp_path, TURN))
+    assert matrix[:3, :3] == pytest.approx(TURN, abs=1e-15)
+    assert list(matrix[:3, 3]) == [12.5, 12.5, 12.5]
+    assert list(matrix[3]) == [0, 0, 0, 1]
+
+
+@pytest.mark.parametrize("digits", [9, 7])
+def test_the_digits_people_write_are_enough(tmp_path, digits):
+    assert read_matrix(written(tmp_path, TURN, digits=digits))[:3, :3] == pytest.approx(TURN, abs=1e-6)
+
+
+def test_lost_digits_are_mended(tmp_path):
+    turn = read_matrix(written(tmp_path, TURN, digits=4))[:3, :3]
+    assert turn @ turn.T == pytest.approx(np.eye(3), abs=1e-14)
+    assert turn == pytest.approx(TURN, abs=1e-4)
+    assert np.abs(np.round(TURN, 4) @ np.round(TURN, 4).T - np.eye(3)).max() > 1e-6  # it was not one
+
+
+@pytest.mark.parametrize(
+    ("season", "lean_deg"),
+    [("2019-2020", None), ("2020-2021", None), ("2021-2022", None), ("2023-2024", 33.8)],
+)
+@pytest.mark.parametrize("kind", ["SOP", "POP"])
+def test_real_matrices_are_accepted(shared_data, season, kind, lean_deg):
+    matrix = read_matrix(shared_data / f"mammoth/{season}-{kind}.dat")
+    assert matrix[:3, :3] @ matrix[:3, :3].T == pytest.approx(np.eye(3), abs=1e-8)
+    if kind == "SOP" and lean_deg:
+        assert np.degrees(np.arccos(matrix[2, 2])) == pytest.approx(lean_deg, abs=0.1)
+    if kind == "POP":
+        assert 6.36e6 < np.linalg.norm(matrix[:3, 3]) < 6.39e6  # on the Earth
+
+
+@pytest.mark.parametrize(
+    ("rotation", "last", "reason"),
+    [
+        (TURN * 1000, "0 0 0 1", "also scales by 1000"),
+        (TURN * [1, 1, -1], "0 0 0 1", "mirrors"),
+        (TURN + [[0, 0, 0.01]] * 3, "0 0 0 1", "not at right angles"),
+        (TURN, "0 0 0 2", "last row must be 0 0 0 1"),
+        (TURN, "0 0 1", r"rows of \[4, 4, 4, 3\]"),
+        (TURN, "", r"rows of \[4, 4, 4\]"),
+        (TURN, "0 0 0 eins", "could not convert"),
+        (TURN * [1, 1, np.nan], "0 0 0 1", "not a finite number"),
+    ],
+)
+def test_what_is_no_pose_is_explained(tmp_path, rotation, last, reason):
+    with pytest.raises(ConfigError, match=reason):
+        read_matrix(written(tmp_path, rotation, last=last))
+
+
+def test_a_transposed_matrix_is_recognised(tmp_path):
+    matrix = np.eye(4)
+    matrix[:3, :3], matrix[:3, 3] = TURN, (1, 2, 3)
+    np.savetxt(tmp_path / "t.dat", matrix.T)
+    with pytest.raises(ConfigError, match="transposed"):
+        read_matrix(tmp_path / "t.dat")
+
+
+def test_a_lost_matrix_is_a_fault_of_the_site_file(tmp_path):
+    with pytest.raises(ConfigError, match="cannot be read"):
+        read_matrix(tmp_path / "none.dat")
+
+
+OCTOBER, MAY = datetime(2024, 10, 1, tzinfo=UTC), datetime(2025, 5, 1, tzinfo=UTC)
+SOPS = [
+    SopSection.model_validate({"from": MAY, "file": Path("may.dat")}),
+    SopSection.model_validate({"from": OCTOBER, "file": Path("october.dat")}),
+]
+
+
+@pytest.mark.parametrize(
+    ("when", "file"),
+    [
+        (OCTOBER, "october.dat"),
+        (MAY - timedelta(seconds=1), "october.dat"),
+        (MAY, "may.dat"),
+        (MAY + timedelta(days=999), "may.dat"),
+    ],
+)
+def test_the_newest_sop_that_has_begun_holds(when, file):
+    assert sop_for(SOPS, when).file == Path(file)
+
+
+def test_before_the_first_sop_there_is_none():
+    with pytest.raises(ScanError, match=r"no \[\[sop\]\] .* has begun by 2024-09-30 23:59:59"):
+        sop_for(SOPS, OCTOBER - timedelta(seconds=1))
