@@ -27,6 +27,7 @@ NEEDED = DecompressionSelection.base().decompress_z().decompress_gps_time()  # h
 BLOCKS_AT_ONCE = 4  # decoded together, a chunk a core; conversion still goes block by block, in the cache
 LONGEST_SCAN_S = 86_400.0
 GLANCE = 16  # points looked at in one place
+SKIP = 50_000  # points decoded at a time only to pass them
 FEW_CHUNKS = 20  # with fewer, chunk starts are too far apart to follow the head
 
 Records = NDArray[np.void]
@@ -138,8 +139,9 @@ class LasScan:
         chosen = starts[np.linspace(0, len(starts) - 1, min(samples, len(starts))).astype(np.int64)]
         with self._points(all_cores=False) as points:
             for start in np.unique([*chosen, max(count - GLANCE, 0)]).tolist():
-                points.seek(start)
-                yield check.shots(points.read(min(GLANCE, count - start)), timed=True)
+                if start >= points.at:
+                    points.seek(start)
+                    yield check.shots(points.read(min(GLANCE, count - start)), timed=True)
 
     @contextmanager
     def _points(self, *, all_cores: bool) -> Iterator[_Points]:
@@ -153,12 +155,12 @@ class LasScan:
 
 
 class _Points:
-    """The records of an open file, one after the other from wherever one seeks."""
+    """The records of an open file, one after the other from wherever one seeks; onwards only."""
 
     def __init__(self, file: BufferedReader, layout: Layout, *, all_cores: bool) -> None:
         self._file = file
         self._layout = layout
-        self._at = 0
+        self.at = 0
         self._decompressor = None
         file.seek(layout.points_at)
         if layout.laszip is not None:
@@ -167,8 +169,12 @@ class _Points:
                 self._decompressor = decompressor(file, layout.laszip, NEEDED.to_lazrs())
 
     def seek(self, number: int) -> None:
-        """Go to a point."""
-        self._at = number
+        """Go on to a point."""
+        if self._decompressor is not None and not self._layout.even_chunks:
+            while self.at < number:  # lazrs 0.8 seeks to wrong points where chunks differ in length
+                self.read(min(SKIP, number - self.at))
+            return
+        self.at = number
         with foreign_code(f"corrupt near point {number:,}"):
             if self._decompressor is None:
                 self._file.seek(self._layout.points_at + number * self._layout.record_bytes)
@@ -178,12 +184,12 @@ class _Points:
     def read(self, count: int) -> Records:
         """Decode the next `count` records; they must be there."""
         raw = bytearray(count * self._layout.record_bytes)
-        with foreign_code(f"corrupt after point {self._at:,}"):
+        with foreign_code(f"corrupt after point {self.at:,}"):
             if self._decompressor is not None:
                 self._decompressor.decompress_many(raw)
             elif self._file.readinto(raw) != len(raw):
-                raise ScanError(f"cut off: ends before point {self._at + count:,} of {self._layout.count:,}")
-        self._at += count
+                raise ScanError(f"cut off: ends before point {self.at + count:,} of {self._layout.count:,}")
+        self.at += count
         return np.frombuffer(raw, dtype=self._layout.record)
 
 

@@ -53,6 +53,7 @@ class Layout:
     software: str
     laszip: bytes | None  # the record that tells how the points are compressed; None: they are not
     chunk_starts: Ints  # (chunks,) number of the first point of each, none where not compressed
+    even_chunks: bool  # all of one length but the last
 
     @property
     def has_time(self) -> bool:
@@ -123,6 +124,7 @@ def read_layout(file: BinaryIO, size: int) -> Layout:
         software=header.software,
         laszip=record,
         chunk_starts=chunk_starts,
+        even_chunks=laszip is not None and laszip.chunk_points != VARIABLE_CHUNKS,
     )
 
 
@@ -280,10 +282,11 @@ def _check_chunks(file: BinaryIO, header: _Header, laszip: _LasZip) -> Ints:
     file.seek(header.points_at)
     with foreign_code("corrupt chunk table"):
         table = lazrs.read_chunk_table(file, lazrs.LazVlr(laszip.record))
-    points, sizes = np.asarray(table, dtype=np.uint64).astype(np.int64).T
+    told = [row for row in table if any(row)]  # writers of variable chunks may close with an empty one
+    points, sizes = np.asarray(told, dtype=np.uint64).astype(np.int64).reshape(-1, 2).T
     if fixed:
-        points[-1] = header.count - (chunks - 1) * laszip.chunk_points
-    if points.sum() != header.count or sizes.sum() != table_at - first_at or sizes.min() <= 0:
+        points[-1:] = header.count - (chunks - 1) * laszip.chunk_points
+    if points.sum() != header.count or sizes.sum() != table_at - first_at or (sizes <= 0).any():
         raise ScanError("corrupt chunk table: its chunks do not add up to the points and bytes there are")
     if points.min() <= 0 or points.max() * header.record_bytes > MOST_CHUNK_BYTES:
         raise ScanError(f"corrupt chunk table: a chunk of {points.max():,} points")

@@ -4,8 +4,10 @@ import os
 import tracemalloc
 
 import laspy
+import lazrs
 import numpy as np
 import pytest
+from laspy._compression.lazrsbackend import LazrsPointWriter
 
 from station.errors import NotReadyError, ScanError
 from station.readers.las import LasScan
@@ -78,6 +80,32 @@ def test_week_seconds_run_on_past_the_end_of_the_week(write_scan):
     scan = LasScan(write_scan("s.laz", points_m, true_s % WEEK_S), range_max_m=100.0)
     assert everything(scan)[1] == pytest.approx(true_s)
     assert scan.time_range_s() == pytest.approx((true_s[0], true_s[-1]))
+
+
+def test_chunks_of_any_length_are_read(monkeypatch, tmp_path, a_sweep):
+    """As COPC has them; laspy writes none by itself."""
+    source = laspy.read(a_sweep("s.las", 5000))
+    plain = LazrsPointWriter.__init__
+
+    def variable(self, dest, point_format, parallel):
+        plain(self, dest, point_format, parallel)
+        self.parallel, self.vlr = False, lazrs.LazVlr.new_for_compression(6, 0, True)
+
+    monkeypatch.setattr(LazrsPointWriter, "__init__", variable)
+    path = tmp_path / "v.laz"
+    with laspy.open(path, "w", header=source.header, laz_backend=laspy.LazBackend.Lazrs) as writer:
+        for first, last in ((0, 100), (100, 3000), (3000, 5000)):
+            writer.write_points(source.points[first:last])
+            writer.point_writer.compressor.finish_current_chunk()
+    scan = LasScan(path, range_max_m=1000.0)
+    read_m, read_s = everything(scan, 700)
+    assert np.array_equal(read_m, [source.x, source.y, source.z])
+    assert np.array_equal(read_s, source.gps_time)
+    assert scan.time_range_s() == (source.gps_time[0], source.gps_time[-1])
+    track = scan.head_track()
+    assert track.azimuth_rad - 0.1 * track.time_s == pytest.approx(
+        np.full(len(track.time_s), -2 * np.pi), abs=4e-4
+    )
 
 
 def test_passes_may_overlap(a_sweep):
