@@ -243,7 +243,7 @@ class AirValues(Section):
 
 
 class AirSection(Section):
-    """What the scanner itself assumed of the air."""
+    """What the scanner itself assumed of the air; without this table nothing is corrected for air."""
 
     scanner_setting: AirValues | Literal["weather"] = AirValues(
         temperature_c=-2.0, pressure_hpa=684.0, humidity_pct=28.0
@@ -288,7 +288,7 @@ class SiteFile(Section):
     grid: GridSection
     inclination: InclinationSection | None = None
     weather: WeatherSection | None = None
-    air: AirSection = AirSection()
+    air: AirSection | None = None
     adjustment: AdjustmentSection = AdjustmentSection()
     uncertainty: UncertaintySection = UncertaintySection()
     reference: ReferenceSection = ReferenceSection()

@@ -23,13 +23,14 @@ from station.quantities import (
 )
 from station.science import change, shared, uncertainty
 from station.science.air import AirCorrection, refraction_rise
-from station.science.grid import Gridder, slope_sampling_variance
+from station.science.grid import Gridder, Stack, slope_sampling_variance
 from station.science.pose import Frame, lean
-from station.science.terrain import cell_means, smooth_gradient
+from station.science.terrain import cell_means, smooth, smooth_gradient
 
 BAND_ROWS = 128  # the cells that are looked at together: what a store chunk is high
 MARGIN_ROWS = 4  # rows beyond a band that its smoothed gradient looks at
 FEW_POINTS = 3
+PROVISIONAL_CELLS = 1.0  # one sigma of the smoothing before residuals are taken
 HIGH_INCIDENCE_COS = float(np.cos(np.radians(80.0)))
 
 Points = tuple[Floats, Floats, Floats]
@@ -229,7 +230,8 @@ def _judge(
             for name, values in _terms_voordendag(view, setup).items():
                 _put(result.terms, name, band, seen, values)
     if reference is not None:
-        random_m2 += np.where(measured, np.nan_to_num(reference.random_variance_m2[band][seen]), 0.0)
+        rough_m2 = reference.roughness_m2[band][seen] / count
+        random_m2 += np.where(measured, reference.random_variance_m2[band][seen] + rough_m2, 0.0)
     sigma_m = np.sqrt(random_m2 + shared_m2)
     if setup.published_budget:
         sigma_m = uncertainty.sigma_total_voordendag(sigma_m, setup.registration_sigma_m)
@@ -310,23 +312,37 @@ def _terms_voordendag(view: View, setup: Setup) -> dict[str, Floats]:
     }
 
 
-def provisional(gridder: Gridder, setup: Setup, scan_ids: tuple[str, ...]) -> Reference:
-    """Return the plain mean of all points of some scans as nodes: good enough to take residuals from."""
-    elevation_m = gridder.mean_residual() + gridder.datum_m
-    nothing = np.zeros(setup.grid.shape, np.float32)
-    return Reference(setup.grid, "provisional", elevation_m, nothing, None, scan_ids)
+def master(
+    stack: Stack,
+    base: Reference | None,
+    unknown: list[Shared | None],
+    datum_m: float,
+    version: str,
+    scan_ids: tuple[str, ...],
+) -> Reference:
+    """Return the surface that change is measured from, from scans laid on `base`.
 
-
-def master(gridder: Gridder, base: Reference, unknown: list[Shared | None], version: str) -> Reference:
-    """Return the surface that change is measured from: scans averaged as residuals to a provisional one.
-
-    What a scan's points share is taken as independent from scan to scan, so that the mean of n scans has an
-    nth of their mean covariance.
+    Without a base, their plain means are smoothed: such a mean stands for where its points happen to lie on
+    the slope (EQUATIONS 4.10), which residuals cannot mend from cell to cell; what smoothing takes from the
+    terrain they can. What a scan's points share is taken as independent from scan to scan, so that the mean
+    of n scans has an nth of their mean covariance.
     """
-    elevation_m = base.elevation_m + gridder.mean_residual()
+    mean_m = stack.mean_residual()
+    if base is None:
+        elevation_m = np.where(np.isfinite(mean_m), smooth(mean_m, PROVISIONAL_CELLS), np.nan) + datum_m
+    else:
+        elevation_m = base.elevation_m + mean_m
     told = [one for one in unknown if one is not None]
     common = None
     if told:
         covariance = sum((one.covariance for one in told), np.zeros_like(told[0].covariance)) / len(told) ** 2
         common = Shared(told[0].names, told[0].units, np.zeros(len(covariance)), covariance)
-    return Reference(base.grid, version, elevation_m, gridder.random_variance(), common, base.scan_ids)
+    return Reference(
+        grid=stack.grid,
+        version=version,
+        elevation_m=elevation_m,
+        random_variance_m2=stack.random_variance(),
+        roughness_m2=stack.roughness().astype(np.float32),
+        shared=common,
+        scan_ids=scan_ids,
+    )

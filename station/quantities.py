@@ -189,5 +189,6 @@ class Reference:
     version: str
     elevation_m: Floats  # (ny, nx)
     random_variance_m2: Floats32  # (ny, nx)
+    roughness_m2: Floats32  # (ny, nx) variance of the terrain about the surface within each cell
     shared: Shared | None  # None: given from outside, its shared errors unknown
     scan_ids: tuple[str, ...]

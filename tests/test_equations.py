@@ -159,3 +159,42 @@ def test_p13_units_of_ozendi():
     """36.6cc and 17.8cc: hundredths of milligon."""
     for cc, degrees in ((36.6, 0.003294), (17.8, 0.001602)):
         assert cc * 1e-4 * 0.9 == pytest.approx(degrees, abs=1e-6)
+
+
+def test_polar_and_cartesian_in_all_quadrants():
+    azimuth = np.linspace(-3.1, 3.1, 17)
+    elevation = np.linspace(-1.2, 1.2, 17)
+    range_m = np.linspace(1, 5000, 17)
+    points = beam.cartesian(range_m, elevation, azimuth)
+    assert points[:, 2] == pytest.approx(range_m * np.sin(elevation))
+    for told, wanted in zip(beam.polar(points), (range_m, elevation, azimuth), strict=True):
+        assert told == pytest.approx(wanted)
+
+
+def test_jacobian_against_finite_differences():
+    at = array(3000.0), array(-0.2), array(2.5)
+    told = beam.polar_jacobian(*at)[0]
+    for column, step in enumerate((1e-2, 1e-6, 1e-6)):
+        ends = []
+        for sign in (1, -1):
+            moved = list(at)
+            moved[column] = moved[column] + sign * step
+            ends.append(beam.cartesian(*moved)[0])
+        assert told[:, column] == pytest.approx((ends[0] - ends[1]) / (2 * step), rel=1e-6, abs=1e-5)
+
+
+def test_beam_of_a_vz4000():
+    """H Table 1: 18 mm at the exit, 0.15 mrad; 93 mm at 500 m."""
+    assert beam.diameter(array(500.0), 0.15e-3, 0.018)[0] == pytest.approx(0.093)
+    assert beam.sigma_beam_range(array(500.0), 0.15e-3, array(math.pi / 4))[0] == pytest.approx(0.01875)
+    grazing = beam.sigma_beam_range(array(500.0), 0.15e-3, array(math.pi / 2))[0]
+    assert grazing == pytest.approx(0.01875 * math.tan(math.radians(87)))
+
+
+def test_beam_as_range_and_as_angle_is_one_effect():
+    """EQUATIONS 3.4: seen vertically from a plane both give R γ/4 sin α / cos γ; Hartzell adds them."""
+    incidence = np.radians(array(70.0))
+    seen = np.cos(incidence), np.cos(np.radians(array(25.0)))
+    as_range_m = beam.sigma_beam_range(array(3421.0), 0.12e-3, incidence)
+    as_angle_m2 = uncertainty.angle_variance(array(3421.0), *seen, beam.sigma_beam_angle(0.12e-3))
+    assert uncertainty.range_variance(*seen, as_range_m) == pytest.approx(as_angle_m2)

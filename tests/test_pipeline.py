@@ -5,8 +5,9 @@ import math
 import numpy as np
 import pytest
 
-from station.pipeline import Pose, Setup, gridder_for, master, measure, provisional, survey
+from station.pipeline import Pose, Setup, gridder_for, master, measure, survey
 from station.quantities import Grid, Quality, Reference, Scanner, Shots
+from station.science.grid import Stack
 from station.science.inclination import LEVEL
 from station.science.pose import frame_in_local_map
 from station.science.shared import basis, covariance_without_adjustment
@@ -47,7 +48,7 @@ def spots(count, seed):
 
 def truth():
     x_m, y_m = np.meshgrid(GRID.x_m, GRID.y_m)
-    return Reference(GRID, "truth", height(x_m, y_m), np.zeros(GRID.shape, np.float32), None, ())
+    return Reference(GRID, "truth", height(x_m, y_m), *[np.zeros(GRID.shape, np.float32)] * 2, None, ())
 
 
 def scanned(shots, reference, unknown=None, **settings):
@@ -85,22 +86,34 @@ def test_a_plain_mean_without_reference_knows_its_slope():
     assert (measured.quality[several] & Quality.OUTSIDE_REFERENCE).all()
 
 
-def test_a_master_from_scans_is_better_than_each():
-    pose_shots = [shots_at(*spots(100_000, seed), seed=seed) for seed in range(4, 10)]
-    _, gridder, setup = scanned(pose_shots[0], None)
-    sop = np.eye(4)
-    sop[:3, 3] = SCANNER
-    pose = Pose(frame_in_local_map(sop), None, None)
-    survey(gridder, pose_shots[1:], setup, pose, lambda: None)
-    base = provisional(gridder, setup, ("a",))
-    fine = gridder_for(setup, base)
-    survey(fine, pose_shots, setup, pose, lambda: None)
-    made = master(fine, base, [None], "1")
-    x_m, y_m = np.meshgrid(GRID.x_m, GRID.y_m)
+def test_a_master_from_scans_finds_the_truth_and_its_own_error():
+    scans = [shots_at(*spots(100_000, seed), seed=seed) for seed in range(4, 10)]
+    made, x_m, y_m = None, *np.meshgrid(GRID.x_m, GRID.y_m)
+    for _ in range(3):
+        stack = Stack(GRID)
+        for shots in scans:
+            _, gridder, _ = scanned(shots, made)
+            stack.add(gridder)
+        made = master(stack, made, [None], gridder.datum_m, "1", ("a",))
     error = made.elevation_m - height(x_m, y_m)
-    assert np.nanstd(error) < 0.8 * np.nanstd(base.elevation_m - height(x_m, y_m))
+    assert np.nanmedian(error) == pytest.approx(0.0, abs=1e-3)
+    assert 1.4826 * np.nanmedian(np.abs(error)) < 0.03
     measured, *_ = scanned(shots_at(*spots(100_000, 30), seed=30), made)
-    assert np.nanstd(measured.surface.change_m) < 0.1
+    z = measured.surface.change_m / measured.random_uncertainty_m
+    assert np.nanstd(z) == pytest.approx(1.0, abs=0.1)
+
+
+def test_roughness_within_cells_is_found():
+    """Boulders of 0.2 m: the master knows, and every later scan is the less sure."""
+    rng = np.random.default_rng(99)
+    made = truth()
+    stack = Stack(GRID)
+    for seed in range(3):
+        shots = shots_at(*spots(300_000, seed), seed=seed)
+        rough = Shots(shots.x_m, shots.y_m, shots.z_m + rng.normal(0, 0.2, len(shots)), None)
+        stack.add(scanned(rough, made)[1])
+    several = stack.count > 10
+    assert np.sqrt(stack.roughness()[several].mean()) == pytest.approx(0.2, rel=0.05)
 
 
 def test_shared_errors_go_into_the_cell_and_its_terms():

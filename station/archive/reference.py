@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from typing import Any
 
 import netCDF4
 import numpy as np
@@ -10,7 +11,7 @@ import numpy as np
 from station.archive.layout import Series, attributes, lay_out, put_raster, written_whole
 from station.archive.variables import FILL, Variable
 from station.errors import StoreError
-from station.quantities import Reference, Shared
+from station.quantities import Floats32, Reference, Shared
 
 _ROWS = (
     Variable(
@@ -20,6 +21,15 @@ _ROWS = (
     Variable(
         "reference_random_uncertainty", ("y", "x"), "f4", "random uncertainty of the reference surface", "m",
         None, 4, None, "one standard deviation, of a single cell",
+    ),
+    Variable(
+        "reference_roughness",
+        ("y", "x"),
+        "f4",
+        "standard deviation of the terrain about the reference surface within the cell",
+        "m",
+        None,
+        4,
     ),
     Variable(
         "shared_parameter_covariance", ("parameter", "parameter_2"), "f8",
@@ -43,6 +53,7 @@ def write_reference(series: Series, reference: Reference) -> None:
         values = {
             "reference_elevation": reference.elevation_m,
             "reference_random_uncertainty": np.sqrt(reference.random_variance_m2),
+            "reference_roughness": np.sqrt(reference.roughness_m2),
         }
         for row in _ROWS:
             if any(dim not in file.dimensions for dim in row.dims):
@@ -93,9 +104,12 @@ def _read(file: netCDF4.Dataset, series: Series) -> Reference:
         grid=grid,
         version=str(file.reference_version),
         elevation_m=np.asarray(file["reference_elevation"][:].filled(np.nan), dtype=np.float64),
-        random_variance_m2=np.asarray(
-            file["reference_random_uncertainty"][:].filled(np.nan) ** 2, dtype=np.float32
-        ),
+        random_variance_m2=_squared(file["reference_random_uncertainty"]),
+        roughness_m2=_squared(file["reference_roughness"]),
         shared=shared,
         scan_ids=tuple(str(file.scan_ids).split()),
     )
+
+
+def _squared(variable: netCDF4.Variable[Any]) -> Floats32:
+    return np.asarray(variable[:].filled(np.nan) ** 2, dtype=np.float32)

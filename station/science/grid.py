@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 import numpy as np
+from scipy import ndimage
 
 from station.science.terrain import Ground, ground
 
@@ -14,6 +15,7 @@ if TYPE_CHECKING:
 # Sums are of multiples of 2^-20 m (and m²), so that adding float64 is exact up to 2^33 and the order in
 # which points come cannot matter.
 QUANTUM = 2.0**20
+ROUGHNESS_CELLS = 1.0  # one sigma of the neighbourhood that tells how rough a cell is
 
 
 class Gridder:
@@ -89,6 +91,54 @@ class Gridder:
         seen = np.flatnonzero(self.count)
         variance_m2[seen] = self._variance[seen] / self.count[seen].astype(np.float64) ** 2
         return variance_m2.reshape(self.grid.shape)
+
+
+class Stack:
+    """Several scans on one grid, each within itself: what they share among their own points stays apart."""
+
+    def __init__(self, grid: Grid) -> None:
+        self.grid = grid
+        self.count = np.zeros(grid.shape)
+        self._residual, self._variance, self._within, self._freedom = (np.zeros(grid.shape) for _ in range(4))
+
+    def add(self, gridder: Gridder) -> None:
+        """Add a scan."""
+        count = gridder.count.reshape(self.grid.shape).astype(np.float64)
+        seen = count > 0
+        self.count += count
+        self._residual[seen] += gridder.mean_residual()[seen] * count[seen]
+        self._variance[seen] += gridder.random_variance()[seen] * count[seen] ** 2
+        self._within += np.nan_to_num(gridder.spread()).astype(np.float64) ** 2 * np.maximum(count - 1, 0)
+        self._freedom += np.maximum(count - 1, 0)
+
+    def mean_residual(self) -> Floats:
+        """Mean height of all points above reference or datum (ny, nx) [m], NaN in empty cells."""
+        return np.divide(
+            self._residual, self.count, out=np.full(self.grid.shape, np.nan), where=self.count > 0
+        )
+
+    def roughness(self) -> Floats:
+        """Variance of the terrain about the reference within each cell (ny, nx) [m²].
+
+        It is what the points of a scan scatter more than their own errors explain, pooled with the cells
+        around, for a few points say little of a variance; nought where nothing tells.
+        """
+        expected = np.divide(self._variance, self.count, out=np.zeros(self.grid.shape), where=self.count > 0)
+        excess = ndimage.gaussian_filter(self._within - expected * self._freedom, ROUGHNESS_CELLS)
+        freedom = ndimage.gaussian_filter(self._freedom, ROUGHNESS_CELLS)
+        told = np.divide(excess, freedom, out=np.zeros(self.grid.shape), where=freedom > 1e-3)
+        return np.where(self.count > 0, np.maximum(told, 0.0), 0.0)
+
+    def random_variance(self) -> Floats32:
+        """Random variance of the mean of all points (ny, nx) [m²], NaN in empty cells.
+
+        Source: Hartzell et al. (2015), Eq. 12, with the roughness as part of each point's variance.
+        """
+        variance_m2 = np.full(self.grid.shape, np.nan, np.float32)
+        seen = self.count > 0
+        total_m2 = self._variance[seen] / self.count[seen] + self.roughness()[seen]
+        variance_m2[seen] = total_m2 / self.count[seen]
+        return variance_m2
 
 
 def slope_sampling_variance(cell_m: float, tan_slope: Floats, count: Floats) -> Floats:

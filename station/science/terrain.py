@@ -29,12 +29,13 @@ def smooth_gradient(
     east = (elevation_m[:, 2:] - elevation_m[:, :-2]) / np.float32(2 * cell_m)
     north = (elevation_m[:-2] - elevation_m[2:]) / np.float32(2 * cell_m)
     return (
-        _smooth(np.pad(east, ((0, 0), (1, 1)), constant_values=np.nan), cells),
-        _smooth(np.pad(north, ((1, 1), (0, 0)), constant_values=np.nan), cells),
+        smooth(np.pad(east, ((0, 0), (1, 1)), constant_values=np.nan), cells),
+        smooth(np.pad(north, ((1, 1), (0, 0)), constant_values=np.nan), cells),
     )
 
 
-def _smooth(values: Floats | Floats32, cells: float) -> Floats32:
+def smooth(values: Floats | Floats32, cells: float) -> Floats32:
+    """Values (ny, nx) under a Gaussian of `cells` (one sigma), NaN passed over; NaN where nothing is near."""
     known = np.isfinite(values)
     weight = ndimage.gaussian_filter(known.astype(np.float32), cells, truncate=2.0, mode="constant")
     total = ndimage.gaussian_filter(

@@ -52,7 +52,7 @@ def sigma_angle(scanner: Scanner) -> float:
 def shot_variance(range_m: Floats, cos_incidence: Floats, cos_slope: Floats, scanner: Scanner) -> Floats:
     """Random variance of the height one shot gives of the surface under it (n,) [m²].
 
-    Source: Hartzell et al. (2015), Eq. 9, projected on the vertical through the terrain (EQUATIONS 6.1).
+    Source: EQUATIONS 6.1: the covariance of the point, projected on the vertical through the terrain.
     """
     return range_variance(cos_incidence, cos_slope, scanner.range_sigma_m) + angle_variance(
         range_m, cos_incidence, cos_slope, sigma_angle(scanner)
@@ -82,7 +82,7 @@ def sigma_geometry(
 
     `sin_rise` is the sine of the beam's elevation angle. The vertical part of the unit vector of the beam
     projected into the surface is (sin_rise + cos α cos γ) / sin α. Incidence is clipped at 87°.
-    Source: Voordendag et al. (2023), Eq. 15 and 18.
+    Source: Voordendag et al. (2023), Eq. 18.
     """
     cos_incidence = np.maximum(cos_incidence, math.cos(math.radians(87.0)))
     sin_incidence = np.sqrt(np.maximum(1 - cos_incidence**2, 1e-12))

@@ -56,16 +56,19 @@ def gather(site: Site, reader: ScanReader, log_path: Path | None, start: datetim
     zero = _zero_lean(site, sop, sop_id, reader, log, track, lacking)
     lean = _lean(site, log, track, zero, lacking)
     air, weather_known = _air(site, start + (end - start) / 2, frame.position_m[2], lacking)
-    assumed = air if site.air.scanner_setting == "weather" else site.air.scanner_setting.air
     setup = setup_of(site, frame.position_m)
     of = shared.basis(setup.grid, frame.position_m)
     speed_rad_s = shared.HEAD_SPEED_RAD_S if track is None else inclination.head_speed(track)
     unknown = shared.covariance_without_adjustment(
         of, lean, zero or LEVEL, _in_scanner(of, frame), speed_rad_s, weather_known=weather_known
     )
-    correction = air_correction(
-        air, assumed if site.air.scanner_corrects else None, site.instrument.wavelength_um
-    )
+    correction = None
+    if site.air is not None:
+        setting = site.air.scanner_setting
+        assumed = air if setting == "weather" else setting.air
+        correction = air_correction(
+            air, assumed if site.air.scanner_corrects else None, site.instrument.wavelength_um
+        )
     provenance = {"sop_id": sop_id, "lean_zero": json.dumps(asdict(zero)) if zero else ""}
     tilt = lean.tilt if lean is not None else None
     return Gathered(
@@ -259,7 +262,6 @@ def _fit(log: InclinationLog, track: HeadTrack | None, sigma_rad: float) -> Cycl
 
 def _air(site: Site, moment: datetime, height_m: float, lacking: list[str]) -> tuple[Air, bool]:
     """Return the air of the scan and whether it was measured."""
-    setting = site.air.scanner_setting
     if site.weather is not None:
         given, moment_s = site.weather, moment.timestamp()
         try:
@@ -278,4 +280,6 @@ def _air(site: Site, moment: datetime, height_m: float, lacking: list[str]) -> t
             return air, True
         age = timedelta(seconds=given.max_age_s)
         lacking.append(f"weather missing within {age} of {moment:%Y-%m-%d %H:%M} UTC")
-    return (standard_air(height_m) if setting == "weather" else setting.air), False
+    if site.air is None or site.air.scanner_setting == "weather":
+        return standard_air(height_m), False
+    return site.air.scanner_setting.air, False

@@ -32,7 +32,8 @@ def built(series, epoch):
         store.write_epoch(series, epoch(hour, terms=True))
     elevation = np.full(series.grid.shape, 2900.125)
     reference.write_reference(
-        series, Reference(series.grid, "1", elevation, np.zeros_like(elevation, np.float32), None, ("a",))
+        series,
+        Reference(series.grid, "1", elevation, *[np.zeros_like(elevation, np.float32)] * 2, None, ("a",)),
     )
     return build_series(series)
 

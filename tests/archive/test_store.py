@@ -93,7 +93,7 @@ def test_the_reference_comes_back_and_its_versions_stay(series):
     variance = np.where(np.isnan(elevation), np.nan, 0.0004).astype(np.float32)
     common = Shared(("tilt_east",), ("rad",), np.zeros(1), np.array([[3e-11]]))
     for version in ("1", "2"):
-        made = Reference(series.grid, version, elevation, variance, common, ("a", "b"))
+        made = Reference(series.grid, version, elevation, variance, variance, common, ("a", "b"))
         reference.write_reference(series, made)
     told = reference.read_reference(series)
     assert told.version == "2"

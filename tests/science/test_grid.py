@@ -69,7 +69,7 @@ def test_residuals_to_a_sloping_reference_lose_the_sampling_error():
     truth = slope * np.broadcast_to(grid.x_m, grid.shape)
     flat = Gridder(grid, None, 0.0)
     with_reference = Gridder(
-        grid, Reference(grid, "1", truth, np.zeros(grid.shape, np.float32), None, ()), 0.0
+        grid, Reference(grid, "1", truth, *[np.zeros(grid.shape, np.float32)] * 2, None, ()), 0.0
     )
     for gridder in (flat, with_reference):
         _, column, row = gridder.cells(x_m, y_m)
