@@ -1,0 +1,190 @@
+"""Work that may hang, abort or take all memory runs in a child process, which can be told to end.
+
+Corrupt scans hang a decoder, abort the process, take 15 GB, or panic past `except Exception` (SERVICE.md).
+Children are forked from a server that has the heavy modules loaded and no threads, so that one starts in
+milliseconds. A task is a function a fresh interpreter can import; its last argument is `progress()`.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import multiprocessing
+import multiprocessing.connection
+import os
+import resource
+import signal
+import time
+import traceback
+from multiprocessing import forkserver
+from pathlib import Path
+from typing import TYPE_CHECKING, TypeVar
+
+from station.errors import NotReadyError, ScanError, StationError
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Sequence
+    from multiprocessing.connection import Connection
+    from multiprocessing.context import ForkServerProcess
+
+T = TypeVar("T")
+
+# Whatever of these cannot be imported is left out; the first brings nearly all of the rest.
+PRELOAD = ("station.service.worker", "station.service.child", "laspy", "lazrs", "netCDF4", "scipy.signal")
+# One scan is one core's work; and every further thread of a BLAS reserves address space against RLIMIT_AS.
+_ONE_THREAD = dict.fromkeys(("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "RAYON_NUM_THREADS"), "1")
+_TICK_S = 0.2
+_GONE_WITH_ITS_SERVER = 255  # what multiprocessing reports where the fork server died
+_NOT_STARTED = ("not started", None)
+
+_forks = multiprocessing.get_context("forkserver")
+
+
+def prepare(preload: Sequence[str] = PRELOAD) -> None:
+    """Start the server that children are forked from; the first call decides what it loads."""
+    before = {name: os.environ.get(name) for name in _ONE_THREAD}
+    os.environ.update(_ONE_THREAD)
+    try:
+        _forks.set_forkserver_preload(list(preload))
+        forkserver.ensure_running()
+    finally:
+        for name, value in before.items():
+            os.environ.pop(name)
+            if value is not None:
+                os.environ[name] = value
+
+
+def run(
+    task: Callable[..., T],
+    *args: object,
+    memory_gb: float,
+    timeout_s: float,
+    on_progress: Callable[[], None] = lambda: None,
+    should_stop: Callable[[], bool] = lambda: False,
+) -> T:
+    """Return what `task(*args, progress)` returns, computed in a child with `memory_gb` of its own.
+
+    `on_progress` is called here for each `progress()` there, and while waiting within `timeout_s`. Raises the
+    StationError the task raised; ScanError where the child ran out of memory or time, panicked, or died by a
+    signal; NotReadyError where `should_stop()` became true or the child could not be started; RuntimeError
+    with the child's traceback for a bug.
+    """
+    prepare()
+    here, there = _forks.Pipe()
+    with here:
+        child = _forks.Process(
+            target=_work, args=(there, task, args, int(memory_gb * 2**30)), name=task.__name__, daemon=True
+        )
+        with there:
+            child.start()
+        try:
+            report = _await_report(here, time.monotonic() + timeout_s, on_progress, should_stop)
+            if report is None:
+                raise ScanError(
+                    f"took longer than {timeout_s:g} s: the file is corrupt, or timeout_s too short"
+                )
+        finally:
+            exit_status = _end(child)
+    kind, value = report
+    if kind == "returned":
+        return value  # type: ignore[return-value] # it is what the task returned
+    if report == _NOT_STARTED or exit_status == _GONE_WITH_ITS_SERVER:
+        raise NotReadyError(
+            f"the process for it could not be started or was lost (exit status {exit_status})"
+        )
+    if kind == "died":
+        raise _cause_of_death(exit_status)
+    if kind == "memory":
+        raise ScanError(
+            f"needs more than {memory_gb:g} GB: the file is corrupt, or service.memory_gb too small"
+        )
+    if kind == "refused":
+        assert isinstance(value, StationError)  # noqa: S101 - by _work
+        raise value
+    if kind == "panicked":
+        raise ScanError(f"the decoder panicked: {value}")
+    raise RuntimeError(f"a bug in {task.__name__}, in the child:\n{value}")
+
+
+def _await_report(
+    here: Connection,
+    deadline_s: float,
+    on_progress: Callable[[], None],
+    should_stop: Callable[[], bool],
+) -> tuple[str, object] | None:
+    """Wait for the child's last word; None where it had none in time."""
+    started = False
+    while time.monotonic() < deadline_s:
+        if should_stop():
+            raise NotReadyError("stopped before it was done")
+        on_progress()
+        try:
+            if here.poll(_TICK_S):
+                kind, value = here.recv()
+                started = True
+                if kind != "progress":
+                    return kind, value
+        except (EOFError, ConnectionResetError):
+            return ("died", None) if started else _NOT_STARTED
+    return None
+
+
+def _end(child: ForkServerProcess) -> int | None:
+    """Make sure the child has ended; its exit status, None where even SIGKILL has to wait for a disk."""
+    child.join(_TICK_S if child.exitcode is None else 0)
+    if child.exitcode is None:
+        child.kill()
+        child.join(5.0)
+    exit_status = child.exitcode
+    if exit_status is not None:
+        child.close()
+    return exit_status
+
+
+def _cause_of_death(exit_status: int | None) -> ScanError:
+    if exit_status is None or exit_status >= 0:
+        return ScanError(f"the decoder ended the process without a word (exit status {exit_status})")
+    name = signal.Signals(-exit_status).name
+    hint = ": probably out of memory" if name == "SIGKILL" else ""
+    return ScanError(f"the decoder died by {name}{hint}")
+
+
+def _work(there: Connection, task: Callable[..., object], args: tuple[object, ...], memory: int) -> None:
+    """Run the task in the child and report once how it ended."""
+    _end_with_the_parent()
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches the whole group: the parent decides
+    resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+    limit = _mapped() + memory
+    resource.setrlimit(resource.RLIMIT_AS, (limit, limit))
+    there.send(("progress", None))  # from here on a death is the task's own
+    try:
+        there.send(("returned", task(*args, lambda: there.send(("progress", None)))))
+    except StationError as error:
+        there.send(("refused", type(error)(str(error))))
+    except MemoryError:
+        there.send(("memory", None))
+    except Exception:  # noqa: BLE001 - goes to the parent whole, which raises it
+        there.send(("bug", traceback.format_exc()))
+    except BaseException as panic:  # noqa: BLE001 - lazrs panics past Exception
+        there.send(("panicked", f"{type(panic).__name__}: {panic}"))
+
+
+def _end_with_the_parent() -> None:
+    """Have the kernel kill this process when the parent is gone: no orphan writes beside a new service.
+
+    A pipe whose other end the parent holds gives the signal; neither PR_SET_PDEATHSIG (the fork server lives
+    as long as its children) nor a thread (a decoder may hold the interpreter's lock) would do.
+    """
+    parent = multiprocessing.parent_process()
+    if parent is None:
+        raise RuntimeError("runs in a child only")
+    fcntl.fcntl(parent.sentinel, fcntl.F_SETOWN, os.getpid())
+    fcntl.fcntl(parent.sentinel, fcntl.F_SETSIG, signal.SIGKILL)
+    flags = fcntl.fcntl(parent.sentinel, fcntl.F_GETFL)
+    fcntl.fcntl(parent.sentinel, fcntl.F_SETFL, flags | os.O_ASYNC)
+    if multiprocessing.connection.wait([parent.sentinel], 0):  # it went before the kernel was asked
+        raise RuntimeError("the parent is gone")
+
+
+def _mapped() -> int:
+    """Address space in use [bytes]: the loaded modules are not held against the scan."""
+    return int(Path("/proc/self/statm").read_text(encoding="ascii").split()[0]) * resource.getpagesize()

@@ -1,0 +1,98 @@
+"""What the tests of the child have it do: a fresh interpreter imports this by name."""
+
+from __future__ import annotations
+
+import ctypes
+import os
+import signal
+import sys
+import time
+from pathlib import Path
+
+from station.errors import ScanError, StoreError
+
+
+class Panic(BaseException):
+    """Like pyo3's PanicException: not an Exception."""
+
+
+def add(a, b, progress):
+    for _ in range(5):
+        progress()
+    return a + b
+
+
+def environment(name, progress):
+    progress()
+    import numpy as np
+
+    np.ones((200, 200)) @ np.ones((200, 200))
+    return os.environ.get(name), len(list(Path("/proc/self/task").iterdir()))
+
+
+def allocate(gigabytes, _progress):
+    return len(bytearray(int(gigabytes * 2**30)))
+
+
+def allocate_in_numpy(gigabytes, _progress):
+    import numpy as np
+
+    return float(np.ones(int(gigabytes * 2**27)).sum())
+
+
+def kill(number, _progress):
+    os.kill(os.getpid(), number)
+    time.sleep(10)
+
+
+def abort(_progress):
+    os.abort()
+
+
+def segfault(_progress):
+    ctypes.string_at(0)
+
+
+def hang(_progress):
+    while True:
+        time.sleep(0.05)
+
+
+def hang_ignoring_signals(note, _progress):
+    for number in (signal.SIGTERM, signal.SIGINT):
+        signal.signal(number, signal.SIG_IGN)
+    Path(note).write_text(str(os.getpid()), encoding="ascii")
+    while True:
+        time.sleep(0.05)
+
+
+def panic(_progress):
+    raise Panic("called `Option::unwrap()` on a `None` value")
+
+
+def leave(_progress):
+    sys.exit(3)
+
+
+def vanish(_progress):
+    os._exit(0)
+
+
+def refuse(_progress):
+    raise ScanError("no points in it")
+
+
+def no_room(_progress):
+    raise StoreError("no space left")
+
+
+def trip(_progress):
+    return {}["missing"]
+
+
+def unpicklable(_progress):
+    return lambda: None
+
+
+def many_bytes(count, _progress):
+    return b"x" * count
