@@ -28,8 +28,10 @@ Json = Annotated[bool, typer.Option("--json", help="Print JSON.")]
 
 
 def main() -> None:
-    """Run a command; end with the exit status its error carries (0 done, 1 failed, 2 wrong usage, 3 some scan
-    set aside, 74 cannot write, 75 try again later, 78 bad config).
+    """Run a command; end with the exit status its error carries.
+
+    0 done, 1 failed, 2 wrong usage, 3 some scan set aside, 74 cannot write, 75 try again later, 78 bad
+    config.
     """
     try:
         app()
@@ -53,8 +55,11 @@ def init(
 
 @app.command()
 def check(site: SiteArgument, *, json_: Json = False) -> None:
-    """Tell everything that can be known before going live; exit 1 if something must be mended."""
-    from station.service.health import check as look
+    """Try site file, SOP, folders, weather, newest scan.
+
+    Everything that can be known before going live; exits with 1 if something must be mended.
+    """
+    from station.service.check import check as look
 
     findings = look(site)
     if json_:
@@ -76,7 +81,10 @@ def process(
         ),
     ],
 ) -> None:
-    """Measure these scans, now: verdict and one line each; exit 3 if some scan was set aside."""
+    """Measure these scans, now: verdict and one line each.
+
+    Exits with 3 if some scan was set aside.
+    """
     from station.config import read_site
     from station.service.once import one_line, process_scans
 
@@ -85,7 +93,10 @@ def process(
 
 @app.command()
 def run(site: SiteArgument) -> None:
-    """Be the service: catch up with the inbox, then watch it, hour by hour."""
+    """Be the service: catch up with the inbox, then watch it.
+
+    Ends at SIGTERM, reads the site file again at SIGHUP.
+    """
     from station.service.daemon import run as serve
 
     sys.exit(serve(site))
@@ -93,9 +104,13 @@ def run(site: SiteArgument) -> None:
 
 @app.command()
 def status(site: SiteArgument, *, json_: Json = False) -> None:
-    """Tell what was done, what waits, what was set aside and why, and how good the last scan was."""
+    """Tell what was done, what waits, what was set aside.
+
+    With the reasons, and how good the last scan was.
+    """
     from station.config import read_site
-    from station.service.health import describe, status as look
+    from station.service.health import describe
+    from station.service.health import status as look
 
     found = look(read_site(site))
     print(json.dumps(found, indent=2) if json_ else describe(found))
@@ -107,7 +122,10 @@ def simulate(
     hours: Annotated[int, typer.Option(min=1, max=2000, help="How many hourly scans.")] = 24,
     seed: Annotated[int, typer.Option(help="The same seed gives the same station.")] = 1,
 ) -> None:
-    """Build a small station with a known truth: scans, logs, weather, SOP, site file."""
+    """Build a small station with a known truth.
+
+    Scans, inclination logs, weather, SOP, site file, and the truth to compare with.
+    """
     from station.simulation.station import demo as scenario
     from station.simulation.station import simulate as build
 
@@ -120,7 +138,10 @@ def demo(
     folder: Annotated[Path, typer.Argument(metavar="[DIR]", help="Where to run it.")] = Path("station-demo"),
     hours: Annotated[int, typer.Option(min=1, max=2000, help="How many hourly scans.")] = 24,
 ) -> None:
-    """Simulate a station, process its scans and tell what changed: the whole thing in about a minute."""
+    """Simulate a day, process it, tell what changed.
+
+    The whole thing in about a minute.
+    """
     from station.service.demo import run_demo
 
     sys.exit(run_demo(folder, hours))

@@ -113,9 +113,9 @@ class Stack:
 
     def mean_residual(self) -> Floats:
         """Mean height of all points above reference or datum (ny, nx) [m], NaN in empty cells."""
-        return np.divide(
-            self._residual, self.count, out=np.full(self.grid.shape, np.nan), where=self.count > 0
-        )
+        mean_m = np.full(self.grid.shape, np.nan)
+        np.divide(self._residual, self.count, out=mean_m, where=self.count > 0)
+        return mean_m
 
     def roughness(self) -> Floats:
         """Variance of the terrain about the reference within each cell (ny, nx) [m²].

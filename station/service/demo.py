@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import sys
 from pathlib import Path
 
@@ -11,10 +12,15 @@ from rich.console import Console
 from rich.progress import Progress
 from rich.table import Table
 
+from station.archive.reference import read_reference
 from station.archive.store import open_series
-from station.config import read_site
+from station.config import Site, read_site
+from station.quantities import Quality
+from station.science import shared, terrain
+from station.service.gather import frame_of
 from station.service.journal import Entry, State
 from station.service.once import one_line, process_scans
+from station.service.worker import series_of
 from station.simulation.station import demo, simulate
 
 
@@ -30,36 +36,49 @@ def run_demo(folder: Path, hours: int) -> int:
         task = progress.add_task("processing", total=len(scans) + scenario.reference_scans)
 
         def tell(entry: Entry) -> None:
-            if entry.state is not State.STORED or entry.verdict != "good":
+            if entry.state in {State.SET_ASIDE, State.LATER} or entry.verdict == "degraded":
                 progress.console.print(one_line(entry), markup=False)
             progress.advance(task)
 
         status = process_scans(site, scans, tell)
         progress.update(task, completed=len(scans) + scenario.reference_scans)
     with open_series(site.station.data) as series, xr.open_dataset(folder / "truth.nc") as truth:
-        Console(width=None if sys.stdout.isatty() else 100).print(_what_changed(series, truth))
+        Console(width=None if sys.stdout.isatty() else 100).print(_what_changed(site, series, truth))
     print(f"\n{site.station.data / 'series.nc'}")
     print("open it:  python -c \"import station; print(station.open('" + str(site.station.data) + "'))\"")
     return status
 
 
-def _what_changed(series: xr.Dataset, truth: xr.Dataset) -> Table:
-    """Compare the change of the ice with the truth, hour by hour, and the cells that changed for certain."""
-    table = Table(title="Mean change of the glacier against the reference (mean of its scans)")
-    for name in ("scan", "measured [m]", "true [m]", "cells", "changed (95 %)"):
-        table.add_column(name, justify="left" if name == "scan" else "right")
-    ice = truth.ice.values > 0.5
-    used = truth.change.values[:8].mean(axis=0) if truth.sizes["time"] >= 8 else truth.change.values[0]
-    for i in range(series.sizes["time"]):
-        change = series.elevation_change[i].values
-        quality = series.quality[i].values.astype(int)
-        seen = ice & np.isfinite(change)
-        if not seen.any():
-            continue
-        true = (truth.change.values[i] - used)[seen].mean()
-        certain = ((quality & 16) > 0) & seen
-        table.add_row(
-            str(series.scan_id.values[i]), f"{change[seen].mean():+.3f}", f"{true:+.3f}",
-            f"{seen.sum():,}", f"{100 * certain.sum() / seen.sum():.0f} %",
-        )  # fmt: skip
+def _what_changed(site: Site, series: xr.Dataset, truth: xr.Dataset) -> Table:
+    """Compare the mean change of the glacier with the truth, scan by scan."""
+    store = series_of(site)
+    reference = read_reference(store)
+    assert reference is not None  # noqa: S101 - the demo has scans enough
+    in_truth = [str(scan_id) for scan_id in truth.scan_id.values]
+    zero = truth.change.values[[in_truth.index(scan_id) for scan_id in reference.scan_ids]].mean(axis=0)
+    position_m = frame_of(site, site.sop[0]).position_m
+    of = shared.basis(store.grid, position_m)
+    gradient = terrain.smooth_gradient(reference.elevation_m, store.grid.cell_m)
+    table = Table(title="Mean change of the glacier", caption="against the mean of the reference's scans")
+    for name in ("scan", "measured, m", "± 1 σ, m", "true, m", "cells changed at 95 %"):
+        table.add_column(name, justify="left" if name == "scan" else "right", no_wrap=True)
+    for i, scan_id in enumerate(str(one) for one in series.scan_id.values):
+        change_m = series.elevation_change[i].values
+        ice = (truth.ice.values > 0.5) & np.isfinite(change_m)
+        felt = shared.cell_sensitivities(of, store.grid, position_m, reference.elevation_m, gradient, ice)
+        random_m2 = series.elevation_change_random_uncertainty[i].values[ice].astype(np.float64) ** 2
+        covariance = series.shared_parameter_covariance[i].values.astype(np.float64)
+        if reference.shared is not None:
+            covariance = covariance + reference.shared.covariance
+        mean = np.full(ice.sum(), 1 / ice.sum())
+        sigma_m = math.sqrt(shared.aggregate_variance(mean, random_m2, felt, covariance))
+        true_m = (truth.change.values[in_truth.index(scan_id)] - zero)[ice].mean()
+        certain = (series.quality[i].values[ice].astype(int) & Quality.CHANGE_SIGNIFICANT) > 0
+        told = (
+            f"{change_m[ice].mean():+.3f}",
+            f"{sigma_m:.3f}",
+            f"{true_m:+.3f}",
+            f"{100 * certain.mean():.0f} %",
+        )
+        table.add_row(scan_id, *told)
     return table

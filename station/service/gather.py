@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import os
 from dataclasses import asdict, dataclass
 from datetime import datetime, timedelta
 from pathlib import Path
@@ -12,6 +11,7 @@ from pathlib import Path
 import numpy as np
 from pyproj import CRS, Transformer
 
+from station.archive.layout import written_whole
 from station.config import Origin, Site, SopSection
 from station.errors import ConfigError, NotReadyError, ScanError
 from station.pipeline import Pose, Setup
@@ -41,8 +41,19 @@ class Gathered:
     provenance: dict[str, str]
 
 
-def gather(site: Site, reader: ScanReader, log_path: Path | None, start: datetime, end: datetime) -> Gathered:
-    """Gather what goes with a scan; raise ScanError or ConfigError where it cannot be placed at all."""
+def gather(
+    site: Site,
+    reader: ScanReader,
+    log_path: Path | None,
+    start: datetime,
+    end: datetime,
+    *,
+    keep_zero: bool = True,
+) -> Gathered:
+    """Gather what goes with a scan; raise ScanError or ConfigError where it cannot be placed at all.
+
+    `keep_zero`: a zero of lean found here is kept for the scans to come.
+    """
     if site.scans.frame == "map":
         setup = setup_of(site, _map_position(site))
         return Gathered(setup, Pose(None, None, None), None, None, None, (), {})
@@ -53,7 +64,11 @@ def gather(site: Site, reader: ScanReader, log_path: Path | None, start: datetim
     if track is None and site.scans.point_time == "auto":
         lacking.append("no time per point: one mean lean for the whole scan")
     log = _log(site, log_path, track, lacking)
-    zero = _zero_lean(site, sop, sop_id, reader, log, track, lacking)
+    zero = _kept_zero(site, sop_id)
+    if zero is None:
+        zero = _zero_lean(site, sop, reader, log, track, lacking)
+        if zero is not None and keep_zero:
+            _keep_zero(site, sop_id, zero)
     lean = _lean(site, log, track, zero, lacking)
     air, weather_known = _air(site, start + (end - start) / 2, frame.position_m[2], lacking)
     setup = setup_of(site, frame.position_m)
@@ -205,41 +220,50 @@ def _lean(
     return lean
 
 
+def _zero_file(site: Site, sop_id: str) -> Path:
+    return site.station.data / "lean_zero" / f"{sop_id}.json"
+
+
+def _kept_zero(site: Site, sop_id: str) -> Cycle | None:
+    """Return the lean an SOP holds, as found when it was first needed."""
+    if site.inclination is None or site.inclination.mode == "absolute":
+        return None
+    path = _zero_file(site, sop_id)
+    if not path.is_file():
+        return None
+    told = json.loads(path.read_text())
+    return Cycle(tuple(told["roll_rad"]), tuple(told["pitch_rad"]))
+
+
+def _keep_zero(site: Site, sop_id: str, zero: Cycle) -> None:
+    path = _zero_file(site, sop_id)
+    with written_whole(path) as beside:
+        beside.write_text(json.dumps(asdict(zero)))
+
+
 def _zero_lean(
     site: Site,
     sop: SopSection,
-    sop_id: str,
     reader: ScanReader,
     log: InclinationLog | None,
     track: HeadTrack | None,
     lacking: list[str],
 ) -> Cycle | None:
-    """Return the lean the SOP already holds: that of the scan it was solved from, kept once known.
+    """Return the lean the SOP already holds: that of the scan it was solved from.
 
-    Without `sop.scan` it is the first scan processed under the SOP.
+    Without `sop.scan` it is this scan, the first processed under the SOP.
     """
     if site.inclination is None:
         return None
     if site.inclination.mode == "absolute":
         return LEVEL
-    kept = site.station.data / "lean_zero" / f"{sop_id}.json"
-    if kept.is_file():
-        told = json.loads(kept.read_text())
-        return Cycle(tuple(told["roll_rad"]), tuple(told["pitch_rad"]))
-    source = reader.path.stem
-    if sop.scan is not None and sop.scan != source:
-        source = sop.scan
+    if sop.scan is not None and sop.scan != reader.path.stem:
         log, track = _log_of(site, sop.scan)
+        if log is None:
+            lacking.append(f"log of {sop.scan}, the scan of the SOP, not found: lean left uncorrected")
     if log is None:
-        if sop.scan is not None:
-            lacking.append(f"log of {source}, the scan of the SOP, not found: lean left uncorrected")
         return None
-    zero = _fit(log, track, site.instrument.inclination_sigma_rad)
-    kept.parent.mkdir(parents=True, exist_ok=True)
-    beside = kept.with_name(f".{kept.name}.{os.getpid()}")
-    beside.write_text(json.dumps({**asdict(zero), "scan": source}))
-    beside.replace(kept)
-    return zero
+    return _fit(log, track, site.instrument.inclination_sigma_rad)
 
 
 def _log_of(site: Site, stem: str) -> tuple[InclinationLog | None, HeadTrack | None]:

@@ -23,7 +23,7 @@ def process_scans(site: Site, scans: Sequence[Path], tell: Tell) -> int:
     site.station.data.mkdir(parents=True, exist_ok=True)
     with only_writer(site.station.data), Journal(site.station.data / "journal.sqlite") as journal:
         worker = Worker(site, journal)
-        arrivals = {path.name: _arrival(site, path) for path in sorted(scans, key=lambda path: path.name)}
+        arrivals = {path.name: arrival_of(site, path) for path in sorted(scans, key=lambda path: path.name)}
         journal.seen((one.name, one.size, one.mtime_ns, "") for one in arrivals.values())
         todo: Iterable[Arrival] = arrivals.values()
         while todo:
@@ -40,7 +40,8 @@ def process_scans(site: Site, scans: Sequence[Path], tell: Tell) -> int:
     return NotReadyError.exit_status if State.LATER in states else 0
 
 
-def _arrival(site: Site, path: Path) -> Arrival:
+def arrival_of(site: Site, path: Path) -> Arrival:
+    """Return a scan with its inclination log, if that lies beside it."""
     log = None
     if site.inclination is not None:
         beside = path.with_name(f"{path.stem}{site.inclination.suffix}")

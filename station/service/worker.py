@@ -78,36 +78,9 @@ def process(site: Site, arrival: Arrival, progress: Progress) -> Outcome:
     """
     began_s = time.monotonic()
     series = series_of(site)
-    with _held_still(arrival.path) as scan_sha256, _opened(site, arrival.path) as reader:
+    with _held_still(arrival.path) as scan_sha256:
         progress()
-        start, end, _ = utc_interval(reader, site.scans.name)
-        gathered = gather(site, reader, arrival.log, start, end)
-        reference = reference_of(site, series)
-        provenance = {
-            "scan_sha256": scan_sha256,
-            "log_sha256": _sha256(arrival.log) if arrival.log else "",
-            "science_hash": site.science_hash,
-            "reference_version": reference.version if reference else "",
-            "software_version": __version__,
-            **gathered.provenance,
-        }
-        gridder = gridder_for(gathered.setup, reference)
-        survey(gridder, reader.blocks(), gathered.setup, gathered.pose, progress)
-    if not gridder.count.any():
-        raise ScanError("no point falls on the grid: wrong scans.frame, SOP, CRS or units?")
-    measured = measure(gridder, gathered.setup, gathered.unknown, reference)
-    progress()
-    epoch = store.Epoch(
-        start_s=start.timestamp(),
-        end_s=end.timestamp(),
-        scan_id=arrival.path.stem,
-        measurement=measured,
-        shared=gathered.unknown,
-        verdict="degraded" if gathered.lacking else "good",
-        verdict_reason="; ".join(gathered.lacking),
-        numbers=_numbers(measured, gathered, reader.header.point_count),
-        provenance=provenance,
-    )
+        epoch = _measure(site, arrival, scan_sha256, progress, rehearsal=False)
     written = _same_as(series, epoch) or store.write_epoch(series, epoch)
     return Outcome(
         start_utc_s=epoch.start_s,
@@ -116,8 +89,48 @@ def process(site: Site, arrival: Arrival, progress: Progress) -> Outcome:
         revision=written.revision,
         verdict=epoch.verdict,
         reason=epoch.verdict_reason,
-        reference=reference.version if reference else None,
-        figures=_figures(measured, reader.header.point_count, time.monotonic() - began_s),
+        reference=epoch.provenance["reference_version"] or None,
+        figures=_figures(epoch, time.monotonic() - began_s),
+    )
+
+
+def rehearse(site: Site, arrival: Arrival, progress: Progress) -> tuple[str, str, dict[str, float | str]]:
+    """Measure a scan without storing anything: verdict, reason, figures."""
+    began_s = time.monotonic()
+    epoch = _measure(site, arrival, "", progress, rehearsal=True)
+    return epoch.verdict, epoch.verdict_reason, _figures(epoch, time.monotonic() - began_s)
+
+
+def _measure(
+    site: Site, arrival: Arrival, scan_sha256: str, progress: Progress, *, rehearsal: bool
+) -> store.Epoch:
+    with _opened(site, arrival.path) as reader:
+        start, end, _ = utc_interval(reader, site.scans.name)
+        gathered = gather(site, reader, arrival.log, start, end, keep_zero=not rehearsal)
+        reference = None if rehearsal and isinstance(site.reference.scans, Path) else reference_of(site)
+        gridder = gridder_for(gathered.setup, reference)
+        survey(gridder, reader.blocks(), gathered.setup, gathered.pose, progress)
+    if not gridder.count.any():
+        raise ScanError("no point falls on the grid: wrong scans.frame, SOP, CRS or units?")
+    measured = measure(gridder, gathered.setup, gathered.unknown, reference)
+    progress()
+    return store.Epoch(
+        start_s=start.timestamp(),
+        end_s=end.timestamp(),
+        scan_id=arrival.path.stem,
+        measurement=measured,
+        shared=gathered.unknown,
+        verdict="degraded" if gathered.lacking else "good",
+        verdict_reason="; ".join(gathered.lacking),
+        numbers=_numbers(measured, gathered, reader.header.point_count),
+        provenance={
+            "scan_sha256": scan_sha256,
+            "log_sha256": _sha256(arrival.log) if arrival.log else "",
+            "science_hash": site.science_hash,
+            "reference_version": reference.version if reference else "",
+            "software_version": __version__,
+            **gathered.provenance,
+        },
     )
 
 
@@ -159,8 +172,9 @@ def build_reference(site: Site, arrivals: list[Arrival], version: str, progress:
     return version
 
 
-def reference_of(site: Site, series: Series) -> Reference | None:
+def reference_of(site: Site) -> Reference | None:
     """Return the master surface; one given as a file is taken into the store at first use."""
+    series = series_of(site)
     held = read_reference(series)
     given = site.reference.scans
     if not isinstance(given, Path):
@@ -257,16 +271,13 @@ def _numbers(measured: Measurement, gathered: Gathered, points: int) -> dict[str
     return told
 
 
-def _figures(measured: Measurement, points: int, seconds: float) -> dict[str, float | str]:
+def _figures(epoch: store.Epoch, seconds: float) -> dict[str, float | str]:
     """Return what the log line and the status show of a scan."""
+    measured = epoch.measurement
     seen = np.isfinite(measured.uncertainty_m)
-    told: dict[str, float | str] = {
-        "points": points,
-        "cells": int(seen.sum()),
-        "sigma_median_m": round(float(np.median(measured.uncertainty_m[seen])), 4)
-        if seen.any()
-        else math.nan,
-    }
+    told: dict[str, float | str] = {"points": int(epoch.numbers["point_total"]), "cells": int(seen.sum())}
+    if seen.any():
+        told["sigma_median_m"] = round(float(np.median(measured.uncertainty_m[seen])), 4)
     change_m = measured.surface.change_m[np.isfinite(measured.surface.change_m)]
     if len(change_m):
         told["change_median_m"] = round(float(np.median(change_m)), 4)
