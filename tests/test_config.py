@@ -1,0 +1,79 @@
+"""The site file: every fault at once, in words that say what to do."""
+
+import pytest
+
+from station.config import read_site
+from station.errors import ConfigError
+
+GOOD = """
+[station]
+id = "x"
+data = "data"
+[scans]
+inbox = "inbox"
+frame = "map"
+[grid]
+bounds_m = { west = 0.0, south = 0.0, east = 10.0, north = 20.0 }
+cell_m = 0.5
+"""
+
+
+def read(tmp_path, text):
+    path = tmp_path / "site.toml"
+    path.write_text(text)
+    return read_site(path)
+
+
+def test_paths_are_relative_to_the_file(tmp_path):
+    site = read(tmp_path, GOOD)
+    assert site.scans.inbox == tmp_path / "inbox"
+    assert site.station.data == tmp_path / "data"
+    assert site.grid_cells.shape == (40, 20)
+    assert site.instrument.beam_divergence_rad == pytest.approx(0.12e-3)
+
+
+def test_all_faults_at_once_with_the_nearest_right_key(tmp_path):
+    text = (
+        GOOD.replace('id = "x"', 'id = "a b"')
+        .replace("frame", "fram")
+        .replace("cell_m = 0.5", "cell_m = 0.3")
+    )
+    with pytest.raises(ConfigError) as error:
+        read(tmp_path, text + '[uncertainty]\nmodel = "best"\n')
+    told = str(error.value)
+    assert "site.toml: 4 to mend" in told
+    assert "scans.fram: no such key; did you mean 'frame'?" in told
+    assert "station.id" in told
+    assert "make it a whole number" in told
+    assert "uncertainty.model" in told
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        (("[station]", "[station"), "not valid TOML"),
+        (('frame = "map"', 'frame = "scanner"'), "needs an"),
+        (("[grid]", '[scanner]\nmodel = "vz"\n[grid]'), "take one of riegl-vz-6000"),
+        (("[grid]", '[reference]\nscans = "there.tif"\n[grid]'), "no such file"),
+        (("[grid]", '[map]\npop = "pop.dat"\n[grid]'), "say which with map.crs"),
+        (("east = 10.0", "east = -10.0"), "at least one cell_m beyond"),
+        (("cell_m = 0.5", "cell_m = 0.0001"), "too many"),
+        (("cell_m = 0.5", "cell_m = nan"), "grid.cell_m"),
+    ],
+)
+def test_faults_say_what_to_do(tmp_path, change, says):
+    with pytest.raises(ConfigError, match=says):
+        read(tmp_path, GOOD.replace(*change))
+
+
+def test_a_missing_file_and_a_folder(tmp_path):
+    with pytest.raises(ConfigError, match="cannot be read"):
+        read_site(tmp_path / "none.toml")
+    with pytest.raises(ConfigError, match="is a folder"):
+        read_site(tmp_path)
+
+
+def test_only_what_changes_numbers_changes_the_hash(tmp_path):
+    one = read(tmp_path, GOOD).science_hash
+    assert read(tmp_path, GOOD.replace('inbox = "inbox"', 'inbox = "other"')).science_hash == one
+    assert read(tmp_path, GOOD.replace("cell_m = 0.5", "cell_m = 1.0")).science_hash != one
