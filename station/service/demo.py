@@ -45,7 +45,11 @@ def run_demo(folder: Path, hours: int) -> int:
     with open_series(site.station.data) as series, xr.open_dataset(folder / "truth.nc") as truth:
         Console(width=None if sys.stdout.isatty() else 100).print(_what_changed(site, series, truth))
     print(f"\n{site.station.data / 'series.nc'}")
-    print("open it:  python -c \"import station; print(station.open('" + str(site.station.data) + "'))\"")
+    print(
+        f"open it:  {sys.executable} -c \"import station; print(station.open('"
+        + str(site.station.data)
+        + "'))\""
+    )
     return status
 
 

@@ -37,6 +37,7 @@ from station.service import child
 from station.service.gather import Gathered, gather
 from station.service.inbox import Arrival
 from station.service.journal import Entry, Journal, State
+from station.service.logs import logfmt
 
 log = logging.getLogger("station")
 Progress = Callable[[], None]
@@ -314,13 +315,11 @@ class Worker:
             outcome = self._run(process, arrival)
         except ScanError as error:
             self._journal.set_aside(arrival.name, str(error))
-            log.warning("scan=%s verdict=set_aside reason=%s", arrival.name, _quoted(str(error)))
+            log.warning("%s", logfmt(scan=arrival.name, verdict="set_aside", reason=error))
             return False
         except NotReadyError as error:
             pause_s = self._journal.later(arrival.name, str(error))
-            log.info(
-                "scan=%s verdict=later reason=%s retry_s=%.0f", arrival.name, _quoted(str(error)), pause_s
-            )
+            log.info("%s", logfmt(scan=arrival.name, verdict="later", reason=error, retry_s=round(pause_s)))
             return False
         self._run(publish)
         self._journal.stored(
@@ -346,7 +345,7 @@ class Worker:
         data = self._site.station.data
         lost = [row.name for row in self._journal.rows(State.STORED) if row.epoch and not self._is_there(row)]
         for name in lost:
-            log.warning("scan=%s reason=%s", name, _quoted("its epoch is missing from the store: done again"))
+            log.warning("%s", logfmt(scan=name, reason="its epoch is missing from the store: done again"))
         self._journal.again(lost)
         if any((data / "epochs").glob("*/*/*/*.nc")):
             self._run(publish)
@@ -381,16 +380,14 @@ class Worker:
         arrivals = [self._arrival(row.name) for row in usable[:wanted]]
         missing = [arrival.name for arrival in arrivals if not arrival.path.is_file()]
         if missing:
-            log.warning(
-                "reference=waiting reason=%s", _quoted(f"no longer in the inbox: {', '.join(missing)}")
-            )
+            log.warning("%s", logfmt(reference="waiting", reason=f"no longer there: {', '.join(missing)}"))
             return
         try:
             version = self._run(build_reference, arrivals, "1")
         except (ScanError, NotReadyError) as error:
-            log.warning("reference=failed reason=%s", _quoted(str(error)))
+            log.warning("%s", logfmt(reference="failed", reason=error))
             return
-        log.info("reference=%s scans=%d", version, wanted)
+        log.info("%s", logfmt(reference=version, scans=wanted))
         self._journal.again(row.name for row in self._journal.rows(State.STORED) if row.reference != version)
 
     def _arrival(self, name: str) -> Arrival:
@@ -425,14 +422,11 @@ class Worker:
 
 def _say(name: str, outcome: Outcome) -> None:
     """Log the one line of a scan."""
-    words = [f"scan={name}", f"verdict={outcome.verdict}"]
-    words += [f"{key}={value}" for key, value in outcome.figures.items()]
-    words.append(f"reference={outcome.reference or 'none'}")
-    if outcome.reason:
-        words.append(f"reason={_quoted(outcome.reason)}")
-    log.log(logging.INFO if outcome.verdict == "good" else logging.WARNING, "%s", " ".join(words))
-
-
-def _quoted(text: str) -> str:
-    plain = text.replace('"', "'").replace("\n", " ")
-    return f'"{plain}"'
+    words = {
+        "scan": name,
+        "verdict": outcome.verdict,
+        **outcome.figures,
+        "reference": outcome.reference or "none",
+        **({"reason": outcome.reason} if outcome.reason else {}),
+    }
+    log.log(logging.INFO if outcome.verdict == "good" else logging.WARNING, "%s", logfmt(**words))
