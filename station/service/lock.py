@@ -5,7 +5,7 @@ from __future__ import annotations
 import fcntl
 import os
 import time
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from typing import TYPE_CHECKING
 
 from station.errors import NotReadyError, StoreError
@@ -36,8 +36,9 @@ def only_writer(data: Path, *, patience_s: float = 2.0) -> Iterator[None]:
                     " or give each site its own station.data"
                 )
             time.sleep(0.05)
-        os.ftruncate(held, 0)
-        os.pwrite(held, b"%d\n" % os.getpid(), 0)
+        with suppress(OSError):  # a full disk: the lock holds all the same, only the number is missing
+            os.ftruncate(held, 0)
+            os.pwrite(held, b"%d\n" % os.getpid(), 0)
         yield
     finally:
         os.close(held)
