@@ -19,6 +19,7 @@ from station.errors import StoreError
 from station.quantities import Grid
 
 CHUNK = 128  # rows and columns stored together
+TIMES_TOGETHER = 512  # of a variable that is small per scan, in a file of as many
 CONVENTIONS = "CF-1.11"
 
 
@@ -49,6 +50,7 @@ def written_whole(path: Path) -> Iterator[Path]:
     beside = path.with_name(f".{path.name}.{os.getpid()}.part")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
+        beside.unlink(missing_ok=True)  # of a process that was killed and had the same number
         yield beside
         with beside.open("rb") as file:
             os.fsync(file.fileno())
@@ -96,7 +98,7 @@ def lay_out(
     for axis, coordinate in (("y", series.grid.y_m), ("x", series.grid.x_m)):
         _axis(file, series, axis, coordinate)
     if times is not None:
-        _time(file)
+        _time(file, times)
     for dim, length in TEXT_LENGTH.items():
         file.createDimension(dim, length)
     if series.crs is not None:
@@ -125,8 +127,9 @@ def _axis(file: netCDF4.Dataset, series: Series, axis: str, coordinate: np.ndarr
     bounds[:] = np.stack([coordinate - towards, coordinate + towards], axis=-1)
 
 
-def _time(file: netCDF4.Dataset) -> None:
-    time = file.createVariable("time", "f8", ("time",), chunksizes=(512,))
+def _time(file: netCDF4.Dataset, times: int) -> None:
+    together = min(times, TIMES_TOGETHER)
+    time = file.createVariable("time", "f8", ("time",), chunksizes=(together,))
     time.setncatts(
         {
             "standard_name": "time",
@@ -138,11 +141,7 @@ def _time(file: netCDF4.Dataset) -> None:
             "bounds": "time_bnds",
         }
     )
-    file.createVariable(
-        "time_bnds",
-        "f8",
-        ("time", "bnds"),
-    )
+    file.createVariable("time_bnds", "f8", ("time", "bnds"), chunksizes=(together, 2))
 
 
 def _crs(file: netCDF4.Dataset, series: Series) -> None:
@@ -189,12 +188,12 @@ def _parameters(file: netCDF4.Dataset, names: tuple[str, ...], units: tuple[str,
         ("parameter_unit", units, "unit of the shared parameter"),
     ):
         variable = file.createVariable(name, "S1", ("parameter", "text"))
-        variable.long_name = long_name
+        variable.setncatts({"long_name": long_name, "_Encoding": "ascii"})
         variable[:] = text(values, "text")
 
 
-def define(file: netCDF4.Dataset, row: Variable, series: Series) -> netCDF4.Variable[Any]:
-    """Create a variable of the table."""
+def define(file: netCDF4.Dataset, row: Variable, series: Series, times: int) -> netCDF4.Variable[Any]:
+    """Create a variable of the table in a file of so many times."""
     chunks = None
     if row.is_raster:
         height, width = min(CHUNK, series.grid.ny), min(CHUNK, series.grid.nx)
@@ -202,7 +201,7 @@ def define(file: netCDF4.Dataset, row: Variable, series: Series) -> netCDF4.Vari
     elif row.is_heavy:
         chunks = (1, *(len(file.dimensions[dim]) for dim in row.dims[1:]))
     elif row.dims[:1] == ("time",):
-        chunks = (512, *(len(file.dimensions[dim]) for dim in row.dims[1:]))
+        chunks = (min(times, TIMES_TOGETHER), *(len(file.dimensions[dim]) for dim in row.dims[1:]))
     fill = {"f4": FILL, "f8": FILL, "S1": None}.get(row.dtype, False)
     variable = file.createVariable(
         row.name,
@@ -229,6 +228,8 @@ def attributes(row: Variable, *, mapped: bool) -> dict[str, Any]:
     for key in ("flag_masks", "flag_values"):
         if getattr(row, key):
             told[key] = np.array(getattr(row, key), dtype=row.dtype)
+    if row.digits is not None:  # netCDF's own is 64 bits wide, which classic files cannot hold
+        told["least_significant_digit"] = np.int32(row.digits)
     if row.is_raster and mapped:
         told["grid_mapping"] = "crs"
     if row.standard_name == "air_temperature":
@@ -259,3 +260,9 @@ def text(values: Sequence[str], dim: str) -> np.ndarray[Any, Any]:
     length = TEXT_LENGTH[dim]
     told = np.array([value.encode("ascii", "replace")[:length] for value in values], dtype=f"S{length}")
     return netCDF4.stringtochar(told)
+
+
+def strings(characters: np.ndarray[Any, Any]) -> list[str]:
+    """Return characters (n, length) as strings: what `text` was given."""
+    rows = np.ascontiguousarray(characters).view(f"S{characters.shape[-1]}")
+    return [value.decode("ascii") for value in rows[:, 0].tolist()]

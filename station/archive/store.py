@@ -8,16 +8,18 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
+import h5py
 import netCDF4
 import numpy as np
 import xarray as xr
 
-from station.archive.layout import Series, define, lay_out, put_raster, text, written_whole
+from station.archive.layout import Series, define, lay_out, put_raster, strings, text, written_whole
 from station.archive.variables import BY_NAME, TERMS, VARIABLES, VERDICTS
 from station.errors import StoreError
 from station.quantities import Measurement, Shared
 
 STAMP = "%Y%m%dT%H%M%SZ"
+JOINED = {"days": "%Y%m%d", "months": "%Y%m"}  # kinds of joined files, by how each names its time
 _EPOCH_NAME = re.compile(r"_(\d{8}T\d{6}Z)(?:_r(\d+))?\.nc$")
 
 
@@ -48,13 +50,29 @@ class Stored:
     revision: int
 
 
+@dataclass(frozen=True)
+class Row:
+    """One epoch and where it is: a file and the index in it."""
+
+    epoch_file: str
+    start: datetime
+    revision: int
+    path: Path
+    index: int
+    time_s: float
+
+
 def write_epoch(series: Series, epoch: Epoch) -> Stored:
     """Write an epoch beside the series; raise StoreError where it cannot, and leave nothing then.
 
     A second epoch of the same start is a new revision; no file is ever changed.
     """
     start = datetime.fromtimestamp(epoch.start_s, UTC)
-    revision = 1 + max((one.revision for one in revisions(series, start)), default=0)
+    known = [one.revision for one in revisions(series, start)]
+    for kind, stamp in JOINED.items():  # after the sweep an epoch may be there only
+        for path in joined(series, kind, start.strftime(stamp)):
+            known += [row.revision for row in rows_in(path) if row.start == start]
+    revision = 1 + max(known, default=0)
     tail = f"_r{revision}" if revision > 1 else ""
     path = epoch_folder(series, start) / f"{series.station_id}_{start.strftime(STAMP)}{tail}.nc"
     with written_whole(path) as beside, netCDF4.Dataset(beside, "w", clobber=False) as file:
@@ -89,6 +107,74 @@ def stored(path: Path) -> Stored | None:
     return Stored(path, start, int(told[2] or 1))
 
 
+def joined(series: Series, kind: str, name: str = "*") -> list[Path]:
+    """Return the joined files of `kind` (days or months) and of the day or month `name`, oldest first."""
+    found = (series.folder / kind).glob(f"**/{series.station_id}_{name}_r*.nc")
+    return sorted(found, key=lambda path: (path.name.rpartition("_r")[0], joined_revision(path)))
+
+
+def joined_revision(path: Path) -> int:
+    """Read off its name which revision of its day or month a joined file is."""
+    tail = path.stem.rpartition("_r")[2]
+    return int(tail) if tail.isdigit() else 0
+
+
+def rows_in(path: Path) -> list[Row]:
+    """Return the epochs in a file; raise StoreError where it is damaged."""
+    try:
+        with h5py.File(path, "r") as file:
+            times = np.asarray(file["time"][:], dtype=np.float64).tolist()
+            names = strings(file["epoch_file"][:])
+    except (OSError, RuntimeError, KeyError) as error:
+        raise StoreError(f"{path}: damaged, cannot be read: {error}") from error
+    found = []
+    for index, (time_s, name) in enumerate(zip(times, names, strict=True)):
+        told = stored(Path(name))
+        if told is None:
+            raise StoreError(f"{path}: damaged, names no epoch file in row {index}")
+        found.append(Row(name, told.start, told.revision, path, index, time_s))
+    return found
+
+
+def rows(series: Series) -> list[Row]:
+    """Return the epochs of the series in the order of time: of each start the newest revision.
+
+    Where several files hold it, months go before days before epochs, and a newer joined file before an older.
+    """
+    best: dict[datetime, tuple[tuple[int, int, int], Row]] = {}
+    for rank, kind in enumerate(JOINED, start=1):
+        for path in joined(series, kind):
+            for row in rows_in(path):
+                key = (row.revision, rank, joined_revision(path))
+                if row.start not in best or key > best[row.start][0]:
+                    best[row.start] = key, row
+    newest = {one.start: one for one in epochs(series)}  # they come oldest revision first
+    for start, one in newest.items():
+        if start not in best or one.revision > best[start][0][0]:
+            best[start] = (one.revision, 0, 0), rows_in(one.path)[0]
+    return _increasing(sorted((row for _, row in best.values()), key=lambda row: (row.time_s, row.start)))
+
+
+def _increasing(found: list[Row]) -> list[Row]:
+    """Leave out epochs whose time is not after the one before: two scans cannot share a middle."""
+    kept: list[Row] = []
+    for row in found:
+        if not kept or row.time_s > kept[-1].time_s:
+            kept.append(row)
+    return kept
+
+
+def sources(series_path: Path) -> set[Path]:
+    """Return the files that a `series.nc` points to; none where there is no series."""
+    if not series_path.is_file():
+        return set()
+    try:
+        with h5py.File(series_path, "r") as file:
+            return {series_path.parent / one.file_name for one in file["elevation"].virtual_sources()}
+    except (OSError, RuntimeError, KeyError) as error:
+        raise StoreError(f"{series_path}: damaged, cannot be read: {error}") from error
+
+
 def said(path: Path) -> dict[str, str]:
     """Return what an epoch file says of its origin: its text variables; raise StoreError if unreadable."""
     try:
@@ -103,7 +189,10 @@ def said(path: Path) -> dict[str, str]:
 
 
 def open_series(site_or_folder: str | Path) -> xr.Dataset:
-    """Return the whole series of a site file or data folder, lazily; raise StoreError where there is none."""
+    """Return the whole series of a site file or data folder, lazily.
+
+    Raises StoreError where there is none, or where a file it points to is gone: that would read as missing.
+    """
     place = Path(site_or_folder)
     if place.is_file() and place.suffix == ".toml":
         from station.config import read_site  # noqa: PLC0415 - a folder needs no pydantic
@@ -112,6 +201,11 @@ def open_series(site_or_folder: str | Path) -> xr.Dataset:
     path = place / "series.nc"
     if not path.is_file():
         raise StoreError(f"{path}: no series yet; has a scan been processed? (station status)")
+    gone = sorted(str(source) for source in sources(path) if not source.is_file())
+    if gone:
+        raise StoreError(
+            f"{path}: {len(gone)} of its files are gone, first {gone[0]}: put them back beside it"
+        )
     return xr.open_dataset(path, engine="netcdf4", decode_timedelta=False)
 
 
@@ -134,10 +228,10 @@ def _write(file: netCDF4.Dataset, series: Series, epoch: Epoch, name: str) -> No
         **{term: measured.terms[term] for term in TERMS if term in measured.terms},
     }
     for raster, values in rasters.items():
-        put_raster(define(file, BY_NAME[raster], series), 0, values)
+        put_raster(define(file, BY_NAME[raster], series, 1), 0, values)
     if shared is not None:
-        define(file, BY_NAME["shared_parameter"], series)[0] = shared.estimate
-        define(file, BY_NAME["shared_parameter_covariance"], series)[0] = shared.covariance
+        define(file, BY_NAME["shared_parameter"], series, 1)[0] = shared.estimate
+        define(file, BY_NAME["shared_parameter_covariance"], series, 1)[0] = shared.covariance
     _write_words(file, series, epoch, name)
 
 
@@ -152,7 +246,7 @@ def _write_words(file: netCDF4.Dataset, series: Series, epoch: Epoch, name: str)
     for row in VARIABLES:
         if row.dims == ("time",):
             value = VERDICTS.index(epoch.verdict) if row.name == "verdict" else epoch.numbers.get(row.name)
-            variable = define(file, row, series)
+            variable = define(file, row, series, 1)
             variable[0] = value if value is not None and np.isfinite(value) else np.ma.masked
         elif row.dtype == "S1":
-            define(file, row, series)[0] = text([words.get(row.name, "")], row.dims[1])[0]
+            define(file, row, series, 1)[0] = text([words.get(row.name, "")], row.dims[1])[0]

@@ -1,15 +1,21 @@
 """Days and months as one file each, without the series changing a value."""
 
+import dataclasses
 import os
 from datetime import UTC, datetime, timedelta
 
+import h5py
 import numpy as np
 import pytest
+import xarray as xr
 
 import station
 from station.archive import store
 from station.archive.join import join_closed, sweep
-from station.archive.series import build_series, rows
+from station.archive.series import build_series
+from station.archive.store import rows, sources
+from station.errors import StoreError
+from station.quantities import Shared
 
 DAY_AFTER = datetime(2025, 11, 23, 12, tzinfo=UTC)
 MONTH_AFTER = datetime(2026, 1, 5, tzinfo=UTC)
@@ -72,3 +78,107 @@ def test_left_over_parts_go(filled):
     long_ago = (datetime.now(UTC) - timedelta(days=3)).timestamp()
     os.utime(part, (long_ago, long_ago))
     assert sweep(filled, datetime.now(UTC)) == [part]
+
+
+def test_a_file_that_the_series_still_names_never_goes(filled):
+    """Where the disk was full after a join, the old series serves on."""
+    before = filled.path.read_bytes()
+    join_closed(filled, DAY_AFTER, lambda: None)
+    filled.path.write_bytes(before)
+    assert sweep(filled, datetime.now(UTC) + timedelta(hours=49)) == []
+    assert values(filled).sizes["time"] == 5
+
+
+def test_the_grace_begins_when_the_series_names_a_file_no_longer(filled):
+    before = filled.path.read_bytes()
+    join_closed(filled, DAY_AFTER, lambda: None)
+    filled.path.write_bytes(before)
+    long_ago = (datetime.now(UTC) - timedelta(days=9)).timestamp()
+    for path in filled.folder.glob("**/*.nc"):
+        os.utime(path, (long_ago, long_ago))
+    build_series(filled)
+    assert sweep(filled, datetime.now(UTC) + timedelta(hours=47)) == []
+    assert len(sweep(filled, datetime.now(UTC) + timedelta(hours=49))) == 5
+
+
+def test_what_is_measured_again_after_the_sweep_wins(filled, epoch):
+    join_closed(filled, DAY_AFTER, lambda: None)
+    sweep(filled, datetime.now(UTC) + timedelta(hours=49))
+    again = store.write_epoch(filled, epoch(5, value=9.0))
+    assert again.path.name == "hef_20251121T050000Z_r2.nc"
+    build_series(filled)
+    assert values(filled).elevation_change[:3, 3, 3].values == pytest.approx([0.01, 9.0, 0.09], abs=1e-3)
+
+
+def test_a_joined_file_never_changes_under_its_name(filled, epoch):
+    for hour in (7, 8):
+        join_closed(filled, DAY_AFTER, lambda: None)
+        sweep(filled, datetime.now(UTC) + timedelta(hours=49))
+        store.write_epoch(filled, epoch(hour))
+    held = {path.name: path.read_bytes() for path in filled.folder.glob("days/**/*.nc")}
+    join_closed(filled, DAY_AFTER, lambda: None)
+    assert "hef_20251121_r3.nc" in {path.name for path in sources(filled.path)}
+    for path in filled.folder.glob("days/**/*.nc"):
+        assert held.get(path.name, path.read_bytes()) == path.read_bytes()
+
+
+def test_progress_is_told_after_every_epoch(filled):
+    told = []
+    join_closed(filled, DAY_AFTER, lambda: told.append(1))
+    assert len(told) == 5
+
+
+def moved(epoch):
+    """The same scan from a scanner that was moved: other azimuths, so other shared parameters."""
+    shared = Shared(("tilt_north", "lean_090.0", "range_bias"), ("rad", "rad", "m"), np.arange(3.0),
+                    np.arange(9.0).reshape(3, 3) * 1e-6)  # fmt: skip
+    return dataclasses.replace(epoch, shared=shared)
+
+
+def test_epochs_before_and_after_a_move_stand_in_one_series_each_with_its_parameters(filled, epoch):
+    store.write_epoch(filled, moved(epoch(33)))
+    build_series(filled)
+    for months in (False, True):
+        if months:
+            assert join_closed(filled, MONTH_AFTER, lambda: None) == 1  # the day before the move
+        told = values(filled)
+        names = [str(name) for name in told.parameter_name.values]
+        assert sorted(names) == ["lean_090.0", "range_bias", "tilt_east", "tilt_north"]
+        covariance = told.shared_parameter_covariance
+        at = [names.index(name) for name in ("tilt_north", "lean_090.0", "range_bias")]
+        assert covariance[-1, at, at].values == pytest.approx(np.arange(9.0).reshape(3, 3) * 1e-6)
+        assert told.shared_parameter[-1, at].values.tolist() == [0.0, 1.0, 2.0]
+        assert np.isnan(covariance[-1, names.index("tilt_east")]).all()
+        at = [names.index(name) for name in ("tilt_east", "tilt_north", "range_bias")]
+        assert covariance[0, at, at].values == pytest.approx(np.diag([1e-10, 2e-10, 1.6e-5]))
+        assert np.isnan(covariance[0, names.index("lean_090.0")]).all()
+
+
+def test_epochs_of_an_older_version_join_with_newer_ones(filled):
+    """Another chunking, a variable that was not there yet: values stay, what was not there is missing."""
+    before = values(filled)
+    for one in store.epochs(filled)[:2]:
+        with h5py.File(one.path, "r+") as file:
+            old = file["elevation"]
+            kept, attributes, scales = old[:], dict(old.attrs), [file[dim] for dim in ("time", "y", "x")]
+            del file["elevation"], file["stable_nmad"], file["lean_zero"], file["elevation_spread"]
+            new = file.create_dataset("elevation", data=kept, chunks=(1, 64, 64), maxshape=(None, 140, 150))
+            for key in attributes.keys() - {"DIMENSION_LIST"}:
+                new.attrs[key] = attributes[key]
+            for axis, scale in enumerate(scales):
+                new.dims[axis].attach_scale(scale)
+    build_series(filled)
+    told = values(filled)
+    assert np.isnan(told.elevation_spread[:2]).all()
+    changed = ["elevation_spread"]
+    assert told.drop_vars(changed).identical(before.drop_vars(changed))
+    join_closed(filled, DAY_AFTER, lambda: None)
+    assert values(filled).identical(told)
+
+
+def test_a_source_that_is_gone_is_noticed(filled):
+    store.epochs(filled)[1].path.unlink()
+    with xr.open_dataset(filled.path) as told:
+        assert np.isnan(told.elevation_change[1]).all()  # what others would read without a word
+    with pytest.raises(StoreError, match="hef_20251121T050000Z"):
+        station.open(filled.folder)

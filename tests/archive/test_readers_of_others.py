@@ -1,16 +1,20 @@
 """What other people's programs make of the files."""
 
+import dataclasses
 import json
 import pickle
 import shutil
 import subprocess
 import sys
+from contextlib import contextmanager
+from datetime import UTC, datetime
 
 import numpy as np
 import pytest
 import xarray as xr
 
 from station.archive import reference, store
+from station.archive.join import join_closed
 from station.archive.series import build_series
 from station.quantities import Reference
 
@@ -38,24 +42,60 @@ def built(series, epoch):
     return build_series(series)
 
 
-@pytest.mark.parametrize("which", ["series.nc", "reference.nc", "epochs/2025/11/21/hef_20251121T010000Z.nc"])
-def test_compliance_checker_finds_nothing(built, which, tmp_path):
-    report = tmp_path / "report.json"
+def findings(path, report):
+    """What the CF checker says against a file."""
     checker = shutil.which("compliance-checker", path=f"{sys.prefix}/bin") or tool("compliance-checker")
     subprocess.run(
-        [checker, "--test=cf:1.11", "--format=json", f"--output={report}", built.parent / which],
+        [checker, "--test=cf:1.11", "--format=json", f"--output={report}", path],
         capture_output=True,
         check=False,
         timeout=120,
     )
     told = json.loads(report.read_text())["cf:1.11"]
-    found = [
+    return [
         (check["name"], check["msgs"])
         for priority in ("high_priorities", "medium_priorities", "low_priorities")
         for check in told[priority]
         if check["msgs"]
     ]
-    assert found == []
+
+
+@pytest.mark.parametrize("which", ["series.nc", "reference.nc", "epochs/2025/11/21/hef_20251121T010000Z.nc"])
+def test_compliance_checker_finds_nothing(built, which, tmp_path):
+    assert findings(built.parent / which, tmp_path / "report.json") == []
+
+
+@pytest.mark.parametrize("which", ["series.nc", "months/2025/hef_202511_r1.nc"])
+def test_compliance_checker_finds_nothing_in_what_was_joined(built, series, which, tmp_path):
+    join_closed(series, datetime(2026, 2, 1, tzinfo=UTC), lambda: None)
+    assert findings(built.parent / which, tmp_path / "report.json") == []
+
+
+@pytest.mark.parametrize("which", ["series.nc", "reference.nc"])
+def test_compliance_checker_finds_nothing_without_a_map(series, epoch, which, tmp_path):
+    local = dataclasses.replace(series, crs=None, vertical_datum="")
+    store.write_epoch(local, epoch(0))
+    build_series(local)
+    elevation = np.full(series.grid.shape, 2900.125)
+    flat = np.zeros_like(elevation, np.float32)
+    reference.write_reference(local, Reference(series.grid, "1", elevation, flat, flat, None, ("a",)))
+    with xr.open_dataset(series.folder / which) as told:
+        assert "crs" not in told
+    assert findings(series.folder / which, tmp_path / "report.json") == []
+
+
+def test_other_programs_read_what_was_joined(built, series, tmp_path):
+    join_closed(series, datetime(2026, 2, 1, tzinfo=UTC), lambda: None)
+    for path in (built, built.parent / "months/2025/hef_202511_r1.nc"):
+        assert "elevation_change" in run(tool("cdo"), "infon", path).stdout
+        assert run(tool("ncdump"), "-v", "scan_id", path).stdout.count('"251121_0') == 4
+        at = run(tool("gdallocationinfo"), "-valonly", "-b", "4", "-geoloc",
+                 f"NETCDF:{path}:elevation_change", "632055", "5185955").stdout  # fmt: skip
+        assert float(at) == pytest.approx(0.03, abs=1e-3)
+        mean = tmp_path / "mean.nc"
+        run(tool("ncra"), "-O", "-3", "-v", "elevation_change", path, mean)
+        with xr.open_dataset(mean) as told:
+            assert float(told.elevation_change[0, 5, 5]) == pytest.approx(0.015, abs=1e-3)
 
 
 def test_ncdump(built):
@@ -92,27 +132,41 @@ def test_gdal_knows_place_and_direction(built):
     assert float(at) == pytest.approx(0.03, abs=1e-3)
 
 
-@pytest.mark.parametrize("engine", ["netcdf4", "h5netcdf"])
-def test_xarray_while_the_series_is_replaced(built, series, engine):
-    # Another process, as in life: HDF5 is one lock within a process.
+@contextmanager
+def replaced_again_and_again(series):
+    """Build the series in another process, as in life: HDF5 is one lock within a process."""
     program = (
-        "import sys, pickle, time; from station.archive.series import build_series\n"
+        "import sys, pickle; from station.archive.series import build_series\n"
         "series = pickle.loads(bytes.fromhex(sys.argv[1]))\n"
-        "end = time.monotonic() + 4\n"
-        "while time.monotonic() < end: build_series(series)\n"
+        "while True: build_series(series)\n"
     )
     writer = subprocess.Popen([sys.executable, "-c", program, pickle.dumps(series).hex()])
+    before = series.path.stat().st_ino
     try:
-        reads = 0
-        while writer.poll() is None:
-            with xr.open_dataset(built, engine=engine) as told:
-                assert told.elevation_change[:, 5, 5].values == pytest.approx([0, 0.01, 0.02, 0.03], abs=1e-3)
-                reads += 1
+        while series.path.stat().st_ino == before:
+            assert writer.poll() is None
+        yield
+        assert writer.poll() is None
     finally:
         writer.kill()
         writer.wait()
-    assert writer.returncode == 0
-    assert reads > 3
+
+
+@pytest.mark.parametrize("engine", ["netcdf4", "h5netcdf"])
+def test_xarray_while_the_series_is_replaced(built, series, engine):
+    with replaced_again_and_again(series):
+        for _ in range(6):
+            with xr.open_dataset(built, engine=engine) as told:
+                assert told.elevation_change[:, 5, 5].values == pytest.approx([0, 0.01, 0.02, 0.03], abs=1e-3)
+
+
+def test_other_programs_while_the_series_is_replaced(built, series):
+    ncdump, cdo, gdal = tool("ncdump"), tool("cdo"), tool("gdalinfo")
+    with replaced_again_and_again(series):
+        for _ in range(5):
+            assert "elevation_change(time, y, x)" in run(ncdump, "-h", built).stdout
+            assert "elevation_change" in run(cdo, "infon", built).stdout
+            assert 'ID["EPSG",32632]' in run(gdal, f"NETCDF:{built}:elevation_change").stdout
 
 
 def test_nco_averages_over_epochs(built, tmp_path):

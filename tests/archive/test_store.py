@@ -5,6 +5,7 @@ import os
 import resource
 import signal
 import time
+from datetime import UTC, datetime
 
 import netCDF4
 import numpy as np
@@ -13,7 +14,8 @@ import xarray as xr
 
 import station
 from station.archive import reference, store
-from station.archive.series import build_series, rows
+from station.archive.join import join_closed
+from station.archive.series import build_series
 from station.errors import StoreError
 from station.quantities import Reference, Shared
 
@@ -126,26 +128,39 @@ def test_no_room_leaves_nothing_behind(series, epoch):
     assert not [path for path in series.folder.rglob("*") if path.is_file()]
 
 
+def test_what_a_killed_writer_left_is_in_nobodys_way(series, epoch):
+    left = store.epoch_folder(series, datetime.fromtimestamp(epoch(1).start_s, UTC))
+    left.mkdir(parents=True)
+    part = left / f".hef_20251121T010000Z.nc.{os.getpid()}.part"
+    part.write_bytes(b"half")
+    assert store.write_epoch(series, epoch(1)).path.is_file()
+    assert not part.exists()
+
+
 def keep_writing(series, epoch):
     for hour in range(10_000):
         store.write_epoch(series, epoch(hour))
         build_series(series)
+        if hour % 3 == 2:
+            join_closed(series, datetime(2030, 1, 1, tzinfo=UTC), lambda: None)
 
 
 def test_kill_at_any_moment_leaves_a_whole_series(series, epoch):
     fork = multiprocessing.get_context("fork")
     rng = np.random.default_rng(20251121)
     build(series, epoch, [0])
-    for _ in range(12):
+    for _ in range(30):
         child = fork.Process(target=keep_writing, args=(series, epoch))
         child.start()
-        time.sleep(rng.uniform(0.02, 0.4))
+        time.sleep(rng.uniform(0.01, 0.3))
         os.kill(child.pid, signal.SIGKILL)
         child.join()
         with station.open(series.folder) as told:
             hours = (told.time.values.astype("datetime64[s]").astype(np.int64) - 450 - 1_763_683_200) / 3600
             assert np.all(np.diff(hours) > 0)
-            assert told.elevation_change[:, 100, 10].values == pytest.approx(hours / 100, abs=1e-3)
-        for one in rows(series):
-            with netCDF4.Dataset(one.path) as file:
-                assert file["elevation_change"][0, 139, 0] == pytest.approx(one.start.hour / 100, abs=25)
+            assert told.elevation_change[:, 139, 74].values == pytest.approx(hours / 100, abs=1e-3)
+    assert sum(1 for _ in series.folder.glob("**/*.nc")) > 30
+    for one in store.rows(series):
+        with netCDF4.Dataset(one.path) as file:
+            hour = (one.time_s - 450 - 1_763_683_200) / 3600
+            assert file["elevation_change"][one.index, 139, 74] == pytest.approx(hour / 100, abs=1e-3)
