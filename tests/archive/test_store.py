@@ -39,6 +39,7 @@ def test_an_epoch_comes_back_to_the_stored_digit(series, epoch):
         ):
             assert np.array_equal(np.isnan(told[name][0]), np.isnan(values))
             assert np.nanmax(np.abs(told[name][0] - values)) <= 0.5 / 1024 + 1e-4
+            assert np.nanmax(np.abs(told[name][0].astype("f8") * 1024 % 1)) == 0
         assert told.point_count[0].sum() == given.surface.count.sum()
         assert told.scan_id.values[0] == "251121_050000"
         assert told.sop_id.values[0] == "sop-1"
@@ -106,26 +107,54 @@ def test_the_reference_comes_back_and_its_versions_stay(series):
     assert (series.folder / "reference_1.nc").is_file()
 
 
-def out_of_room(series, epoch, written):
+def out_of_room(task, written):
     resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, 20_000))
     signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
     try:
-        store.write_epoch(series, epoch)
+        task()
         written.send("written")
     except StoreError as error:
         written.send(str(error))
 
 
-def test_no_room_leaves_nothing_behind(series, epoch):
-    rng = np.random.default_rng(0)
-    noisy = epoch(1)
-    noisy.measurement.surface.change_m[:] = rng.normal(size=series.grid.shape)
+def said_without_room(task):
     here, there = multiprocessing.Pipe()
-    child = multiprocessing.get_context("fork").Process(target=out_of_room, args=(series, noisy, there))
+    child = multiprocessing.get_context("fork").Process(target=out_of_room, args=(task, there))
     child.start()
-    assert "cannot be written" in here.recv()
+    said = here.recv() if here.poll(30) else "nothing"
     child.join()
+    return said
+
+
+def noisy(epoch, hour):
+    rng = np.random.default_rng(hour)
+    made = epoch(hour)
+    made.measurement.surface.change_m[:] = rng.normal(size=made.measurement.surface.change_m.shape)
+    return made
+
+
+def test_no_room_for_an_epoch_leaves_nothing_behind(series, epoch):
+    made = noisy(epoch, 1)
+    assert "cannot be written" in said_without_room(lambda: store.write_epoch(series, made))
     assert not [path for path in series.folder.rglob("*") if path.is_file()]
+
+
+@pytest.mark.parametrize("task", ["series", "join", "reference"])
+def test_no_room_leaves_what_there_was(series, epoch, task):
+    for hour in (1, 2):
+        store.write_epoch(series, noisy(epoch, hour))
+    build_series(series)
+    bumpy = np.random.default_rng(0).normal(size=series.grid.shape)
+    flat = np.ones(series.grid.shape, np.float32)
+    made = Reference(series.grid, "1", bumpy, flat, flat, None, ("a",))
+    tasks = {
+        "series": lambda: build_series(series),
+        "join": lambda: join_closed(series, datetime(2026, 2, 1, tzinfo=UTC), lambda: None),
+        "reference": lambda: reference.write_reference(series, made),
+    }
+    before = {path: path.read_bytes() for path in series.folder.rglob("*") if path.is_file()}
+    assert "cannot be written" in said_without_room(tasks[task])
+    assert {path: path.read_bytes() for path in series.folder.rglob("*") if path.is_file()} == before
 
 
 def test_what_a_killed_writer_left_is_in_nobodys_way(series, epoch):
