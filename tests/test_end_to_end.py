@@ -112,6 +112,10 @@ def test_a_day_in_the_life_of_a_station(service):
     assert "cut off or corrupt" in reasons["250715_040000.laz.txt"]
     assert "is a link" in reasons["250715_100000.laz.txt"]
 
+    # A broken file is not waited with until its log comes.
+    (service.folder / "inbox" / "250715_110000.laz").write_bytes(b"LASF" + bytes(500))
+    service.await_(lambda: service.status()["counts"]["set_aside"] == 3)
+
     # The whole file comes after all and takes its right place.
     (service.folder / "inbox" / "250715_040000.laz").write_bytes(whole)
     service.await_(lambda: service.scans() == names(0, 1, 2, 3, 4, 5))

@@ -245,6 +245,8 @@ def put_raster(variable: netCDF4.Variable[Any], at: int | None, values: np.ndarr
         variable[... if at is None else at] = values
         return
     ny, nx = values.shape
+    if at is not None:  # else a variable without any value would be shorter than time
+        variable[at, 0, 0] = np.ma.masked
     for top in range(0, ny, CHUNK):
         for left in range(0, nx, CHUNK):
             tile = values[top : top + CHUNK, left : left + CHUNK]

@@ -38,6 +38,7 @@ class Takes(Protocol):
 
     def recover(self) -> None: ...  # noqa: D102
     def take(self, arrival: Arrival) -> bool: ...  # noqa: D102
+    def glance(self, arrival: Arrival) -> None: ...  # noqa: D102
     def join_closed(self) -> None: ...  # noqa: D102
     def sweep(self) -> None: ...  # noqa: D102
 
@@ -143,6 +144,9 @@ class Daemon:
         self._looked_s = time.monotonic()
         listing = inbox.look()
         self._note_new(listing.new)
+        if listing.first is None and listing.unread is not None:
+            worker.glance(listing.unread)
+            return 0.0
         if listing.first is None:
             self._tidy(worker)
             self._say_idle()

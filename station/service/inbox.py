@@ -34,6 +34,7 @@ log = logging.getLogger("station")
 
 # What needs no quotes in a log line or a shell; and `<name>.txt` must still be a possible file name.
 _PLAIN_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._,+=@~()-]{0,99}")
+WAITS_FOR_LOG = "its inclination log"
 _LOOK_AGAIN_S = 5.0  # at a file someone holds open: nothing tells when it is closed
 _KINDS = {
     stat.S_IFLNK: "a link",
@@ -61,6 +62,7 @@ class Listing:
     """What one look at the inbox gave."""
 
     first: Arrival | None  # the earliest that may be taken now
+    unread: Arrival | None  # where there is none, one that waits for its log, once: is it worth waiting for?
     queued: int  # how many settled ones there are, the first among them
     new: int  # names never seen before
     next_s: float  # until another may be ready; inf where none waits
@@ -95,6 +97,7 @@ class Inbox:
         self._monotonic_s = monotonic_s
         self._now_s = now_s
         self._sights: dict[str, _Sight] = {}
+        self._given_to_read: set[tuple[int, ...]] = set()
 
     def look(self) -> Listing:
         """List the folder, note in the journal what is new, changed or gone, and give the scan to take next.
@@ -106,6 +109,7 @@ class Inbox:
         scans = {name: status for name, status in there.items() if is_scan(name, self._suffixes)}
         new = len({quoted(name) for name in scans} - known.keys())
         settled: list[Arrival] = []
+        unread: Arrival | None = None
         waiting: list[tuple[str, int, int, str]] = []
         next_s = math.inf
         for name, status in scans.items():
@@ -120,13 +124,19 @@ class Inbox:
             next_s = min(next_s, wait_s)
             if not waits_for:
                 settled.append(arrival)
+            elif waits_for.startswith(WAITS_FOR_LOG) and _print(status) not in self._given_to_read:
+                unread = unread or arrival
         self._journal.seen(waiting)
         self._forget(known, scans)
         settled.sort(key=lambda arrival: (_start(arrival.name, self._pattern), arrival.name))
         first = next((arrival for arrival in settled if not _is_written(arrival)), None)
         if settled and first is None:
             next_s = min(next_s, _LOOK_AGAIN_S)
-        return Listing(first, len(settled), new, next_s)
+        if first is not None:
+            unread = None
+        if unread is not None:
+            self._given_to_read.add(_print(scans[unread.name]))
+        return Listing(first, unread, len(settled), new, next_s)
 
     def _weigh(
         self, name: str, status: os.stat_result, there: Mapping[str, os.stat_result], known: Glimpse | None
@@ -149,7 +159,7 @@ class Inbox:
         if self._inclination and self._inclination.required and log_path is None:
             left_s = self._inclination.wait_s - still_s
             if left_s > 0:
-                return arrival, f"its inclination log {log_name}", left_s
+                return arrival, f"{WAITS_FOR_LOG} {log_name}", left_s
         pause_s = self._pause_s(status, known)
         return arrival, "its next try" if pause_s else "", pause_s or math.inf
 

@@ -95,6 +95,13 @@ def process(site: Site, arrival: Arrival, progress: Progress) -> Outcome:
     )
 
 
+def open_only(site: Site, arrival: Arrival, progress: Progress) -> None:
+    """Raise ScanError where a scan's headers say that it cannot be used."""
+    progress()
+    with _opened(site, arrival.path) as reader:
+        utc_interval(reader, site.scans.name)
+
+
 def rehearse(site: Site, arrival: Arrival, progress: Progress) -> tuple[str, str, dict[str, float | str]]:
     """Measure a scan without storing anything: verdict, reason, figures."""
     began_s = time.monotonic()
@@ -314,8 +321,7 @@ class Worker:
         try:
             outcome = self._run(process, arrival)
         except ScanError as error:
-            self._journal.set_aside(arrival.name, str(error))
-            log.warning("%s", logfmt(scan=arrival.name, verdict="set_aside", reason=error))
+            self._set_aside(arrival, error)
             return False
         except NotReadyError as error:
             pause_s = self._journal.later(arrival.name, str(error))
@@ -337,6 +343,15 @@ class Worker:
         self._make_reference_when_due()
         return True
 
+    def glance(self, arrival: Arrival) -> None:
+        """Set a scan aside at once if its headers are broken, rather than after waiting for its log."""
+        try:
+            self._run(open_only, arrival)
+        except ScanError as error:
+            self._set_aside(arrival, error)
+        except NotReadyError:
+            return
+
     def recover(self) -> None:
         """Make journal and files agree: epochs without their journal row are redone, the series is rebuilt.
 
@@ -357,6 +372,10 @@ class Worker:
     def sweep(self) -> None:
         """Delete what no longer serves."""
         self._run(sweep_store)
+
+    def _set_aside(self, arrival: Arrival, error: ScanError) -> None:
+        self._journal.set_aside(arrival.name, str(error))
+        log.warning("%s", logfmt(scan=arrival.name, verdict="set_aside", reason=error))
 
     def _is_there(self, row: Entry) -> bool:
         """Tell whether a stored epoch still is: as itself, or joined into its day or month."""

@@ -66,6 +66,19 @@ def test_the_series_is_in_the_order_of_time_and_holds_the_newest_revision(series
         assert np.isnan(told.elevation_change[0, 3, -1])
 
 
+def test_an_epoch_before_there_is_a_reference(series, epoch):
+    """Its change is empty altogether, alone and beside one that has some."""
+    store.write_epoch(series, epoch(1, value=np.nan))
+    build_series(series)
+    with station.open(series.folder) as told:
+        assert np.isnan(told.elevation_change.values).all()
+        assert np.isfinite(told.elevation.values).any()
+    store.write_epoch(series, epoch(2))
+    build_series(series)
+    with station.open(series.folder) as told:
+        assert told.elevation_change[:, 3, 3].values == pytest.approx([np.nan, 0.02], abs=1e-3, nan_ok=True)
+
+
 def test_nothing_stored_is_said(series):
     with pytest.raises(StoreError, match="no series yet"):
         station.open(series.folder)

@@ -38,6 +38,9 @@ class FakeWorker:
     def sweep(self):
         self.say("sweep")
 
+    def glance(self, arrival):
+        self.say("glance", arrival.name)
+
     def take(self, arrival):
         self.on_progress()
         if (self.site.station.data / "full").exists():
