@@ -41,6 +41,7 @@ from station.service.logs import logfmt
 
 log = logging.getLogger("station")
 Progress = Callable[[], None]
+MOST_SOURCES = 400  # of the series: past the limit of open files some readers return wrong data
 REFERENCE_PASSES = 3  # a third improves the second by a tenth, a fourth the third by nothing measurable
 T = TypeVar("T")
 
@@ -197,31 +198,24 @@ def reference_of(site: Site) -> Reference | None:
 
 
 def publish(site: Site, progress: Progress) -> None:
-    """Build `series.nc` anew over the epochs that exist."""
-    build_series(series_of(site))
+    """Build `series.nc` anew over the epochs that exist; join them first where they are too many files."""
+    series = series_of(site)
+    if len(store.sources(series.path)) > MOST_SOURCES:
+        join.join_closed(series, datetime.now(UTC), progress)
+    build_series(series)
     progress()
 
 
 def join_epochs(site: Site, progress: Progress) -> int:
     """Join closed days and months; return how many files that made."""
     series = series_of(site)
-    return join.join_closed(series, datetime.now(UTC), progress) if store.epochs(series) else 0
+    return join.join_closed(series, datetime.now(UTC), progress) if store.rows(series) else 0
 
 
 def sweep_store(site: Site, progress: Progress) -> int:
     """Delete what the series has not named for two days; return how many files went."""
     progress()
     return len(join.sweep(series_of(site), datetime.now(UTC)))
-
-
-def stored_epochs(site: Site, progress: Progress) -> dict[str, str]:
-    """Return the newest epoch file of each scan id (path relative to the data folder)."""
-    series = series_of(site)
-    progress()
-    return {
-        store.said(one.path)["scan_id"]: str(one.path.relative_to(series.folder))
-        for one in store.epochs(series)
-    }
 
 
 @contextmanager
@@ -362,7 +356,7 @@ class Worker:
         for name in lost:
             log.warning("%s", logfmt(scan=name, reason="its epoch is missing from the store: done again"))
         self._journal.again(lost)
-        if any((data / "epochs").glob("*/*/*/*.nc")):
+        if any(path for kind in ("epochs", "days", "months") for path in (data / kind).glob("**/*.nc")):
             self._run(publish)
 
     def join_closed(self) -> None:
