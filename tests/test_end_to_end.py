@@ -172,3 +172,30 @@ def test_a_bad_site_file_does_not_start(tmp_path):
     )  # fmt: skip
     assert done.returncode == 78
     assert "station.id: missing" in done.stderr
+
+
+@pytest.mark.slow
+def test_random_kills_lose_nothing_and_change_no_value(service, tmp_path):
+    """Twenty kills at random moments; then every value is that of an undisturbed run."""
+    seed = int(np.random.default_rng().integers(1 << 30))
+    rng = np.random.default_rng(seed)
+    for kill in range(20):
+        service.start()
+        drop(service, kill % 6)
+        time.sleep(rng.uniform(0.3, 2.5))
+        service.end(signal.SIGKILL)
+    service.start()
+    drop(service, *range(6))
+    service.await_(lambda: service.scans() == names(*range(6)))
+    service.await_(lambda: service.status()["counts"]["waiting"] == 0)
+    assert service.end(signal.SIGTERM) == 0
+
+    quiet = Service(tmp_path / "quiet")
+    shutil.copytree(service.folder, quiet.folder, ignore=shutil.ignore_patterns("data", "log"))
+    quiet.start()
+    quiet.await_(lambda: quiet.scans() == names(*range(6)))
+    quiet.await_(lambda: quiet.status()["counts"]["waiting"] == 0)
+    assert quiet.end(signal.SIGTERM) == 0
+    with station.open(service.folder / "data") as told, station.open(quiet.folder / "data") as wanted:
+        for name in set(wanted.variables) - {"epoch_file"}:  # a revision more or less is no other value
+            assert told[name].identical(wanted[name]), f"{name}, seed {seed}"

@@ -120,3 +120,14 @@ def test_sigma_holds_what_the_log_cannot_know(tmp_path):
     seen = np.isfinite(measured.series.elevation_change.values)
     flagged = measured.series.quality.values.astype(int) & Quality.CHANGE_SIGNIFICANT
     assert (flagged > 0)[seen].mean() < 0.2
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [2, 3, 4, 5])
+def test_sigma_holds_for_other_stations(tmp_path, seed):
+    """Other weather, motion and sensor errors: box by box within two sigma, and not because sigma is vast."""
+    simulate(tmp_path / "station", replace(CALM, seed=seed))
+    measured = Measured(tmp_path / "station")
+    error, sigma, _ = measured.boxes(measured.error_of_change)
+    assert np.mean(np.abs(error) < 2 * sigma) > 0.9
+    assert np.std(error / sigma) > 0.3
