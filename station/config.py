@@ -226,6 +226,7 @@ class WeatherSection(Section):
     format: Literal["toa5", "csv"] = "toa5"
     columns: WeatherColumns
     max_age_s: Positive = 3600.0
+    wait_s: NotNegative = 900.0
     utc_offset_h: Annotated[float, Field(ge=-14, le=14)] = 0.0
 
 
@@ -345,7 +346,7 @@ class Site(SiteFile):
                 "station": True,
                 "scans": {"inbox", "settle_s", "expected_every_s", "polling", "timeout_s", "name"},
                 "sop": True,  # an epoch names the SOP it was made with
-                "weather": {"file"},
+                "weather": {"file", "wait_s"},
                 "inclination": {"wait_s", "required", "suffix"},
                 "map": {"pop"},
             },

@@ -188,7 +188,11 @@ class Daemon:
     def _make(self, site: Site) -> tuple[Takes, Inbox, Ear, Clockwork]:
         journal = self._opened_journal()
         worker = self._make_worker(
-            site, journal, on_progress=self._heart.ping, should_stop=lambda: time.monotonic() > self._stop_s
+            site,
+            journal,
+            on_progress=self._heart.ping,
+            should_stop=lambda: time.monotonic() > self._stop_s,
+            patient=True,
         )
         inbox = Inbox(site, journal, suffixes())
         ear = Ear(site.scans.inbox, lambda: self.wake(Wake.LOOK), polling=site.scans.polling)

@@ -49,10 +49,12 @@ def gather(
     end: datetime,
     *,
     keep_zero: bool = True,
+    wait_for_weather: bool = False,
 ) -> Gathered:
     """Gather what goes with a scan; raise ScanError or ConfigError where it cannot be placed at all.
 
-    `keep_zero`: a zero of lean found here is kept for the scans to come.
+    `keep_zero`: a zero of lean found here is kept for the scans to come. `wait_for_weather`: raise
+    NotReadyError where there is no weather yet.
     """
     if site.scans.frame == "map":
         setup = setup_of(site, _map_position(site))
@@ -72,6 +74,8 @@ def gather(
     lean = _lean(site, log, track, zero, lacking)
     air, weather_known = _air(site, start + (end - start) / 2, frame.position_m[2], lacking)
     setup = setup_of(site, frame.position_m)
+    if wait_for_weather and site.weather is not None and not weather_known:
+        raise NotReadyError(lacking[-1])
     of = shared.basis(setup.grid, frame.position_m)
     speed_rad_s = shared.HEAD_SPEED_RAD_S if track is None else inclination.head_speed(track)
     unknown = shared.covariance_without_adjustment(
@@ -141,7 +145,7 @@ def _require_on_map(crs: str, position_m: list[float], file: Path) -> None:
     longitude, latitude = to_degrees.transform(position_m[0], position_m[1])
     if area is None:
         return
-    inside = area.west - 3 <= longitude <= area.east + 3 and area.south - 3 <= latitude <= area.north + 3
+    inside = area.west - 1 <= longitude <= area.east + 1 and area.south - 1 <= latitude <= area.north + 1
     if not inside:
         raise ConfigError(
             f"{file}: places the scanner at easting {position_m[0]:g}, northing {position_m[1]:g}, outside"

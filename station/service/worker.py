@@ -73,16 +73,25 @@ def series_of(site: Site) -> Series:
     )
 
 
-def process(site: Site, arrival: Arrival, progress: Progress) -> Outcome:
+def process(
+    site: Site,
+    arrival: Arrival,
+    progress: Progress,
+    *,
+    patient: bool = False,
+) -> Outcome:
     """Measure a scan and store its epoch, unless just this is stored.
 
-    Raises ScanError where the scan cannot be used.
+    Raises ScanError where the scan cannot be used; NotReadyError where it changes meanwhile, or `patient` and
+    still without weather shortly after its arrival.
     """
     began_s = time.monotonic()
     series = series_of(site)
     with _held_still(arrival.path) as scan_sha256:
         progress()
-        epoch = _measure(site, arrival, scan_sha256, progress, rehearsal=False)
+        wait_s = site.weather.wait_s if patient and site.weather else 0.0
+        young = time.time() - arrival.mtime_ns * 1e-9 < wait_s
+        epoch = _measure(site, arrival, scan_sha256, progress, rehearsal=False, wait_for_weather=young)
     written = _same_as(series, epoch) or store.write_epoch(series, epoch)
     return Outcome(
         start_utc_s=epoch.start_s,
@@ -96,6 +105,11 @@ def process(site: Site, arrival: Arrival, progress: Progress) -> Outcome:
     )
 
 
+def process_patiently(site: Site, arrival: Arrival, progress: Progress) -> Outcome:
+    """Process a scan that may wait a while for its weather."""
+    return process(site, arrival, progress, patient=True)
+
+
 def open_only(site: Site, arrival: Arrival, progress: Progress) -> None:
     """Raise ScanError where a scan's headers say that it cannot be used."""
     progress()
@@ -106,16 +120,30 @@ def open_only(site: Site, arrival: Arrival, progress: Progress) -> None:
 def rehearse(site: Site, arrival: Arrival, progress: Progress) -> tuple[str, str, dict[str, float | str]]:
     """Measure a scan without storing anything: verdict, reason, figures."""
     began_s = time.monotonic()
-    epoch = _measure(site, arrival, "", progress, rehearsal=True)
+    epoch = _measure(site, arrival, "", progress, rehearsal=True, wait_for_weather=False)
     return epoch.verdict, epoch.verdict_reason, _figures(epoch, time.monotonic() - began_s)
 
 
 def _measure(
-    site: Site, arrival: Arrival, scan_sha256: str, progress: Progress, *, rehearsal: bool
+    site: Site,
+    arrival: Arrival,
+    scan_sha256: str,
+    progress: Progress,
+    *,
+    rehearsal: bool,
+    wait_for_weather: bool,
 ) -> store.Epoch:
     with _opened(site, arrival.path) as reader:
         start, end, _ = utc_interval(reader, site.scans.name)
-        gathered = gather(site, reader, arrival.log, start, end, keep_zero=not rehearsal)
+        gathered = gather(
+            site,
+            reader,
+            arrival.log,
+            start,
+            end,
+            keep_zero=not rehearsal,
+            wait_for_weather=wait_for_weather,
+        )
         reference = None if rehearsal and isinstance(site.reference.scans, Path) else reference_of(site)
         gridder = gridder_for(gathered.setup, reference)
         survey(gridder, reader.blocks(), gathered.setup, gathered.pose, progress)
@@ -299,11 +327,14 @@ class Worker:
         *,
         on_progress: Progress = lambda: None,
         should_stop: Callable[[], bool] = lambda: False,
+        patient: bool = False,
     ) -> None:
+        """`patient`: scans may wait a while for their weather, as in the service."""
         self._site = site
         self._journal = journal
         self._on_progress = on_progress
         self._should_stop = should_stop
+        self._patient = patient
         self._taken: dict[str, Arrival] = {}
 
     def take(self, arrival: Arrival) -> bool:
@@ -313,7 +344,7 @@ class Worker:
         """
         self._taken[arrival.name] = arrival
         try:
-            outcome = self._run(process, arrival)
+            outcome = self._run(process_patiently if self._patient else process, arrival)
         except ScanError as error:
             self._set_aside(arrival, error)
             return False

@@ -124,7 +124,6 @@ scan = "{first}"            # the scan it was solved from: its lean is the zero 
 [map]
 crs = "{crs}"
 origin = {{ latitude_deg = {latitude}, longitude_deg = {longitude}, height_m = {height} }}
-vertical_datum = "WGS 84 ellipsoid"
 
 [grid]
 bounds_m = {{ west = {west}, south = {south}, east = {east}, north = {north} }}

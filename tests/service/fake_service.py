@@ -18,8 +18,8 @@ from station.service.daemon import Pace, run
 class FakeWorker:
     """Keeps a line of what it was asked to do in `<data>/did`."""
 
-    def __init__(self, site, journal, *, on_progress, should_stop):
-        self.site, self.journal = site, journal
+    def __init__(self, site, journal, *, on_progress, should_stop, patient):
+        self.site, self.journal, self.patient = site, journal, patient
         self.on_progress, self.should_stop = on_progress, should_stop
         self.folder = site.station.data / "stored"
         self.folder.mkdir(exist_ok=True)
