@@ -10,7 +10,6 @@ import numpy as np
 from station.quantities import (
     Bools,
     Floats,
-    Floats32,
     Grid,
     Measurement,
     Quality,
@@ -132,6 +131,11 @@ class View:
         cos_incidence = np.abs(z_m - east * x_m - north * y_m) * cos_slope / range_m
         return cls((x_m, y_m, z_m), east, north, range_m, np.minimum(cos_incidence, 1.0), cos_slope)
 
+    @property
+    def tan_slope(self) -> Floats:
+        """Steepness of the terrain (n,) [1]."""
+        return np.hypot(self.east_gradient, self.north_gradient)
+
     def shot_variance(self, setup: Setup) -> Floats:
         """Random variance of one shot's height [m²], by the budget the site asks for."""
         seen = self.range_m, self.cos_incidence, self.cos_slope
@@ -202,49 +206,51 @@ def _judge(
         return
     count = surface.count[band][seen].astype(np.float64)
     measured = known[band][seen]
+    flags = np.where(count < FEW_POINTS, Quality.FEW_POINTS, 0)
+    flags |= np.where(measured, 0, Quality.OUTSIDE_REFERENCE)
     random_m2 = surface.random_variance_m2[band][seen].astype(np.float64)
-    shared_m2 = np.zeros(len(count))
-    flags = np.where(count < FEW_POINTS, Quality.FEW_POINTS, 0) | np.where(
-        measured, 0, Quality.OUTSIDE_REFERENCE
-    )
     if setup.position_m is None:
         spread_m2 = np.nan_to_num(surface.spread_m[band][seen].astype(np.float64)) ** 2
         random_m2 = np.maximum(spread_m2, setup.scanner.range_sigma_m**2) / count
+        shared_m2, terms = np.zeros_like(count), dict[str, Floats]()
     else:
         view = _view(surface, band, seen, setup.position_m)
-        tan_slope = np.sqrt(np.maximum(view.cos_slope**-2 - 1, 0.0))
-        sampling_m2 = np.where(measured, 0.0, slope_sampling_variance(setup.grid.cell_m, tan_slope, count))
-        random_m2 = np.where(measured, random_m2, view.shot_variance(setup) / count + sampling_m2)
         flags |= np.where(view.cos_incidence < HIGH_INCIDENCE_COS, Quality.HIGH_INCIDENCE, 0)
-        if unknown is not None and not setup.published_budget:
-            felt = shared.sensitivities(
-                shared.basis(setup.grid, setup.position_m),
-                view.offset_m,
-                view.east_gradient,
-                view.north_gradient,
-            )
-            shared_m2 = felt.variance(_covariance_of_change(unknown, reference))
-            for name, values in _terms(view, count, sampling_m2, felt, unknown, setup).items():
-                _put(result.terms, name, band, seen, values)
-        elif setup.published_budget:
-            for name, values in _terms_voordendag(view, setup).items():
-                _put(result.terms, name, band, seen, values)
-    if reference is not None:
+        sampling_m2 = slope_sampling_variance(setup.grid.cell_m, view.tan_slope, count)
+        sampling_m2[measured] = 0.0
+        random_m2 = np.where(measured, random_m2, view.shot_variance(setup) / count + sampling_m2)
+        shared_m2, terms = _shared_and_terms(view, count, sampling_m2, setup, unknown, reference)
+    if reference is not None and not setup.published_budget:
         rough_m2 = reference.roughness_m2[band][seen] / count
         random_m2 += np.where(measured, reference.random_variance_m2[band][seen] + rough_m2, 0.0)
     sigma_m = np.sqrt(random_m2 + shared_m2)
     if setup.published_budget:
         sigma_m = uncertainty.sigma_total_voordendag(sigma_m, setup.registration_sigma_m)
-    change_m = surface.change_m[band][seen]
-    flags |= np.where(change.significant(change_m, sigma_m), Quality.CHANGE_SIGNIFICANT, 0)
+    significant = change.significant(surface.change_m[band][seen], sigma_m)
     result.uncertainty_m[band][seen] = sigma_m
     result.random_uncertainty_m[band][seen] = np.sqrt(random_m2)
-    result.quality[band][seen] = flags
+    result.quality[band][seen] = flags | np.where(significant, Quality.CHANGE_SIGNIFICANT, 0)
+    for name, values in terms.items():
+        result.terms[name][band][seen] = values
 
 
-def _put(terms: dict[str, Floats32], name: str, band: slice, seen: Bools, values: Floats) -> None:
-    if name in terms:
-        terms[name][band][seen] = values
+def _shared_and_terms(
+    view: View,
+    count: Floats,
+    sampling_m2: Floats,
+    setup: Setup,
+    unknown: Shared | None,
+    reference: Reference | None,
+) -> tuple[Floats, dict[str, Floats]]:
+    """Return what cells share with others (n,) [m²] and, where asked for, the budget term by term [m]."""
+    if setup.published_budget:
+        return np.zeros_like(count), _terms_voordendag(view, setup) if setup.store_terms else {}
+    if unknown is None or setup.position_m is None:
+        return np.zeros_like(count), {}
+    of = shared.basis(setup.grid, setup.position_m)
+    felt = shared.sensitivities(of, view.offset_m, view.east_gradient, view.north_gradient)
+    shared_m2 = felt.variance(_covariance_of_change(unknown, reference))
+    return shared_m2, _terms(view, count, sampling_m2, felt, unknown, setup) if setup.store_terms else {}
 
 
 def _view(surface: Surface, band: slice, seen: Bools, position_m: tuple[float, float, float]) -> View:
@@ -279,8 +285,6 @@ def _terms(
 
     Their squares add up to the variance as long as no adjustment has tied the shared parameters together.
     """
-    if not setup.store_terms:
-        return {}
     by_air = np.array([name.startswith(("range_scale", "refraction")) for name in unknown.names])
     range_m2 = uncertainty.range_variance(view.cos_incidence, view.cos_slope, setup.scanner.range_sigma_m)
     beam_m2 = uncertainty.angle_variance(

@@ -43,6 +43,9 @@ def _finding(level: str, what: str, says: str) -> Finding:
 def _pose(site: Site) -> Iterator[Finding]:
     """Tell where each SOP puts the scanner, and whether the grid is within its reach."""
     grid = site.grid_cells
+    if site.scans.frame == "map" and site.map.origin is None:
+        says = "map.origin, the scanner's place, is not given: sigma holds the scatter of points alone"
+        yield _finding("warning", "map", says)
     for sop in site.sop:
         try:
             frame = frame_of(site, sop)

@@ -57,8 +57,14 @@ def gather(
     NotReadyError where there is no weather yet.
     """
     if site.scans.frame == "map":
-        setup = setup_of(site, _map_position(site))
-        return Gathered(setup, Pose(None, None, None), None, None, None, (), {})
+        position_m = _map_position(site)
+        setup, unknown = setup_of(site, position_m), None
+        if position_m is not None:  # registered by others: how well, nobody tells
+            of = shared.basis(setup.grid, position_m)
+            unknown = shared.covariance_without_adjustment(
+                of, None, LEVEL, of.azimuth_rad, shared.HEAD_SPEED_RAD_S, weather_known=False
+            )
+        return Gathered(setup, Pose(None, None, None), unknown, None, None, (), {})
     sop = sop_for(site.sop, start)
     frame, sop_id = frame_of(site, sop), sop_identity(sop)
     lacking: list[str] = []

@@ -18,7 +18,7 @@ Tell = Callable[[Entry], None]
 def process_scans(site: Site, scans: Sequence[Path], tell: Tell) -> int:
     """Process scans in the order of their names, `tell` the journal row of each; return the exit status.
 
-    Those that the reference was built from are done again when it is there, and told again.
+    Those from before the reference was there are done again, and told again.
     """
     site.station.data.mkdir(parents=True, exist_ok=True)
     with only_writer(site.station.data), Journal(site.station.data / "journal.sqlite") as journal:
@@ -31,7 +31,8 @@ def process_scans(site: Site, scans: Sequence[Path], tell: Tell) -> int:
                 worker.take(arrival)
                 entry = journal.entry(arrival.name)
                 assert entry is not None  # noqa: S101 - it was just taken
-                tell(entry)
+                if entry.state is not State.WAITING:  # for the reference it just made possible
+                    tell(entry)
             again = {row.name for row in journal.waiting() if row.state is State.WAITING}
             todo = [one for name, one in arrivals.items() if name in again]
         states = {row.state for row in journal.rows() if row.name in arrivals}
