@@ -28,7 +28,7 @@ from station.archive.series import build_series
 from station.config import Site
 from station.errors import NotReadyError, ScanError
 from station.pipeline import gridder_for, master, measure, survey
-from station.quantities import Measurement, Quality, Reference
+from station.quantities import Measurement, Quality, Reference, Shared
 from station.readers.raster import read_geotiff
 from station.readers.scan import ScanReader, open_scan, utc_interval
 from station.science.grid import Stack
@@ -193,20 +193,25 @@ def build_reference(site: Site, arrivals: list[Arrival], version: str, progress:
     scan_ids = tuple(arrival.path.stem for arrival in arrivals)
     surface: Reference | None = None
     for _ in range(REFERENCE_PASSES):
-        stack, unknown, datum_m = Stack(series.grid), [], 0.0
-        for arrival in arrivals:
-            with _opened(site, arrival.path) as reader:
-                start, end, _ = utc_interval(reader, site.scans.name)
-                gathered = gather(site, reader, arrival.log, start, end)
-                gridder = gridder_for(gathered.setup, surface)
-                survey(gridder, reader.blocks(), gathered.setup, gathered.pose, progress)
-            stack.add(gridder)
-            unknown.append(gathered.unknown)
-            datum_m = gridder.datum_m
-        surface = master(stack, surface, unknown, datum_m, version, scan_ids)
+        stack = Stack(series.grid)
+        laid = [_lay_on(stack, site, arrival, surface, progress) for arrival in arrivals]
+        surface = master(stack, surface, [unknown for unknown, _ in laid], laid[0][1], version, scan_ids)
     if surface is not None:
         write_reference(series, surface)
     return version
+
+
+def _lay_on(
+    stack: Stack, site: Site, arrival: Arrival, surface: Reference | None, progress: Progress
+) -> tuple[Shared | None, float]:
+    """Add a scan to a stack; return what its points share and its datum [m]. Its own grid goes at once."""
+    with _opened(site, arrival.path) as reader:
+        start, end, _ = utc_interval(reader, site.scans.name)
+        gathered = gather(site, reader, arrival.log, start, end)
+        gridder = gridder_for(gathered.setup, surface)
+        survey(gridder, reader.blocks(), gathered.setup, gathered.pose, progress)
+    stack.add(gridder)
+    return gathered.unknown, gridder.datum_m
 
 
 def reference_of(site: Site) -> Reference | None:
