@@ -11,7 +11,7 @@ from station.archive.store import open_series
 from station.config import read_site
 from station.quantities import Quality
 from station.science import shared, terrain
-from station.service import worker
+from station.service import tasks
 from station.service.gather import frame_of
 from station.service.inbox import Arrival
 from station.simulation.station import demo, simulate
@@ -32,12 +32,12 @@ class Measured:
             log = path.with_name(f"{path.stem}-incl.txt") if self.site.inclination else None
             status = path.stat()
             arrivals.append(Arrival(path.name, path, log, status.st_size, status.st_mtime_ns))
-        worker.build_reference(self.site, arrivals[:3], "1", lambda: None)
-        self.outcomes = [worker.process(self.site, arrival, lambda: None) for arrival in arrivals]
-        worker.publish(self.site, lambda: None)
+        tasks.build_reference(self.site, arrivals[:3], "1", lambda: None)
+        self.outcomes = [tasks.process(self.site, arrival, lambda: None) for arrival in arrivals]
+        tasks.publish(self.site, lambda: None)
         self.series = open_series(self.site.station.data).load()
         self.truth = xr.open_dataset(folder / "truth.nc").load()
-        self.reference = read_reference(worker.series_of(self.site))
+        self.reference = read_reference(tasks.series_of(self.site))
         self.position_m = frame_of(self.site, self.site.sop[0]).position_m
 
     def error(self, scan):

@@ -16,7 +16,7 @@ from station.readers.weather import air_at, read_weather
 from station.service import child
 from station.service.gather import frame_of
 from station.service.once import arrival_of
-from station.service.worker import rehearse, series_of
+from station.service.tasks import rehearse, series_of
 
 Finding = dict[str, str]  # level (ok, warning, fault), what, says
 EPOCH_BYTES_PER_CELL = 16  # of an epoch without compression

@@ -20,7 +20,7 @@ from station.science import shared, terrain
 from station.service.gather import frame_of
 from station.service.journal import Entry, State
 from station.service.once import one_line, process_scans
-from station.service.worker import series_of
+from station.service.tasks import series_of
 from station.simulation.station import demo, simulate
 
 

@@ -10,7 +10,7 @@ import pytest
 
 from station.config import read_site
 from station.errors import ConfigError, NotReadyError, ScanError
-from station.service import worker
+from station.service import tasks
 from station.service.once import arrival_of
 from station.simulation.station import simulate, tiny
 
@@ -41,7 +41,7 @@ def processed(folder, *changes, scan=1, **how):
     """Outcome of one scan, and the standard deviation of the lean it is left with."""
     site = site_of(folder, *changes)
     scans = sorted(site.scans.inbox.glob("*.laz"))
-    outcome = worker.process(site, arrival_of(site, scans[scan]), lambda: None, **how)
+    outcome = tasks.process(site, arrival_of(site, scans[scan]), lambda: None, **how)
     with netCDF4.Dataset(site.station.data / outcome.epoch) as file:
         variance = np.diagonal(file["shared_parameter_covariance"][0])
     return outcome, np.sqrt(variance)
