@@ -155,12 +155,6 @@ def test_range_error_seen_vertically():
     assert abs(raised_m) == pytest.approx(float(told_m))
 
 
-def test_p13_units_of_ozendi():
-    """36.6cc and 17.8cc: hundredths of milligon."""
-    for cc, degrees in ((36.6, 0.003294), (17.8, 0.001602)):
-        assert cc * 1e-4 * 0.9 == pytest.approx(degrees, abs=1e-6)
-
-
 def test_polar_and_cartesian_in_all_quadrants():
     azimuth = np.linspace(-3.1, 3.1, 17)
     elevation = np.linspace(-1.2, 1.2, 17)

@@ -150,12 +150,11 @@ def test_the_same_inputs_are_stored_once_and_other_bytes_anew(folder):
     again, _ = processed(folder)
     assert (again.epoch, again.revision) == (first.epoch, 1)
     other = sorted((folder / "inbox").glob("*.laz"))
-    stem = other[1].name
     shutil.copy(other[0], folder / "other.laz")
     other[1].write_bytes((folder / "other.laz").read_bytes())
     anew, _ = processed(folder)
     assert anew.revision == 2
-    assert stem in anew.epoch or anew.epoch != first.epoch
+    assert anew.epoch != first.epoch
 
 
 def test_scans_are_never_followed_through_links(folder):
