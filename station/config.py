@@ -27,48 +27,7 @@ from pydantic import (
 
 from station.errors import ConfigError
 from station.quantities import Air, Grid, Scanner
-
-# Published values: Voordendag et al. (2023), section 2.2 (VZ-6000); Hartzell et al. (2015), Table 1
-# (VZ-4000, LMS-Z390i). The papers give no range noise and no aperture for the VZ-6000, and nothing for the
-# VZ-400i: there the maker's data sheets stand in (RIEGL: 10 mm and 3 mm precision; 0.35 mrad, 1.55 µm).
-SCANNERS: dict[str, dict[str, float]] = {
-    "riegl-vz-6000": {
-        "wavelength_um": 1.064,
-        "beam_divergence_mrad": 0.12,
-        "exit_diameter_m": 0.0,
-        "range_sigma_m": 0.010,
-        "angle_resolution_deg": 0.0005,
-        "inclination_sigma_deg": 0.008,
-        "range_max_m": 6000.0,
-    },
-    "riegl-vz-4000": {
-        "wavelength_um": 1.55,
-        "beam_divergence_mrad": 0.15,
-        "exit_diameter_m": 0.018,
-        "range_sigma_m": 0.010,
-        "angle_resolution_deg": 0.0005,
-        "inclination_sigma_deg": 0.008,
-        "range_max_m": 4000.0,
-    },
-    "riegl-vz-400i": {
-        "wavelength_um": 1.55,
-        "beam_divergence_mrad": 0.35,
-        "exit_diameter_m": 0.007,
-        "range_sigma_m": 0.003,
-        "angle_resolution_deg": 0.0005,
-        "inclination_sigma_deg": 0.008,
-        "range_max_m": 800.0,
-    },
-    "riegl-lms-z390i": {
-        "wavelength_um": 1.55,
-        "beam_divergence_mrad": 0.30,
-        "exit_diameter_m": 0.0085,
-        "range_sigma_m": 0.004,
-        "angle_resolution_deg": 0.001,
-        "inclination_sigma_deg": 0.008,
-        "range_max_m": 400.0,
-    },
-}
+from station.scanners import SCANNERS
 
 Positive = Annotated[float, Field(gt=0)]
 NotNegative = Annotated[float, Field(ge=0)]
@@ -253,9 +212,10 @@ class AirSection(Section):
 
 
 class AdjustmentSection(Section):
-    """How the pose of each scan is found."""
+    """How the pose of each scan is found, and on which ground: found out, or the polygons of a GeoJSON."""
 
-    method: Literal["none"] = "none"
+    method: Literal["none", "joint"] = "joint"
+    stable: Literal["auto"] | Path = "auto"
 
 
 class UncertaintySection(Section):
@@ -270,6 +230,12 @@ class ReferenceSection(Section):
     """The master surface: the mean of the first usable scans, or a GeoTIFF."""
 
     scans: Annotated[int, Field(ge=1, le=200)] | Path = 8
+
+
+class AreasSection(Section):
+    """Named polygons, each of which becomes a time series of mean and volume change."""
+
+    file: Path
 
 
 class ServiceSection(Section):
@@ -293,6 +259,7 @@ class SiteFile(Section):
     adjustment: AdjustmentSection = AdjustmentSection()
     uncertainty: UncertaintySection = UncertaintySection()
     reference: ReferenceSection = ReferenceSection()
+    areas: AreasSection | None = None
     service: ServiceSection = ServiceSection()
 
     @model_validator(mode="after")
@@ -344,6 +311,7 @@ class Site(SiteFile):
                 "path": True,
                 "service": True,
                 "station": True,
+                "areas": True,  # their series is made anew from the epochs
                 "scans": {"inbox", "settle_s", "expected_every_s", "polling", "timeout_s", "name"},
                 "sop": True,  # an epoch names the SOP it was made with
                 "weather": {"file", "wait_s"},
@@ -352,8 +320,14 @@ class Site(SiteFile):
             },
         )
         if self.map.pop:
-            told["pop"] = hashlib.sha256(self.map.pop.read_bytes()).hexdigest()
+            told["pop"] = _sha256(self.map.pop)
+        if isinstance(self.adjustment.stable, Path):
+            told["adjustment"]["stable"] = _sha256(self.adjustment.stable)
         return hashlib.sha256(json.dumps(told, sort_keys=True).encode()).hexdigest()[:16]
+
+
+def _sha256(path: Path) -> str:
+    return hashlib.sha256(path.read_bytes()).hexdigest()
 
 
 def write_site(folder: Path, like: str) -> Path:
@@ -424,6 +398,10 @@ def _must_exist(site: Site) -> list[tuple[str, Path]]:
         files.append(("map.pop", site.map.pop))
     if isinstance(site.reference.scans, Path):
         files.append(("reference.scans", site.reference.scans))
+    if isinstance(site.adjustment.stable, Path):
+        files.append(("adjustment.stable", site.adjustment.stable))
+    if site.areas:
+        files.append(("areas.file", site.areas.file))
     return files
 
 

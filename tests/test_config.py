@@ -55,6 +55,10 @@ def test_all_faults_at_once_with_the_nearest_right_key(tmp_path):
         (('frame = "map"', 'frame = "scanner"'), "needs an"),
         (("[grid]", '[scanner]\nmodel = "vz"\n[grid]'), "take one of riegl-vz-6000"),
         (("[grid]", '[reference]\nscans = "there.tif"\n[grid]'), "no such file"),
+        (("[grid]", '[adjustment]\nstable = "there.geojson"\n[grid]'), r"adjustment.stable: no such file"),
+        (("[grid]", '[adjustment]\nmethod = "best"\n[grid]'), "adjustment.method"),
+        (("[grid]", '[areas]\nfile = "there.geojson"\n[grid]'), r"areas.file: no such file"),
+        (("[grid]", "[areas]\n[grid]"), "areas.file: missing"),
         (("[grid]", '[map]\npop = "pop.dat"\n[grid]'), "say which with map.crs"),
         (("east = 10.0", "east = -10.0"), "at least one cell_m beyond"),
         (("cell_m = 0.5", "cell_m = 0.0001"), "too many"),
@@ -77,3 +81,23 @@ def test_only_what_changes_numbers_changes_the_hash(tmp_path):
     one = read(tmp_path, GOOD).science_hash
     assert read(tmp_path, GOOD.replace('inbox = "inbox"', 'inbox = "other"')).science_hash == one
     assert read(tmp_path, GOOD.replace("cell_m = 0.5", "cell_m = 1.0")).science_hash != one
+
+
+def test_stable_ground_counts_by_what_the_file_says(tmp_path):
+    (tmp_path / "one.geojson").write_text("{}")
+    (tmp_path / "same.geojson").write_text("{}")
+    (tmp_path / "other.geojson").write_text("[]")
+    auto = read(tmp_path, GOOD)
+    assert (auto.adjustment.method, auto.adjustment.stable) == ("joint", "auto")
+    wording = GOOD + '[adjustment]\nstable = "{}.geojson"\n'
+    one, same, other = (read(tmp_path, wording.replace("{}", name)) for name in ("one", "same", "other"))
+    assert one.adjustment.stable == tmp_path / "one.geojson"
+    assert one.science_hash == same.science_hash
+    assert len({auto.science_hash, one.science_hash, other.science_hash}) == 3
+
+
+def test_areas_change_no_epoch(tmp_path):
+    (tmp_path / "areas.geojson").write_text("{}")
+    site = read(tmp_path, f'{GOOD}[areas]\nfile = "areas.geojson"\n')
+    assert site.areas.file == tmp_path / "areas.geojson"
+    assert site.science_hash == read(tmp_path, GOOD).science_hash

@@ -11,6 +11,7 @@ from pydantic import BaseModel
 from station import config, errors
 from station.archive.variables import VARIABLES
 from station.config import SiteFile, read_site, write_site
+from station.scanners import SCANNERS
 
 ROOT = Path(__file__).parents[1]
 README = (ROOT / "README.md").read_text(encoding="utf-8")
@@ -71,12 +72,12 @@ def test_site_files_are_complete(tmp_path, like):
 
 def test_papers_instrument_values():
     """V section 2.2, H Table 1."""
-    vz6000 = config.SCANNERS["riegl-vz-6000"]
+    vz6000 = SCANNERS["riegl-vz-6000"]
     assert (vz6000["wavelength_um"], vz6000["beam_divergence_mrad"]) == (1.064, 0.12)
     assert vz6000["inclination_sigma_deg"] == 0.008
-    vz4000 = config.SCANNERS["riegl-vz-4000"]
+    vz4000 = SCANNERS["riegl-vz-4000"]
     assert (vz4000["wavelength_um"], vz4000["beam_divergence_mrad"], vz4000["exit_diameter_m"]) == (
         1.55, 0.15, 0.018,
     )  # fmt: skip
-    z390 = config.SCANNERS["riegl-lms-z390i"]
+    z390 = SCANNERS["riegl-lms-z390i"]
     assert (z390["beam_divergence_mrad"], z390["range_sigma_m"]) == (0.30, 0.004)

@@ -132,8 +132,9 @@ def test_geometry_uncertainty_of_box_5():
 
 def test_published_budget_of_a_cell():
     """V-1 and V-2 by hand for box 5, and V-3 as the linear sum it is."""
-    from station.config import SCANNERS, ScannerSection
+    from station.config import ScannerSection
     from station.quantities import Scanner
+    from station.scanners import SCANNERS
 
     assert SCANNERS["riegl-vz-6000"]["beam_divergence_mrad"] == 0.12
     given = ScannerSection.model_validate({"model": "riegl-vz-6000"})
