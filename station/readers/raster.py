@@ -6,11 +6,10 @@ import warnings
 from pathlib import Path
 
 import numpy as np
-from pyproj import CRS
 
 from station.errors import ConfigError
 from station.quantities import Floats, Grid
-from station.science.pose import horizontal_crs
+from station.science.pose import horizontal_crs, is_same_map
 
 ALIGNED = 1e-3  # of a cell
 ELEVATIONS_M = (-500.0, 9000.0)  # of land
@@ -61,13 +60,8 @@ def _check_crs(path: Path, has_wkt: str | None, wanted: str | None) -> None:
             f"{path}: names no CRS; if it is {wanted}: gdal_edit.py -a_srs {wanted} {path.name}"
         )
     has, should = horizontal_crs(has_wkt), horizontal_crs(wanted)
-    if not has.equals(should, ignore_axis_order=True) and not _same_code(has, should):
+    if not is_same_map(has, should):
         raise ConfigError(f"{path}: is in {has.name}, map.crs is {should.name}")
-
-
-def _same_code(one: CRS, other: CRS) -> bool:
-    """Tell a CRS from another whose writer worded it differently."""
-    return one.to_epsg() is not None and one.to_epsg() == other.to_epsg()
 
 
 def _place(path: Path, transform: tuple[float, ...], grid: Grid) -> tuple[int, int]:

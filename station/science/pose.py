@@ -160,6 +160,12 @@ def horizontal_crs(crs: str) -> CRS:
     return wanted.sub_crs_list[0] if wanted.is_compound else wanted.to_2d()
 
 
+def is_same_map(one: CRS, other: CRS) -> bool:
+    """Tell whether two horizontal CRS are the same, however their writers worded them."""
+    code = one.to_epsg()
+    return one.equals(other, ignore_axis_order=True) or (code is not None and code == other.to_epsg())
+
+
 def tangent_frame(geocentric_m: Floats) -> Floats:
     """Matrix (4, 4) from east, north, up at a point to WGS84 geocentric coordinates."""
     to_geographic = Transformer.from_crs(GEOCENTRIC, GEOGRAPHIC, always_xy=True)
