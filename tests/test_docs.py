@@ -9,6 +9,7 @@ import pytest
 from pydantic import BaseModel
 
 from station import config, errors
+from station.archive.areas import AREA_VARIABLES
 from station.archive.variables import VARIABLES
 from station.config import SiteFile, read_site, write_site
 from station.scanners import SCANNERS
@@ -33,7 +34,7 @@ def test_every_command():
 
 
 def test_every_variable_of_the_store():
-    for row in VARIABLES:
+    for row in (*VARIABLES, *AREA_VARIABLES):
         assert f"`{row.name}`" in README, row.name
 
 

@@ -82,6 +82,22 @@ def lay_out(
     parameters: tuple[tuple[str, ...], tuple[str, ...]] = ((), ()),
 ) -> None:
     """Write dimensions, coordinates and metadata. `times` None: no time dimension."""
+    introduce(file, series, title)
+    if times is not None:
+        file.createDimension("time", None)
+    for axis, coordinate in (("y", series.grid.y_m), ("x", series.grid.x_m)):
+        _axis(file, series, axis, coordinate)
+    if times is not None:
+        time_axis(file, times)
+    for dim, length in TEXT_LENGTH.items():
+        file.createDimension(dim, length)
+    if series.crs is not None:
+        _crs(file, series)
+    _parameters(file, *parameters)
+
+
+def introduce(file: netCDF4.Dataset, series: Series, title: str) -> None:
+    """Write what a file is and where it comes from."""
     file.setncatts(
         {
             "Conventions": CONVENTIONS,
@@ -93,17 +109,6 @@ def lay_out(
             "station_name": series.name or series.station_id,
         }
     )
-    if times is not None:
-        file.createDimension("time", None)
-    for axis, coordinate in (("y", series.grid.y_m), ("x", series.grid.x_m)):
-        _axis(file, series, axis, coordinate)
-    if times is not None:
-        _time(file, times)
-    for dim, length in TEXT_LENGTH.items():
-        file.createDimension(dim, length)
-    if series.crs is not None:
-        _crs(file, series)
-    _parameters(file, *parameters)
 
 
 def _axis(file: netCDF4.Dataset, series: Series, axis: str, coordinate: np.ndarray[Any, Any]) -> None:
@@ -127,7 +132,8 @@ def _axis(file: netCDF4.Dataset, series: Series, axis: str, coordinate: np.ndarr
     bounds[:] = np.stack([coordinate - towards, coordinate + towards], axis=-1)
 
 
-def _time(file: netCDF4.Dataset, times: int) -> None:
+def time_axis(file: netCDF4.Dataset, times: int) -> None:
+    """Create time and its bounds, of so many times, on the dimensions `time` and `bnds`."""
     together = min(times, TIMES_TOGETHER)
     time = file.createVariable("time", "f8", ("time",), chunksizes=(together,))
     time.setncatts(

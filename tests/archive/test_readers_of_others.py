@@ -14,6 +14,7 @@ import pytest
 import xarray as xr
 
 from station.archive import reference, store
+from station.archive.areas import update_areas
 from station.archive.join import join_closed
 from station.archive.series import build_series
 from station.quantities import Reference
@@ -130,6 +131,49 @@ def test_gdal_knows_place_and_direction(built):
     at = run(tool("gdallocationinfo"), "-valonly", "-b", "4", "-geoloc", f"NETCDF:{built}:elevation_change",
              "632055", "5185955").stdout  # fmt: skip
     assert float(at) == pytest.approx(0.03, abs=1e-3)
+
+
+class Told:
+    def mean_change(self, cells, _row):
+        return (0.25, 0.125, 0.5) if cells.all() else (np.nan, np.nan, 0.0)
+
+
+@pytest.fixture
+def of_areas(series, epoch):
+    for hour in range(4):
+        store.write_epoch(series, epoch(hour))
+    everywhere = np.ones(series.grid.shape, bool)
+    areas = {"Süd": everywhere, "unseen": np.tri(*series.grid.shape, dtype=bool)}
+    return update_areas(series, areas, Told(), lambda: None)
+
+
+def test_compliance_checker_finds_nothing_in_areas(of_areas, tmp_path):
+    assert findings(of_areas, tmp_path / "report.json") == []
+
+
+def test_ncdump_of_areas(of_areas):
+    told = run(tool("ncdump"), "-t", "-v", "time,area_name,mean_change", of_areas).stdout
+    assert '"2025-11-21 00:07:30"' in told
+    assert r'"S\303\274d"' in told  # ncdump's way with UTF-8
+    assert "0.25, _" in told
+
+
+def test_cdo_on_areas(of_areas):
+    told = run(tool("cdo"), "-s", "output", "-timmean", "-selname,mean_change", of_areas).stdout
+    assert [float(value) for value in told.split()] == pytest.approx([0.25, 9.96921e36])
+    shown = run(tool("cdo"), "infon", of_areas)
+    assert "volume_change" in shown.stdout
+    warnings = [line for line in shown.stderr.splitlines() if "(char/string), skipped" not in line]
+    assert "warning" not in "".join(warnings).lower()
+
+
+def test_nco_averages_areas_over_time(of_areas, tmp_path):
+    mean = tmp_path / "mean.nc"
+    run(tool("ncra"), "-O", "-v", "mean_change", of_areas, mean)
+    with xr.open_dataset(mean) as told:
+        assert told.area_name.values.tolist() == ["Süd", "unseen"]
+        assert told.mean_change.values[0, 0] == 0.25
+        assert np.isnan(told.mean_change.values[0, 1])
 
 
 @contextmanager

@@ -1,0 +1,199 @@
+"""`areas.nc`: mean and volume change of named areas over time, made from the epochs."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Callable
+from dataclasses import astuple
+from pathlib import Path
+from typing import Any, Protocol
+
+import h5py
+import netCDF4
+import numpy as np
+
+from station.archive.layout import Series, define, introduce, strings, time_axis, written_whole
+from station.archive.series import read_source, runs
+from station.archive.store import Row, rows
+from station.archive.variables import BY_NAME, FILL, TEXT, TEXT_LENGTH, Variable
+from station.quantities import Bools
+
+Columns = dict[str, np.ndarray[Any, Any]]  # all that lies over time, as it stands in the file
+
+MASKS = "area_masks_sha256"
+LACKING = -1
+_OVER_TIME = ("time", "area")
+_ONE_SIGMA = "one standard deviation, with what all cells of a scan share"
+
+AREA_VARIABLES: tuple[Variable, ...] = (
+    Variable("area_name", ("area", "area_text"), "S1", "name of the area"),
+    Variable("area_size", ("area",), "f8", "horizontal size of the area's cells on the grid", "m2"),
+    Variable(
+        "mean_change", _OVER_TIME, "f8", "mean elevation change of the area", "m",
+        comment="against the reference surface, of the cells that have a change",
+    ),
+    Variable(
+        "mean_change_uncertainty", _OVER_TIME, "f8", "uncertainty of the mean elevation change", "m",
+        comment=_ONE_SIGMA,
+    ),
+    Variable(
+        "volume_change", _OVER_TIME, "f8", "volume change of the area", "m3",
+        comment="mean_change times area_size: cells without a change are taken as the mean of those with one",
+    ),
+    Variable(
+        "volume_change_uncertainty", _OVER_TIME, "f8", "uncertainty of the volume change", "m3",
+        comment=f"{_ONE_SIGMA}; mean_change_uncertainty times area_size: nothing is added for cells without a"
+        " change, which are taken as the mean of those with one",
+    ),
+    Variable("coverage", _OVER_TIME, "f8", "share of the area's cells that have a change", "1"),
+    BY_NAME["epoch_file"],
+    BY_NAME["reference_version"],
+)  # fmt: skip
+
+
+class Aggregator(Protocol):
+    """What knows the mean of an area and how sure it is."""
+
+    def mean_change(self, cells: Bools, row: Row) -> tuple[float, float, float]:
+        """Mean change of the cells (ny, nx) in an epoch [m], one sigma [m], share of cells with a change.
+
+        NaN where no cell has one.
+        """
+
+
+def update_areas(
+    series: Series, areas: dict[str, Bools], aggregator: Aggregator, progress: Callable[[], None]
+) -> Path | None:
+    """Make `areas.nc` agree with the epochs stored; `areas` are cells (ny, nx) by name.
+
+    Epochs it already holds are not computed again unless an area has changed. Returns None, and writes
+    nothing, where there is no area or no epoch. `progress` is called after each epoch computed. Raises
+    StoreError where an epoch is damaged or it cannot write; then the old file stays.
+    """
+    found = rows(series) if areas else []
+    if not found:
+        return None
+    path = series.folder / "areas.nc"
+    masks = _fingerprint(series, areas)
+    known = _read(path, masks, len(areas))
+    place = {key: index for index, key in enumerate(_keys(known))}
+    at = [place.get((row.time_s, row.epoch_file), LACKING) for row in found]
+    if at == list(range(len(place))):
+        return path
+    size_m2 = np.array([np.count_nonzero(cells) for cells in areas.values()]) * series.grid.cell_m**2
+    lacking = [row for row, index in zip(found, at, strict=True) if index == LACKING]
+    measured = _measure(lacking, areas, size_m2, aggregator, progress)
+    is_known = np.array(at) != LACKING
+    columns = _blank(len(found), len(areas))
+    for name, column in columns.items():
+        column[is_known] = known[name][[index for index in at if index != LACKING]]
+        column[~is_known] = measured[name]
+    with written_whole(path) as beside, netCDF4.Dataset(beside, "w", clobber=False) as file:
+        _write(file, series, tuple(areas), size_m2, columns)
+        file.setncattr(MASKS, masks)
+    return path
+
+
+def _fingerprint(series: Series, areas: dict[str, Bools]) -> str:
+    """Identify areas by their names, their order and their cells, and the grid these are of."""
+    told = hashlib.sha256(json.dumps([astuple(series.grid), list(areas)]).encode())
+    for cells in areas.values():
+        told.update(np.packbits(cells).tobytes())
+    return told.hexdigest()
+
+
+def _blank(times: int, areas: int) -> Columns:
+    """Return columns without any value."""
+    return {
+        "time": np.zeros(times),
+        "time_bnds": np.zeros((times, 2)),
+        **{row.name: np.full((times, areas), FILL) for row in AREA_VARIABLES if row.dims == _OVER_TIME},
+        **{
+            row.name: np.zeros((times, TEXT_LENGTH["text"]), "S1")
+            for row in AREA_VARIABLES
+            if row.dims == TEXT
+        },
+    }
+
+
+def _keys(columns: Columns) -> list[tuple[float, str]]:
+    """Return what tells one epoch from another: its time and file."""
+    return list(zip(columns["time"].tolist(), strings(columns["epoch_file"]), strict=True))
+
+
+def _read(path: Path, masks: str, areas: int) -> Columns:
+    """Read what the file holds of these areas: nothing where it is not there, damaged or of others."""
+    blank = _blank(0, areas)
+    try:
+        with h5py.File(path, "r") as file:
+            if file.attrs[MASKS] != np.bytes_(masks):
+                return blank
+            found = {name: np.asarray(file[name][:], dtype=blank[name].dtype) for name in blank}
+    except (OSError, RuntimeError, KeyError, TypeError, ValueError):
+        return blank
+    times = found["time"].shape
+    whole = all(found[name].shape == (*times, *column.shape[1:]) for name, column in blank.items())
+    return found if whole else blank
+
+
+def _measure(
+    lacking: list[Row],
+    areas: dict[str, Bools],
+    size_m2: np.ndarray[Any, Any],
+    aggregator: Aggregator,
+    progress: Callable[[], None],
+) -> Columns:
+    """Compute the columns of some epochs; where there was no reference yet, nothing is known."""
+    columns = _blank(len(lacking), len(areas))
+    for path, first, at, count in runs(lacking):
+        words = read_source(path, first, at, count).words
+        for name in ("time", "time_bnds", "epoch_file", "reference_version"):
+            columns[name][at : at + count] = words[name]
+    values = np.full((3, len(lacking), len(areas)), np.nan)
+    for index, version in enumerate(strings(columns["reference_version"])):
+        for area, cells in enumerate(areas.values()):
+            if version and size_m2[area] > 0:
+                values[:, index, area] = aggregator.mean_change(cells, lacking[index])
+        progress()
+    mean_m, sigma_m, coverage = values
+    for name, column in (
+        ("mean_change", mean_m),
+        ("mean_change_uncertainty", sigma_m),
+        ("volume_change", mean_m * size_m2),
+        ("volume_change_uncertainty", sigma_m * size_m2),
+        ("coverage", coverage),
+    ):
+        columns[name] = np.where(np.isfinite(column), column, FILL)
+    return columns
+
+
+def _write(
+    file: netCDF4.Dataset,
+    series: Series,
+    names: tuple[str, ...],
+    size_m2: np.ndarray[Any, Any],
+    columns: Columns,
+) -> None:
+    times = len(columns["time"])
+    spelt = np.array([name.encode() for name in names])
+    introduce(file, series, f"Elevation change of areas at {series.name or series.station_id}")
+    for dim, length in {
+        "time": None,
+        "bnds": 2,
+        "area": len(names),
+        "area_text": spelt.dtype.itemsize,
+        "text": TEXT_LENGTH["text"],
+    }.items():
+        file.createDimension(dim, length)
+    time_axis(file, times)
+    for row in AREA_VARIABLES:
+        variable = define(file, row, series, times)
+        if row.dims == _OVER_TIME:
+            variable.coordinates = "area_name"  # a label: CDO and NCO carry it on, xarray selects by it
+    file.set_auto_mask(False)
+    file.set_auto_chartostring(False)
+    file["area_name"].setncattr("_Encoding", "utf-8")
+    letters = spelt.view("S1").reshape(len(names), -1)
+    for name, column in ({"area_name": letters, "area_size": size_m2} | columns).items():
+        file[name][:] = column
