@@ -103,7 +103,7 @@ def stored(path: Path) -> Stored | None:
     told = _EPOCH_NAME.search(path.name)
     if told is None or path.name.startswith("."):
         return None
-    start = datetime.strptime(told[1], STAMP).replace(tzinfo=UTC)
+    start = datetime.fromisoformat(told[1])
     return Stored(path, start, int(told[2] or 1))
 
 
