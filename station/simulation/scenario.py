@@ -5,9 +5,11 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
-from typing import Literal
+from typing import Any, Literal
 
 from station.errors import ConfigError
+
+NAMES = ("quiet", "drift", "wind", "snowfall", "melt", "avalanche", "poor", "fog", "moved")  # of scenarios
 
 # Everything without_errors() sets to zero: what stands between a shot and the point it should give.
 ERRORS = (
@@ -161,6 +163,48 @@ def demo(hours: int = 24, seed: int = 1) -> Scenario:
         reference_scans=min(8, max(1, hours // 3)),
         melt_m_per_h=0.02,
         avalanche_m=3.0,
+    )
+
+
+def named(name: str, hours: int = 24, seed: int = 1) -> Scenario:
+    """Give the demo's valley with every usual error and one thing to see or to withstand.
+
+    Whatever happens does so after the scans of the reference. Raises ConfigError if the name is not in NAMES.
+    """
+    reference = min(8, max(1, hours // 3))
+    usual = replace(demo(hours, seed), melt_m_per_h=0.0, avalanche_m=0.0)
+    special: dict[str, dict[str, Any]] = {
+        "quiet": {},
+        "drift": {
+            "lean_drift_deg": 2 * usual.lean_drift_deg,
+            "lean_within_scan_deg": 1.5 * usual.lean_within_scan_deg,
+            "lean_jerk_deg": 0.002,
+        },
+        "wind": {"wind_sway_deg": 0.002, "mirror_wobble_deg": 0.0005},
+        "snowfall": {"snowfall_m": 0.4, "snow_hours": (hours / 2, float(hours))},
+        "melt": {"melt_m_per_h": 0.005, "melt_from_hour": float(reference)},
+        "avalanche": {"avalanche_m": 2.0, "avalanche_hour": 2 * hours / 3, "avalanche_size": 0.11},
+        "poor": {"stable_ground": "poor"},
+        "fog": {"fog_visibility_m": 1500.0, "fog_hours": (hours / 3, 2 * hours / 3)},
+        "moved": {"moved_hour": hours / 2, "moved_deg": 0.02, "moved_m": 0.005},
+    }
+    if name not in special:
+        raise ConfigError(f"no scenario is called {name}: choose from {', '.join(NAMES)}")
+    return replace(usual, **special[name])
+
+
+def dense(scenario: Scenario) -> Scenario:
+    """Give the same on the whole valley, as finely as the real scanner sees it: 1.4 million echoes a scan."""
+    whole = Scenario()
+    return replace(
+        scenario,
+        terrain_step_m=whole.terrain_step_m,
+        roughness_length_m=whole.roughness_length_m,
+        cell_m=whole.cell_m,
+        extent_m=whole.extent_m,
+        azimuth_deg=whole.azimuth_deg,
+        lines=whole.lines,
+        shots_per_line=whole.shots_per_line,
     )
 
 

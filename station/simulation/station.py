@@ -15,12 +15,12 @@ from station.simulation.air import weather
 from station.simulation.change import Change, changes, ground_at, white_at
 from station.simulation.ledger import CONVENTIONS, true_errors
 from station.simulation.scan import Conditions, Recorded, conditions, record
-from station.simulation.scenario import Scenario, demo, tiny
+from station.simulation.scenario import Scenario, demo, dense, named, tiny
 from station.simulation.stable import Rectangle, areas, covered, stable_ground
 from station.simulation.terrain import Heights, Valley, valley
 from station.simulation.truth import CRS, TrueSurface, grid_of, true_surface
 
-__all__ = ["Scenario", "Station", "demo", "simulate", "tiny"]
+__all__ = ["Scenario", "Station", "demo", "dense", "named", "simulate", "tiny"]
 
 WEATHER_MARGIN_S = 3600.0  # the weather log begins before the first scan and ends after the last
 PACKED_M = 1e-4  # last digit of the stored surfaces
