@@ -123,7 +123,7 @@ def _wobble(scenario: Scenario, scan: int) -> Floats:
     """Return the part of the jitter that comes back every few lines [rad] (lines,)."""
     rng = stream(scenario.seed, 38, scan)
     line = np.arange(scenario.lines, dtype=np.float64)
-    swell = 1 + wander(rng, WOBBLE_SWELL, 150, 1500)(line)
+    swell = 1 + wander(rng, WOBBLE_SWELL, 300, 2000)(line)
     wave = np.sin(2 * np.pi * line / WOBBLE_LINES + rng.uniform(0, 2 * np.pi))
     return np.asarray(
         np.radians(scenario.mirror_wobble_deg) * np.sqrt(2 / (1 + WOBBLE_SWELL**2)) * swell * wave

@@ -19,7 +19,6 @@ RETRACE = 0.25  # share of each line in which the mirror swings back and nothing
 ROCK, WHITE = 0.25, 0.60  # of the light come back from rock, and from snow and ice
 SPECKLE = 0.08  # relative scatter of the brightness of single shots
 GAIN = 0.05  # the receiver is up to so much more or less sensitive in a scan
-FAINTEST = 0.1  # the least bright ground that still gives an echo from the scanner's reach in clear air
 FADING = 0.3  # relative scatter of what the receiver just detects: the edge of sight in fog is not sharp
 
 
@@ -145,11 +144,12 @@ def _pierces_fog(
     """Tell which echoes are still strong enough behind the fog; all of them without.
 
     An echo weakens with the square of the range and with the fog there and back; it is detected where it is
-    as strong as that of the faintest ground from the scanner's reach in clear air.
+    as strong as that of the faintest ground seen in clear air: rock at the reach, hit as slantly as can be.
     """
     if np.isinf(now.visibility_m):
         return np.ones(len(range_m), dtype=np.bool_)
-    margin = brightness / FAINTEST * (scenario.range_max_m / range_m) ** 2
+    faintest = ROCK * np.cos(np.radians(scenario.incidence_max_deg))
+    margin = brightness / faintest * (scenario.range_max_m / range_m) ** 2
     needed = np.exp(FADING * receive.standard_normal(len(range_m)))
     return np.asarray(margin * left_by_fog(range_m, now.visibility_m) > needed)
 
