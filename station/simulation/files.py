@@ -159,7 +159,11 @@ cutoff_hz = "auto"                 # from the log's own spectrum
 mode = "relative"                  # the SOP already holds the lean of its own scan
 
 [adjustment]
-method = "none"
+method = "joint"                   # from stable ground, log and weather; "none": filtered log only
+stable = "stable.geojson"          # or "auto"
+
+[areas]
+file = "areas.geojson"             # named polygons: mean and volume of change in areas.nc
 
 [uncertainty]
 model = "rigorous"
