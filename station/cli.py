@@ -10,6 +10,7 @@ from typing import Annotated
 import typer
 
 from station.errors import StationError
+from station.simulation.scenario import NAMES
 
 app = typer.Typer(
     name="station",
@@ -116,20 +117,36 @@ def status(site: SiteArgument, *, json_: Json = False) -> None:
     print(json.dumps(found, indent=2) if json_ else describe(found))
 
 
+def _known(scenario: str | None) -> str | None:
+    if scenario is not None and scenario not in NAMES:
+        raise typer.BadParameter(f"choose from {', '.join(NAMES)}")
+    return scenario
+
+
 @app.command()
 def simulate(
     folder: Annotated[Path, typer.Argument(metavar="DIR", help="Where to build it.", show_default=False)],
     hours: Annotated[int, typer.Option(min=1, max=2000, help="How many hourly scans.")] = 24,
     seed: Annotated[int, typer.Option(help="The same seed gives the same station.")] = 1,
+    scenario: Annotated[
+        str | None,
+        typer.Option(
+            metavar="NAME",
+            callback=_known,
+            show_default="melt and a large avalanche",
+            help=f"What it lives through: {', '.join(NAMES)}.",
+        ),
+    ] = None,
 ) -> None:
     """Build a small station with a known truth.
 
-    Scans, inclination logs, weather, SOP, site file, and the truth to compare with.
+    Scans, inclination logs, weather, SOP, polygons, site file, and the truth to compare with.
     """
-    from station.simulation.station import demo as scenario
+    from station.simulation.scenario import demo as usual
+    from station.simulation.scenario import named
     from station.simulation.station import simulate as build
 
-    build(folder, scenario(hours=hours, seed=seed))
+    build(folder, named(scenario, hours, seed) if scenario else usual(hours, seed))
     print(folder / "site.toml")
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,6 +17,9 @@ SCANNER_SETTING = Air(-2.0, 684.0, 28.0)  # Voordendag et al. (2023), section 3.
 LAPSE_K_PER_M = 0.0065  # ICAO standard atmosphere
 SCALE_K_PER_M = 9.80665 * 0.0289644 / 8.314462  # g M / R: pressure falls by this over temperature
 EARTH_M = 6.371e6
+PATCH_DEG = (3.0, 10.0)  # widths of the patches of refraction
+PATCH_EDGE_DEG = 0.3  # from one patch to the next
+CONTRAST = 3.912  # ln 50: at the visibility a black thing has 2 % contrast left. Koschmieder (1924)
 
 
 @dataclass(frozen=True)
@@ -26,10 +31,26 @@ class AirOfScan:
     lapse_k_per_m: float
     coefficient: float  # of refraction, mean over azimuth
     by_azimuth: Wander  # what to add to it, by the ray's direction [rad, counter-clockwise from east]
+    by_patch: Callable[[Floats], Floats] = np.zeros_like  # the same, with sharp edges
 
     def coefficient_at(self, bearing_rad: Floats) -> Floats:
         """Return the coefficient of refraction in each direction, counter-clockwise from east [1]."""
-        return np.asarray(self.coefficient + self.by_azimuth(bearing_rad))
+        return np.asarray(self.coefficient + self.by_azimuth(bearing_rad) + self.by_patch(bearing_rad))
+
+
+@dataclass(frozen=True)
+class Patches:
+    """A function of direction in steps: the same within a patch, another in the next."""
+
+    edge_deg: Floats  # (p - 1,) where each patch but the first begins, rising within 0-360
+    value: Floats  # (p,)
+
+    def __call__(self, bearing_rad: Floats) -> Floats:
+        """Return the value in each direction."""
+        half_deg = PATCH_EDGE_DEG / 2
+        knot_deg = np.stack((self.edge_deg - half_deg, self.edge_deg + half_deg), axis=1).ravel()
+        ends = np.repeat(self.value, 2)[1:-1]
+        return np.asarray(np.interp(np.degrees(bearing_rad) % 360, knot_deg, ends))
 
 
 def group_refractivity_ppm(
@@ -111,7 +132,30 @@ def air_of_scan(scenario: Scenario, scan: int) -> AirOfScan | None:
         # than the mean lapse rate does, so that has a magnitude of its own
         usual * (0.0343 - LAPSE_K_PER_M) + scenario.refraction_sigma * rng.standard_normal(),
         wander(rng, scenario.refraction_azimuth_sigma, np.radians(12), np.radians(90)),
+        _patches(scenario, scan) if scenario.refraction_patch_sigma else np.zeros_like,
     )
+
+
+def _patches(scenario: Scenario, scan: int) -> Patches:
+    rng = stream(scenario.seed, 42, scan)
+    edge_deg = np.cumsum(rng.uniform(*PATCH_DEG, int(360 / PATCH_DEG[0])))
+    edge_deg = edge_deg[edge_deg < 360 - PATCH_DEG[0]]
+    return Patches(edge_deg, scenario.refraction_patch_sigma * rng.standard_normal(len(edge_deg) + 1))
+
+
+def visibility_m(scenario: Scenario, scan: int) -> float:
+    """Return how far one sees in one scan [m], infinity without fog."""
+    begin, end = scenario.fog_hours
+    foggy = scenario.fog_visibility_m > 0 and begin <= scenario.hours_at(scan) < end
+    return scenario.fog_visibility_m if foggy else math.inf
+
+
+def left_by_fog(range_m: Floats, visibility_m: float) -> Floats:
+    """Return the share of the light that comes through the fog there and back [1].
+
+    Source: Koschmieder (1924), extinction 3.912 over visibility, along twice the range.
+    """
+    return np.asarray(np.exp(-2 * CONTRAST / visibility_m * range_m))
 
 
 def bending_m(coefficient: Floats, along_m: Floats) -> Floats:

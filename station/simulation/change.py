@@ -12,13 +12,16 @@ from dataclasses import dataclass
 import numpy as np
 
 from station.quantities import Floats
+from station.simulation.places import roof
 from station.simulation.randomness import stream
 from station.simulation.scenario import Scenario
 from station.simulation.terrain import Heights, Valley, bumps
 
-# Where the avalanche breaks off and where it stops: east, north, half length, half width, times size [m]
+# Where the avalanche breaks off and where it stops: east, north, half length, half width, times size [m];
+# the half axes also times the scenario's avalanche_size
 RELEASE = (-730.0, 1950.0, 110.0, 90.0)
 DEPOSIT = (-700.0, 1500.0, 150.0, 120.0)
+WHITE_FROM_M, WHITE_AT_M = 0.005, 0.03  # so much fresh snow begins to hide rock, so much hides it
 SLAB_SHARE = 0.5  # height of the slab that leaves against that of the deposit
 
 
@@ -54,12 +57,26 @@ def ground_at(place: Valley, happening: tuple[Change, ...], hours: float) -> Hei
     return place.ground.over(node)
 
 
+def white_at(place: Valley, happening: tuple[Change, ...], hours: float) -> Heights:
+    """Return what is white, so many hours after the start: ice, and ground under fresh snow (0-1)."""
+    white = place.ice.node
+    for change in happening:
+        if change.name == "snowfall":
+            depth_m = change.amount(hours) * change.pattern.node
+            white = np.maximum(white, np.clip((depth_m - WHITE_FROM_M) / (WHITE_AT_M - WHITE_FROM_M), 0, 1))
+    return place.ice.over(white)
+
+
 def _melt(scenario: Scenario, place: Valley) -> Change:
     height = place.ground.node / place.size
     lowest = height[place.ice.node > 0.5].min()
     share = np.clip(1 - (height - lowest) / 450.0, 0, 1) * place.ice.node
     share[share < 0.01] = 0  # rock is rock: it does not melt by what is left of a smooth edge
-    return Change("melt", place.ground.over(-share), lambda hours: scenario.melt_m_per_h * hours)
+
+    def amount(hours: float) -> float:
+        return scenario.melt_m_per_h * max(0.0, hours - scenario.melt_from_hour)
+
+    return Change("melt", place.ground.over(-share), amount)
 
 
 def _snowfall(scenario: Scenario, place: Valley) -> Change:
@@ -74,11 +91,14 @@ def _snowfall(scenario: Scenario, place: Valley) -> Change:
     def amount(hours: float) -> float:
         return scenario.snowfall_m * float(np.clip((hours - begin) / (end - begin), 0, 1))
 
+    if scenario.stable_ground == "poor":
+        held[roof(scenario, place)] = 0
     return Change("snowfall", place.ground.over(held * np.clip(1 + 0.3 * patches, 0.1, 2)), amount)
 
 
 def _avalanche(scenario: Scenario, place: Valley) -> Change:
-    pattern = _heap(place, DEPOSIT) - SLAB_SHARE * _heap(place, RELEASE)
+    deposit, release = (_heap(place, where, scenario.avalanche_size) for where in (DEPOSIT, RELEASE))
+    pattern = deposit - SLAB_SHARE * release
 
     def amount(hours: float) -> float:
         return scenario.avalanche_m if hours >= scenario.avalanche_hour else 0.0
@@ -86,9 +106,10 @@ def _avalanche(scenario: Scenario, place: Valley) -> Change:
     return Change("avalanche", place.ground.over(pattern), amount)
 
 
-def _heap(place: Valley, where: tuple[float, float, float, float]) -> Floats:
+def _heap(place: Valley, where: tuple[float, float, float, float], larger: float) -> Floats:
     """Return a flat-topped heap of height one with a smooth edge, nothing beyond it."""
     east, north, half_x, half_y = (place.size * length for length in where)
+    half_x, half_y = half_x * larger, half_y * larger
     ground = place.ground
     ny, nx = ground.node.shape
     x = ((ground.west_m + np.arange(nx) * ground.step_m - east) / half_x)[None, :]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
@@ -67,6 +68,25 @@ def write_weather(path: Path, log: WeatherLog) -> None:
 def write_sop(path: Path, matrix: Floats) -> None:
     """Write a 4 x 4 matrix as text."""
     np.savetxt(path, matrix, fmt="%.16f", header="scanner's frame to east-north-up at the mark")
+
+
+def write_polygons(path: Path, rings_m: dict[str, Floats]) -> None:
+    """Write named polygons as GeoJSON with the map's eastings and northings, to the millimetre.
+
+    The member `crs` is that of GeoJSON 2008, which GIS programs still read.
+    """
+    features = [
+        {
+            "type": "Feature",
+            "properties": {"name": name},
+            "geometry": {"type": "Polygon", "coordinates": [np.round(ring_m, 3).tolist()]},
+        }
+        for name, ring_m in rings_m.items()
+    ]
+    crs = {"type": "name", "properties": {"name": f"urn:ogc:def:crs:EPSG::{CRS.removeprefix('EPSG:')}"}}
+    lines = ",\n".join(json.dumps(feature) for feature in features)
+    head = f'{{"type": "FeatureCollection", "crs": {json.dumps(crs)}, "features": [\n'
+    path.write_text(f"{head}{lines}\n]}}\n", encoding="ascii")
 
 
 def write_site(path: Path, scenario: Scenario, grid: Grid) -> None:
@@ -139,7 +159,11 @@ cutoff_hz = "auto"                 # from the log's own spectrum
 mode = "relative"                  # the SOP already holds the lean of its own scan
 
 [adjustment]
-method = "none"
+method = "joint"                   # from stable ground, log and weather; "none": filtered log only
+stable = "stable.geojson"          # or "auto"
+
+[areas]
+file = "areas.geojson"             # named polygons: mean and volume of change in areas.nc
 
 [uncertainty]
 model = "rigorous"

@@ -12,7 +12,7 @@ from station.simulation import motion
 from station.simulation.scan import Conditions
 from station.simulation.scenario import Scenario
 
-BEARINGS = 73  # directions at which the refraction is told
+BEARING_STEP_DEG = 0.25  # between directions at which the refraction is told: its patches have sharp edges
 
 CONVENTIONS = (
     "A direction d recorded in the scanner's frame truly points along"
@@ -51,6 +51,11 @@ def _motion(scenario: Scenario, now: list[Conditions], lean: tuple[motion.Axis, 
             ),
             "position": _per_scan([one.moves.position_m for one in now], "m", "shift against the SOP", "enu"),
             "range_bias": _per_scan([one.range_bias_m for one in now], "m", "measured less true"),
+            "moved": _per_scan(
+                [np.int8(motion.has_moved(scenario, one.scan)) for one in now],
+                "1",
+                "whether the scanner has been moved for good; roll, pitch, heading and position hold it",
+            ),
             "scanner_start": _per_scan([one.scanner_start_s for one in now], "s", "gps_time at the start"),
         },
         coords={
@@ -63,9 +68,9 @@ def _motion(scenario: Scenario, now: list[Conditions], lean: tuple[motion.Axis, 
 def _air(scenario: Scenario, now: list[Conditions]) -> xr.Dataset:
     """Return the air at the scanner and over the valley, NaN where it is switched off."""
     first, last = (np.radians(scenario.mount_heading_deg) + edge for edge in scenario.azimuth_rad)
-    bearing_rad = np.linspace(first, last, BEARINGS)
+    bearing_rad = np.linspace(first, last, 1 + round(np.degrees(last - first) / BEARING_STEP_DEG))
     bend: list[Floats] = [
-        one.air.coefficient_at(bearing_rad) if one.air else np.zeros(BEARINGS) for one in now
+        one.air.coefficient_at(bearing_rad) if one.air else np.zeros_like(bearing_rad) for one in now
     ]
     told = [
         (a.at_scanner.temperature_c, a.at_scanner.pressure_hpa, a.at_scanner.humidity_pct, a.path_warmer_k,
@@ -82,6 +87,9 @@ def _air(scenario: Scenario, now: list[Conditions]) -> xr.Dataset:
     return xr.Dataset(
         {
             "refraction": _per_scan(bend, "1", "coefficient of refraction by direction", "bearing"),
+            "fog_visibility": _per_scan(
+                [one.visibility_m for one in now], "m", "how far one sees, infinite without fog"
+            ),
             **{
                 name: _per_scan([row[column] for row in told], units, meaning)
                 for column, (name, units, meaning) in enumerate(names)

@@ -8,24 +8,31 @@ over the first scan by definition, though it drifts and sways within it.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 
 from station.quantities import Floats, InclinationLog
-from station.simulation.randomness import Wander, stream, wander
+from station.simulation.randomness import stream, wander
 from station.simulation.scenario import Scenario
+from station.simulation.shakes import Jerks, Knock, gusty_sway
 
 LOG_MARGIN_S = 6.0  # the log begins and ends this much before and after the shots
 CLOCK_LIMIT_S = 5.0  # Voordendag et al. (2023): log and scan differ by up to 5 s
-SPACING_S = 0.1  # the lean is interpolated between such times: sway has periods of 2 s and more
+SPACING_S = 0.1  # the lean is interpolated between such times: sway has periods of 1.5 s and more
+JERKS_PER_SCAN = 2.0
+WOBBLE_LINES = 7.3  # period of the mirror's wobble: it closes with no whole number of lines
+WOBBLE_SWELL = 0.4  # share by which the wobble's height wanders over hundreds of lines
+
+LeanPart = Callable[[Floats], Floats]  # of seconds since the first scan began [rad]
 
 
 @dataclass(frozen=True)
 class Axis:
     """The lean about one axis of the scanner, by seconds since the first scan began."""
 
-    parts: tuple[Wander, ...]
+    parts: tuple[LeanPart, ...]
     zero_rad: float
 
     def lean(self, series_s: Floats) -> Floats:
@@ -57,30 +64,70 @@ def axes(scenario: Scenario) -> tuple[Axis, Axis]:
     found = []
     for number in range(2):
         rng = stream(scenario.seed, 30, number)
-        parts = (
+        parts: tuple[LeanPart, ...] = (
             wander(rng, np.radians(scenario.lean_drift_deg), 2.5 * 3600, 26 * 3600),
             wander(rng, np.radians(scenario.lean_within_scan_deg), 150, 2400),
             wander(rng, np.radians(scenario.sway_deg), 2, 25),
+            *_rare(scenario, number),
         )
         zero_rad = float(np.mean(sum(part(during) for part in parts)))
         found.append(Axis(parts, zero_rad))
     return found[0], found[1]
 
 
+def _rare(scenario: Scenario, number: int) -> list[LeanPart]:
+    """Return the gusts, the jerks and the knock of one axis; nothing that is switched off."""
+    parts: list[LeanPart] = []
+    if scenario.wind_sway_deg:
+        parts.append(gusty_sway(scenario.seed, number, np.radians(scenario.wind_sway_deg)))
+    if scenario.lean_jerk_deg:
+        size_rad = np.radians(scenario.lean_jerk_deg)
+        parts.append(Jerks(scenario.seed, number, size_rad, JERKS_PER_SCAN / scenario.scan_s))
+    if scenario.moved_hour and scenario.moved_deg:
+        direction_rad = stream(scenario.seed, 39, 0).uniform(0, 2 * np.pi)
+        share = (np.cos(direction_rad), np.sin(direction_rad))[number]
+        parts.append(Knock(3600 * scenario.moved_hour, np.radians(scenario.moved_deg) * share))
+    return parts
+
+
+def has_moved(scenario: Scenario, scan: int) -> bool:
+    """Tell whether somebody had moved the scanner for good before this scan."""
+    return 0 < 3600 * scenario.moved_hour <= scenario.scan_start_s(scan)
+
+
 def moves(scenario: Scenario, scan: int) -> Moves:
-    """Return how the scanner is turned and moved in one scan; in the first not at all, the SOP is of it."""
+    """Return how the scanner is turned and moved in one scan; in the first not at all, the SOP is of it.
+
+    Whoever tilts the scanner for good turns it by half as much, to either side, and shifts it.
+    """
     rng = stream(scenario.seed, 31, scan)
     here = 1.0 if scan else 0.0
-    return Moves(
-        heading_rad=here * float(np.radians(scenario.heading_deg) * rng.standard_normal()),
-        position_m=here * scenario.position_m * rng.standard_normal(3),
-    )
+    heading_rad = here * float(np.radians(scenario.heading_deg) * rng.standard_normal())
+    position_m = here * scenario.position_m * rng.standard_normal(3)
+    if has_moved(scenario, scan):
+        rng = stream(scenario.seed, 39, 1)
+        heading_rad += float(np.radians(scenario.moved_deg / 2) * rng.choice((-1, 1)))
+        direction = rng.standard_normal(3)
+        position_m = position_m + scenario.moved_m * direction / np.linalg.norm(direction)
+    return Moves(heading_rad, position_m)
 
 
 def line_jitter(scenario: Scenario, scan: int) -> Floats:
     """Return by how much each line points higher than all else says [rad] (lines,)."""
     rng = stream(scenario.seed, 32, scan)
-    return np.asarray(np.radians(scenario.line_jitter_deg) * rng.standard_normal(scenario.lines))
+    white = np.radians(scenario.line_jitter_deg) * rng.standard_normal(scenario.lines)
+    return np.asarray(white + _wobble(scenario, scan))
+
+
+def _wobble(scenario: Scenario, scan: int) -> Floats:
+    """Return the part of the jitter that comes back every few lines [rad] (lines,)."""
+    rng = stream(scenario.seed, 38, scan)
+    line = np.arange(scenario.lines, dtype=np.float64)
+    swell = 1 + wander(rng, WOBBLE_SWELL, 300, 2000)(line)
+    wave = np.sin(2 * np.pi * line / WOBBLE_LINES + rng.uniform(0, 2 * np.pi))
+    return np.asarray(
+        np.radians(scenario.mirror_wobble_deg) * np.sqrt(2 / (1 + WOBBLE_SWELL**2)) * swell * wave
+    )
 
 
 def sensor_faults(scenario: Scenario, scan: int) -> SensorFaults:

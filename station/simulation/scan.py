@@ -6,9 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from station.quantities import Floats, Ints
+from station.quantities import Bools, Floats, Ints
 from station.simulation import motion
-from station.simulation.air import AirOfScan, air_of_scan, stretch
+from station.simulation.air import AirOfScan, air_of_scan, left_by_fog, stretch, visibility_m
 from station.simulation.cast import Hits, cast
 from station.simulation.randomness import stream
 from station.simulation.scenario import Scenario
@@ -16,6 +16,10 @@ from station.simulation.terrain import EAST_M, NORTH_M, SOUTH_M, WEST_M, Heights
 
 SHOTS_AT_ONCE = 50_000  # what stays in the cache
 RETRACE = 0.25  # share of each line in which the mirror swings back and nothing is shot
+ROCK, WHITE = 0.25, 0.60  # of the light come back from rock, and from snow and ice
+SPECKLE = 0.08  # relative scatter of the brightness of single shots
+GAIN = 0.05  # the receiver is up to so much more or less sensitive in a scan
+FADING = 0.3  # relative scatter of what the receiver just detects: the edge of sight in fog is not sharp
 
 
 @dataclass(frozen=True)
@@ -26,7 +30,7 @@ class Recorded:
     y_m: Floats
     z_m: Floats
     time_s: Floats  # scanner's seconds
-    brightness: Floats  # 0-1: ice or rock, and how steeply it was hit
+    brightness: Floats  # 0-1: snow, ice or rock, and how steeply it was hit
     true_m: Floats  # (n, 3) east, north, up of the mark
 
 
@@ -42,6 +46,8 @@ class Conditions:
     jitter_rad: Floats  # (lines,)
     moves: motion.Moves
     range_bias_m: float
+    visibility_m: float  # infinite without fog
+    gain: float  # of the receiver, 1 on average
     start_share: Floats  # (2,) by which share of a step the scan's azimuths and elevations are shifted
 
 
@@ -50,6 +56,7 @@ def conditions(scenario: Scenario, scan: int, lean: tuple[motion.Axis, motion.Ax
     rng = stream(scenario.seed, 50, scan)
     into_s = np.linspace(0, scenario.scan_s, int(scenario.scan_s / motion.SPACING_S) + 2)
     start_s = scenario.scan_start_s(scan)
+    gain = 1 + GAIN * stream(scenario.seed, 53, scan).uniform(-1, 1)
     return Conditions(
         scan=scan,
         scanner_start_s=float(np.round(rng.uniform(30, 110), 3)),  # it counts from when it was switched on
@@ -59,16 +66,20 @@ def conditions(scenario: Scenario, scan: int, lean: tuple[motion.Axis, motion.Ax
         jitter_rad=motion.line_jitter(scenario, scan),
         moves=motion.moves(scenario, scan),
         range_bias_m=float(scenario.range_bias_m * rng.standard_normal()),
+        visibility_m=visibility_m(scenario, scan),
+        gain=gain if scenario.range_noise_m else 1.0,
         start_share=rng.uniform(0, 1, 2),
     )
 
 
-def record(scenario: Scenario, ground: Heights, ice: Heights, now: Conditions) -> Recorded:
-    """Shoot one scan."""
-    rng = stream(scenario.seed, 51, now.scan)
+def record(scenario: Scenario, ground: Heights, white: Heights, now: Conditions) -> Recorded:
+    """Shoot one scan of a ground that is white (1: ice, snow) or dark (0: rock)."""
+    aim, receive = (stream(scenario.seed, kind, now.scan) for kind in (51, 52))
     lines = max(1, SHOTS_AT_ONCE // scenario.shots_per_line)
     parts = [
-        _shoot(scenario, ground, ice, now, np.arange(first, min(first + lines, scenario.lines)), rng)
+        _shoot(
+            scenario, ground, white, now, np.arange(first, min(first + lines, scenario.lines)), aim, receive
+        )
         for first in range(0, scenario.lines, lines)
     ]
     together = {
@@ -81,10 +92,11 @@ def record(scenario: Scenario, ground: Heights, ice: Heights, now: Conditions) -
 def _shoot(
     scenario: Scenario,
     ground: Heights,
-    ice: Heights,
+    white: Heights,
     now: Conditions,
     lines: Ints,
     rng: np.random.Generator,
+    receive: np.random.Generator,
 ) -> Recorded:
     azimuth_rad, elevation_rad, into_s, line = _angles(scenario, now, lines, rng)
     eye_m = np.array(scenario.mount_position_m) + now.moves.position_m
@@ -113,16 +125,43 @@ def _shoot(
     echo &= rng.random(len(line)) >= scenario.echo_loss
     measured_m = range_m * stretch(air, rise_m) + now.range_bias_m
     measured_m += scenario.range_noise_m * rng.standard_normal(len(line))
-    white = ice.at(hits.east_m, hits.north_m)
+    brightness = (ROCK + (WHITE - ROCK) * white.at(hits.east_m, hits.north_m)) * cosine
+    echo &= _pierces_fog(scenario, now, brightness, range_m, receive)
     flat_m = measured_m * np.cos(elevation_rad)
     return Recorded(
         x_m=(flat_m * np.cos(azimuth_rad))[echo],
         y_m=(flat_m * np.sin(azimuth_rad))[echo],
         z_m=(measured_m * np.sin(elevation_rad))[echo],
         time_s=(now.scanner_start_s + into_s)[echo],
-        brightness=((0.25 + 0.35 * white) * cosine)[echo],
+        brightness=_received(scenario, now, brightness[echo], receive),
         true_m=np.stack((hits.east_m, hits.north_m, hits.up_m), axis=1)[echo],
     )
+
+
+def _pierces_fog(
+    scenario: Scenario, now: Conditions, brightness: Floats, range_m: Floats, receive: np.random.Generator
+) -> Bools:
+    """Tell which echoes are still strong enough behind the fog; all of them without.
+
+    An echo weakens with the square of the range and with the fog there and back; it is detected where it is
+    as strong as that of the faintest ground seen in clear air: rock at the reach, hit as slantly as can be.
+    """
+    if np.isinf(now.visibility_m):
+        return np.ones(len(range_m), dtype=np.bool_)
+    faintest = ROCK * np.cos(np.radians(scenario.incidence_max_deg))
+    margin = brightness / faintest * (scenario.range_max_m / range_m) ** 2
+    needed = np.exp(FADING * receive.standard_normal(len(range_m)))
+    return np.asarray(margin * left_by_fog(range_m, now.visibility_m) > needed)
+
+
+def _received(
+    scenario: Scenario, now: Conditions, brightness: Floats, receive: np.random.Generator
+) -> Floats:
+    """Return the brightness as the receiver tells it, each shot with its speckle [1]."""
+    if not scenario.range_noise_m:
+        return brightness
+    speckle = 1 + SPECKLE * receive.standard_normal(len(brightness))
+    return np.clip(now.gain * speckle * brightness, 0, 1)
 
 
 def _angles(

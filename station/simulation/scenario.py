@@ -5,13 +5,18 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
+from typing import Any, Literal
 
 from station.errors import ConfigError
+
+NAMES = ("quiet", "drift", "wind", "snowfall", "melt", "avalanche", "poor", "fog", "moved")  # of scenarios
 
 # Everything without_errors() sets to zero: what stands between a shot and the point it should give.
 ERRORS = (
     "air", "refraction_sigma", "refraction_azimuth_sigma", "lapse_sigma_k_per_m", "path_temperature_sigma_k",
-    "lean_drift_deg", "lean_within_scan_deg", "sway_deg", "line_jitter_deg", "heading_deg", "position_m",
+    "refraction_patch_sigma", "fog_visibility_m",
+    "lean_drift_deg", "lean_within_scan_deg", "sway_deg", "wind_sway_deg", "lean_jerk_deg",
+    "line_jitter_deg", "mirror_wobble_deg", "heading_deg", "position_m", "moved_hour", "moved_deg", "moved_m",
     "range_bias_m", "range_noise_m", "beam_divergence_mrad", "echo_loss",
     "log_noise_deg", "log_bias_deg", "log_cyclic_deg", "log_cyclic_change", "log_clock_s",
     "melt_m_per_h", "snowfall_m", "avalanche_m",
@@ -57,16 +62,25 @@ class Scenario:
     air: bool = True
     refraction_sigma: float = 0.07  # of k from scan to scan, about what temperature and pressure tell
     refraction_azimuth_sigma: float = 0.02  # of k over azimuth within a scan
+    refraction_patch_sigma: float = 0.0  # of k in patches of azimuth with sharp edges, fresh in each scan
     lapse_sigma_k_per_m: float = 0.0015
     path_temperature_sigma_k: float = 0.7  # of the air over the glacier against the thermometer's
+    fog_visibility_m: float = 0.0  # between the hours below; 0 is no fog
+    fog_hours: tuple[float, float] = (8.0, 16.0)
 
     # how the scanner moves
     lean_drift_deg: float = 0.004  # over hours; against the first scan 1.4 times that
     lean_within_scan_deg: float = 0.0018  # over minutes
     sway_deg: float = 0.0010  # over seconds
+    wind_sway_deg: float = 0.0  # over seconds within gusts, nothing between them
+    lean_jerk_deg: float = 0.0  # of sudden steps, about two a scan, that fade within minutes
     line_jitter_deg: float = 0.0008  # of each line's elevation; no sensor sees it
+    mirror_wobble_deg: float = 0.0  # the same, but it comes back every few lines
     heading_deg: float = 0.0010  # of each scan
     position_m: float = 0.002  # of each scan, each axis
+    moved_hour: float = 0.0  # from then on the scanner is moved for good; 0 is never
+    moved_deg: float = 0.0  # by how much it is tilted then; it is turned by half as much
+    moved_m: float = 0.0  # by how much it is shifted then
 
     # how it measures
     range_bias_m: float = 0.004  # of each scan
@@ -83,10 +97,15 @@ class Scenario:
 
     # how the surface changes
     melt_m_per_h: float = 0.0  # of ice at the end of the tongue; none 450 m (times size) higher
+    melt_from_hour: float = 0.0
     snowfall_m: float = 0.0  # in all, between the hours below
     snow_hours: tuple[float, float] = (4.0, 12.0)
     avalanche_m: float = 0.0  # height of the deposit
     avalanche_hour: float = 15.0
+    avalanche_size: float = 1.0  # of release and deposit; at 1 the deposit is 300 m long
+
+    # what its owner knows to be stable: rock all round, or only a far ridge and a hut that snow never covers
+    stable_ground: Literal["good", "poor"] = "good"
 
     def __post_init__(self) -> None:
         """Refuse what cannot be simulated."""
@@ -119,6 +138,10 @@ class Scenario:
         """Return the start of one scan in seconds since 1970."""
         return self.start_utc_s + self.scan_start_s(scan)
 
+    def hours_at(self, scan: int) -> float:
+        """Return the middle of one scan in hours since the series began; its ground stands still then."""
+        return scan + self.scan_s / 7200
+
     @property
     def azimuth_rad(self) -> tuple[float, float]:
         """First and last azimuth of the head."""
@@ -140,6 +163,48 @@ def demo(hours: int = 24, seed: int = 1) -> Scenario:
         reference_scans=min(8, max(1, hours // 3)),
         melt_m_per_h=0.02,
         avalanche_m=3.0,
+    )
+
+
+def named(name: str, hours: int = 24, seed: int = 1) -> Scenario:
+    """Give the demo's valley with every usual error and one thing to see or to withstand.
+
+    Whatever happens does so after the scans of the reference. Raises ConfigError if the name is not in NAMES.
+    """
+    reference = min(8, max(1, hours // 3))
+    usual = replace(demo(hours, seed), melt_m_per_h=0.0, avalanche_m=0.0)
+    special: dict[str, dict[str, Any]] = {
+        "quiet": {},
+        "drift": {
+            "lean_drift_deg": 2 * usual.lean_drift_deg,
+            "lean_within_scan_deg": 1.5 * usual.lean_within_scan_deg,
+            "lean_jerk_deg": 0.002,
+        },
+        "wind": {"wind_sway_deg": 0.002, "mirror_wobble_deg": 0.0005},
+        "snowfall": {"snowfall_m": 0.4, "snow_hours": (hours / 2, float(hours))},
+        "melt": {"melt_m_per_h": 0.005, "melt_from_hour": float(reference)},
+        "avalanche": {"avalanche_m": 2.0, "avalanche_hour": 2 * hours / 3, "avalanche_size": 0.11},
+        "poor": {"stable_ground": "poor"},
+        "fog": {"fog_visibility_m": 1500.0, "fog_hours": (hours / 3, 2 * hours / 3)},
+        "moved": {"moved_hour": hours / 2, "moved_deg": 0.02, "moved_m": 0.005},
+    }
+    if name not in special:
+        raise ConfigError(f"no scenario is called {name}: choose from {', '.join(NAMES)}")
+    return replace(usual, **special[name])
+
+
+def dense(scenario: Scenario) -> Scenario:
+    """Give the same on the whole valley, as finely as the real scanner sees it: 1.4 million echoes a scan."""
+    whole = Scenario()
+    return replace(
+        scenario,
+        terrain_step_m=whole.terrain_step_m,
+        roughness_length_m=whole.roughness_length_m,
+        cell_m=whole.cell_m,
+        extent_m=whole.extent_m,
+        azimuth_deg=whole.azimuth_deg,
+        lines=whole.lines,
+        shots_per_line=whole.shots_per_line,
     )
 
 

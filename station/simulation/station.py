@@ -12,14 +12,15 @@ from station.errors import ConfigError, StoreError
 from station.quantities import Floats, InclinationLog
 from station.simulation import files, motion
 from station.simulation.air import weather
-from station.simulation.change import Change, changes, ground_at
+from station.simulation.change import Change, changes, ground_at, white_at
 from station.simulation.ledger import CONVENTIONS, true_errors
 from station.simulation.scan import Conditions, Recorded, conditions, record
-from station.simulation.scenario import Scenario, demo, tiny
+from station.simulation.scenario import Scenario, demo, dense, named, tiny
+from station.simulation.stable import Rectangle, areas, covered, stable_ground
 from station.simulation.terrain import Heights, Valley, valley
 from station.simulation.truth import CRS, TrueSurface, grid_of, true_surface
 
-__all__ = ["Scenario", "Station", "demo", "simulate", "tiny"]
+__all__ = ["Scenario", "Station", "demo", "dense", "named", "simulate", "tiny"]
 
 WEATHER_MARGIN_S = 3600.0  # the weather log begins before the first scan and ends after the last
 PACKED_M = 1e-4  # last digit of the stored surfaces
@@ -53,13 +54,14 @@ class Station:
         """The true cell means on the map's grid."""
         return true_surface(self.place, self.happening, grid_of(self.scenario))
 
-    def hours_at(self, scan: int) -> float:
-        """Return the middle of one scan in hours since the series began; its ground stands still then."""
-        return scan + self.scenario.scan_s / 7200
+    @cached_property
+    def stable(self) -> list[Rectangle]:
+        """What the owner knows to be stable."""
+        return stable_ground(self.scenario, self.place, self.happening, self.surface)
 
     def ground(self, scan: int) -> Heights:
         """Return the ground that one scan sees."""
-        return ground_at(self.place, self.happening, self.hours_at(scan))
+        return ground_at(self.place, self.happening, self.scenario.hours_at(scan))
 
     def conditions(self, scan: int) -> Conditions:
         """Return what holds for all shots of one scan."""
@@ -69,7 +71,8 @@ class Station:
 
     def scan(self, scan: int) -> Recorded:
         """Shoot one scan."""
-        return record(self.scenario, self.ground(scan), self.place.ice, self.conditions(scan))
+        white = white_at(self.place, self.happening, self.scenario.hours_at(scan))
+        return record(self.scenario, self.ground(scan), white, self.conditions(scan))
 
     def log(self, scan: int) -> InclinationLog:
         """Return the inclination log of one scan."""
@@ -92,7 +95,9 @@ class Station:
 
     def _true_surfaces(self) -> xr.Dataset:
         surface, scans = self.surface, range(self.scenario.hours)
-        change_m = np.stack([surface.change_m(self.happening, self.hours_at(scan)) for scan in scans])
+        change_m = np.stack(
+            [surface.change_m(self.happening, self.scenario.hours_at(scan)) for scan in scans]
+        )
         plane, cube = ("y", "x"), ("time", "y", "x")
         return xr.Dataset(
             {
@@ -100,6 +105,11 @@ class Station:
                 "change": (cube, change_m, {"units": "m", "long_name": "against the unchanged ground"}),
                 "unchanged_elevation": (plane, surface.elevation_m, {"units": "m"}),
                 "ice": (plane, surface.ice, {"units": "1", "long_name": "share of ice"}),
+                "stable_polygons": (
+                    plane,
+                    covered(surface.grid, self.stable).astype(np.int8),
+                    {"long_name": "inside stable.geojson: rock, on which snow may fall"},
+                ),
                 "stable": (plane, surface.stable().astype(np.int8), {"long_name": "never changes here"}),
             },
             coords={"x": surface.grid.x_m, "y": surface.grid.y_m},
@@ -107,7 +117,7 @@ class Station:
 
 
 def simulate(folder: Path, scenario: Scenario) -> None:
-    """Write a station's folder: inbox, weather.dat, sop.dat, site.toml, and truth.nc.
+    """Write a station's folder: inbox, weather.dat, sop.dat, site.toml, polygons, and truth.nc.
 
     Raises ConfigError if there already is a station, StoreError if it cannot be written.
     """
@@ -119,6 +129,11 @@ def simulate(folder: Path, scenario: Scenario) -> None:
         inbox.mkdir(parents=True)
         files.write_sop(folder / "sop.dat", motion.sop(scenario))
         files.write_site(folder / "site.toml", scenario, grid_of(scenario))
+        grid = station.surface.grid
+        files.write_polygons(
+            folder / "stable.geojson", {one.name: one.ring_m(grid) for one in station.stable}
+        )
+        files.write_polygons(folder / "areas.geojson", areas(scenario, station.place))
         if scenario.air:
             files.write_weather(folder / "weather.dat", weather(scenario, _minutes(scenario)))
         for scan in range(scenario.hours):

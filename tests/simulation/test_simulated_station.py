@@ -73,7 +73,7 @@ def test_true_elevation_is_the_mean_over_the_cell_and_follows_the_ground():
         for scan in (0, 2):
             mean = truth.heights(station.ground(scan), lines, northing, easting).mean()
             told = surface.elevation_m[row, column]
-            told += surface.change_m(station.happening, station.hours_at(scan))[row, column]
+            told += surface.change_m(station.happening, station.scenario.hours_at(scan))[row, column]
             off.append(told - mean)
     assert np.abs(off).max() < 5e-3  # on a sharp crest
     assert np.median(np.abs(off)) < 3e-4
