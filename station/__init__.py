@@ -1,6 +1,7 @@
 """A permanently mounted laser scanner as a measuring instrument.
 
-`station.open(site_or_folder)` gives the whole series of a station as one lazy `xarray.Dataset`.
+`station.open(site_or_folder)` gives the whole series of a station as one lazy `xarray.Dataset`;
+`station.variance(site_or_folder, weights, epoch)` how sure any mean, volume or difference of it is.
 """
 
 from __future__ import annotations
@@ -10,7 +11,11 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from pathlib import Path
 
+    import numpy as np
+    import numpy.typing as npt
     import xarray as xr
+
+    Epoch = int | str | np.datetime64
 
 __version__ = "0.1.0"
 
@@ -23,3 +28,23 @@ def open(site_or_folder: str | Path) -> xr.Dataset:  # noqa: A001 - reads well a
     from station.archive.store import open_series  # noqa: PLC0415 - importing station stays cheap
 
     return open_series(site_or_folder)
+
+
+def variance(
+    site_or_folder: str | Path, weights: npt.ArrayLike, epoch: Epoch, epoch2: Epoch | None = None
+) -> float:
+    """Variance of a weighted sum of the elevation change in an epoch, or of its difference to a second one.
+
+    `weights` (y, x), rows from north to south, nought outside: 1/n in n cells for a mean, a cell's size for a
+    volume. An epoch is its place in the series or a time (the nearest is taken). What all cells of a scan
+    share is in it, at every scale. Raises StoreError where there is no series or no reference yet.
+    Source: EQUATIONS 6.2.
+    """
+    import numpy as np  # noqa: PLC0415
+
+    from station.archive.aggregate import Aggregates  # noqa: PLC0415
+    from station.archive.store import series_in  # noqa: PLC0415
+
+    found = Aggregates(series_in(site_or_folder))
+    other = None if epoch2 is None else found.row(epoch2)
+    return found.variance(np.asarray(weights, dtype=np.float64), found.row(epoch), other)

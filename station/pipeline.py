@@ -3,14 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import median_abs_deviation
 
 from station.quantities import (
     Bools,
     Floats,
+    Floats32,
     Grid,
+    Habits,
+    Ints,
     Measurement,
     Quality,
     Reference,
@@ -20,31 +25,37 @@ from station.quantities import (
     Surface,
     Tilt,
 )
-from station.science import change, shared, uncertainty
+from station.science import budget, change, ground, prior, shared, uncertainty
+from station.science.adjustment import Adjustment, LineLog, adjust, prior_of_difference, turned
 from station.science.air import AirCorrection, refraction_rise
 from station.science.grid import Gridder, Stack, slope_sampling_variance
+from station.science.patches import Cells, collect
 from station.science.pose import Frame, lean
+from station.science.shared import Basis, Sensitivities
 from station.science.terrain import cell_means, smooth, smooth_gradient
+from station.science.view import Points, View
 
 BAND_ROWS = 128  # the cells that are looked at together: what a store chunk is high
 MARGIN_ROWS = 4  # rows beyond a band that its smoothed gradient looks at
 FEW_POINTS = 3
+FEW_STABLE = 20  # cells, that say nothing of a spread
 PROVISIONAL_CELLS = 1.0  # one sigma of the smoothing before residuals are taken
+STEADY = 3.0  # times its modelled variance from scan to scan, which ground found stable may show
 HIGH_INCIDENCE_COS = float(np.cos(np.radians(80.0)))
-
-Points = tuple[Floats, Floats, Floats]
 
 
 @dataclass(frozen=True)
 class Setup:
     """What stays the same from scan to scan.
 
-    `position_m` is the scanner's place on the map, None where a map-frame scan does not tell it.
+    `position_m` is the scanner's place on the map, None where a map-frame scan does not tell it; `axis` the
+    direction (east, north, up) its head turns about.
     """
 
     scanner: Scanner
     grid: Grid
     position_m: tuple[float, float, float] | None
+    axis: tuple[float, float, float] = shared.UPRIGHT
     min_points: int = 1
     published_budget: bool = False  # Voordendag et al. (2023) instead of the corrected form
     registration_sigma_m: float = 0.0  # of the published budget
@@ -70,7 +81,7 @@ def survey(
 ) -> None:
     """Lay every shot of a scan on the grid."""
     for shots in blocks:
-        lay(gridder, to_map(shots, pose), setup)
+        lay(gridder, to_map(shots, pose), setup, shots.intensity)
         progress()
 
 
@@ -92,7 +103,7 @@ def to_map(shots: Shots, pose: Pose) -> Points:
     return pose.frame.to_map((x_m, y_m, z_m))
 
 
-def lay(gridder: Gridder, points: Points, setup: Setup) -> None:
+def lay(gridder: Gridder, points: Points, setup: Setup, intensity: Floats | None = None) -> None:
     """Add points on the map to the grid, as residuals to the reference where it is known."""
     inside, column, row = gridder.cells(points[0], points[1])
     x_m, y_m, z_m = (axis[inside] for axis in points)
@@ -105,61 +116,90 @@ def lay(gridder: Gridder, points: Points, setup: Setup) -> None:
         below_m[known] = under_m
         if setup.position_m is not None:
             view = View.of((x_m[known], y_m[known], z_m[known]), setup.position_m, east, north)
-            variance_m2[known] = view.shot_variance(setup)
+            variance_m2[known] = view.shot_variance(setup.scanner, published=setup.published_budget)
         else:
             variance_m2[known] = setup.scanner.range_sigma_m**2
-    gridder.add(cell, z_m - below_m, variance_m2)
+    gridder.add(cell, z_m - below_m, variance_m2, None if intensity is None else intensity[inside])
 
 
 @dataclass(frozen=True)
-class View:
-    """How shots or cells (n,) are seen from the scanner."""
+class Told:
+    """What is known of a scan's scanner beside its shots: how it was turned, what log and weather say.
 
-    offset_m: Points
-    east_gradient: Floats
-    north_gradient: Floats
-    range_m: Floats
-    cos_incidence: Floats
-    cos_slope: Floats
+    `assumed_rad` (3, lines) is the lean its points were turned by, about east, north and up.
+    """
 
-    @classmethod
-    def of(cls, points: Points, position_m: tuple[float, float, float], east: Floats, north: Floats) -> View:
-        """See map points with the given terrain gradients from a position."""
-        x_m, y_m, z_m = (axis - origin for axis, origin in zip(points, position_m, strict=True))
-        range_m = np.maximum(np.sqrt(x_m**2 + y_m**2 + z_m**2), 1e-3)
-        cos_slope = 1 / np.sqrt(1 + east**2 + north**2)
-        cos_incidence = np.abs(z_m - east * x_m - north * y_m) * cos_slope / range_m
-        return cls((x_m, y_m, z_m), east, north, range_m, np.minimum(cos_incidence, 1.0), cos_slope)
+    of: Basis
+    lines: prior.Lines
+    assumed_rad: Floats
+    log: LineLog | None
+    weather_known: bool
 
-    @property
-    def tan_slope(self) -> Floats:
-        """Steepness of the terrain (n,) [1]."""
-        return np.hypot(self.east_gradient, self.north_gradient)
 
-    def shot_variance(self, setup: Setup) -> Floats:
-        """Random variance of one shot's height [m²], by the budget the site asks for."""
-        seen = self.range_m, self.cos_incidence, self.cos_slope
-        if setup.published_budget:
-            sin_rise = self.offset_m[2] / self.range_m
-            return uncertainty.shot_variance_voordendag(*seen, sin_rise, setup.scanner)
-        return uncertainty.shot_variance(*seen, setup.scanner)
+def level(gridder: Gridder, setup: Setup, told: Told, reference: Reference, stable: Bools) -> Adjustment:
+    """Estimate the state of the scanner from a scan on its grid; `stable` (ny, nx) is ground known for it."""
+    habits = reference.habits
+    sigma = prior.globals_sigma(habits, weather_known=told.weather_known)
+    motion, bend = prior.motion(habits, told.lines), prior.bending(habits, told.of)
+    state = prior_of_difference(told.of, prior.by_line(told.of, sigma, motion, bend), reference.shared)
+    bands = _cells(gridder, setup, told.of, reference, stable)
+    patches = collect(told.of, bands, setup.scanner.range_max_m)
+    return adjust(patches, told.assumed_rad, state, told.log)
+
+
+def _cells(gridder: Gridder, setup: Setup, of: Basis, reference: Reference, stable: Bools) -> Iterator[Cells]:
+    """Give the cells of a scan that the reference knows, band by band."""
+    mean_m, kept_out, bright = gridder.mean_residual(), ground.withheld(setup.grid), gridder.intensity()
+    model_m2 = gridder.random_variance()
+    count = gridder.count.reshape(setup.grid.shape)
+    for band in _bands(setup.grid):
+        seen = np.isfinite(mean_m[band]) & np.isfinite(reference.elevation_m[band])
+        if not seen.any():
+            continue
+        view = _view(setup, band, seen, reference.elevation_m)
+        unlike = ground.looks_unlike(bright[band][seen], reference.intensity[band][seen])
+        yield Cells(
+            _felt(view, of),
+            np.hypot(view.offset_m[0], view.offset_m[1]),
+            ground.kinds(stable[band][seen], kept_out[band][seen], view.tan_slope, unlike),
+            mean_m[band][seen],
+            _random(model_m2, count, reference, band, seen) + reference.random_variance_m2[band][seen],
+        )
+
+
+def corrections(
+    gridder: Gridder, setup: Setup, told: Told, reference: Reference, found: Adjustment
+) -> Floats32:
+    """What the estimated state does to the heights of the cells that the reference knows (ny, nx) [m]."""
+    correction_m = np.zeros(setup.grid.shape, np.float32)
+    for band in _bands(setup.grid):
+        seen = (gridder.count.reshape(setup.grid.shape)[band] > 0) & np.isfinite(reference.elevation_m[band])
+        if seen.any():
+            felt = _felt(_view(setup, band, seen, reference.elevation_m), told.of)
+            correction_m[band][seen] = found.effect(felt) - turned(felt, told.assumed_rad)
+    return correction_m
 
 
 def measure(
-    gridder: Gridder, setup: Setup, unknown: Shared | None, reference: Reference | None
+    gridder: Gridder,
+    setup: Setup,
+    unknown: Shared | None,
+    reference: Reference | None,
+    levelled: tuple[Told, Adjustment, Bools] | None = None,
 ) -> Measurement:
     """Turn the sums of a scan into surface, change and their uncertainty.
 
-    `unknown` is what all points of the scan share; None where there is nothing to derive it from.
+    `unknown` is what all points of the scan share, against the reference where `levelled` says how it was
+    adjusted to that and to which stable ground (ny, nx); None where there is nothing to derive it from.
     """
-    grid, ground = setup.grid, gridder.ground
+    grid, below = setup.grid, gridder.ground
     mean_m = gridder.mean_residual()
     mean_m[gridder.count.reshape(grid.shape) < setup.min_points] = np.nan
-    known = ground.known if ground is not None else np.zeros(grid.shape, bool)
+    known = below.known if below is not None else np.zeros(grid.shape, bool)
     change_m = np.where(known, mean_m, np.nan).astype(np.float32)
     elevation_m = mean_m + (
-        np.where(known, ground.datum_m + cell_means(ground.rise_m), gridder.datum_m)
-        if ground is not None
+        np.where(known, below.datum_m + cell_means(below.rise_m), gridder.datum_m)
+        if below is not None
         else gridder.datum_m
     )
     surface = Surface(
@@ -181,9 +221,23 @@ def measure(
             if setup.store_terms and setup.position_m is not None
         },
     )
+    judge = _Judge(result, setup, unknown, reference, known, gridder.intensity(), levelled)
     for band in _bands(grid):
-        _judge(result, band, setup, unknown, reference, known)
+        judge.judge(band)
     return result
+
+
+def stable_figures(measured: Measurement) -> dict[str, float]:
+    """Return how a scan does on the stable ground it was not fitted to: number of cells, median, spread, z."""
+    surface = measured.surface
+    chosen = ((measured.quality & Quality.STABLE_GROUND) > 0) & ground.withheld(surface.grid)
+    change_m, sigma_m = surface.change_m[chosen], measured.uncertainty_m[chosen]
+    figures = {"stable_count": float(len(change_m))}
+    if len(change_m) >= FEW_STABLE:
+        figures["stable_median"] = float(np.median(change_m))
+        figures["stable_nmad"] = float(median_abs_deviation(change_m, scale="normal"))
+        figures["stable_z_std"] = float(median_abs_deviation(change_m / sigma_m, scale="normal"))
+    return figures
 
 
 def _bands(grid: Grid) -> Iterator[slice]:
@@ -191,138 +245,137 @@ def _bands(grid: Grid) -> Iterator[slice]:
         yield slice(first, min(first + BAND_ROWS, grid.ny))
 
 
-def _judge(
-    result: Measurement,
-    band: slice,
-    setup: Setup,
-    unknown: Shared | None,
-    reference: Reference | None,
-    known: Bools,
-) -> None:
-    """Fill uncertainty, terms and quality of a band of rows."""
-    surface = result.surface
-    seen = np.isfinite(surface.elevation_m[band])
-    if not seen.any():
-        return
-    count = surface.count[band][seen].astype(np.float64)
-    measured = known[band][seen]
-    flags = np.where(count < FEW_POINTS, Quality.FEW_POINTS, 0)
-    flags |= np.where(measured, 0, Quality.OUTSIDE_REFERENCE)
-    random_m2 = surface.random_variance_m2[band][seen].astype(np.float64)
-    if setup.position_m is None:
-        spread_m2 = np.nan_to_num(surface.spread_m[band][seen].astype(np.float64)) ** 2
-        random_m2 = np.maximum(spread_m2, setup.scanner.range_sigma_m**2) / count
-        shared_m2, terms = np.zeros_like(count), dict[str, Floats]()
-    else:
-        view = _view(surface, band, seen, setup.position_m)
-        flags |= np.where(view.cos_incidence < HIGH_INCIDENCE_COS, Quality.HIGH_INCIDENCE, 0)
-        sampling_m2 = slope_sampling_variance(setup.grid.cell_m, view.tan_slope, count)
-        sampling_m2[measured] = 0.0
-        random_m2 = np.where(measured, random_m2, view.shot_variance(setup) / count + sampling_m2)
-        shared_m2, terms = _shared_and_terms(view, count, sampling_m2, setup, unknown, reference)
-    if reference is not None and not setup.published_budget:
-        rough_m2 = reference.roughness_m2[band][seen] / count
-        random_m2 += np.where(measured, reference.random_variance_m2[band][seen] + rough_m2, 0.0)
-    sigma_m = np.sqrt(random_m2 + shared_m2)
-    if setup.published_budget:
-        sigma_m = uncertainty.sigma_total_voordendag(sigma_m, setup.registration_sigma_m)
-    significant = change.significant(surface.change_m[band][seen], sigma_m)
-    result.uncertainty_m[band][seen] = sigma_m
-    result.random_uncertainty_m[band][seen] = np.sqrt(random_m2)
-    result.quality[band][seen] = flags | np.where(significant, Quality.CHANGE_SIGNIFICANT, 0)
-    for name, values in terms.items():
-        result.terms[name][band][seen] = values
+def _random(
+    model_m2: Floats32, count: NDArray[np.int32], reference: Reference, band: slice, seen: Bools
+) -> Floats:
+    """Random variance of a scan's own cells (n,) [m²]: shots and roughness, as scans have shown it."""
+    rough_m2 = reference.roughness_m2[band][seen] / count[band][seen]
+    return np.asarray(
+        (model_m2[band][seen] + rough_m2) * reference.variance_factor[band][seen], dtype=np.float64
+    )
 
 
-def _shared_and_terms(
-    view: View,
-    count: Floats,
-    sampling_m2: Floats,
-    setup: Setup,
-    unknown: Shared | None,
-    reference: Reference | None,
-) -> tuple[Floats, dict[str, Floats]]:
-    """Return what cells share with others (n,) [m²] and, where asked for, the budget term by term [m]."""
-    if setup.published_budget:
-        return np.zeros_like(count), _terms_voordendag(view, setup) if setup.store_terms else {}
-    if unknown is None or setup.position_m is None:
-        return np.zeros_like(count), {}
-    of = shared.basis(setup.grid, setup.position_m)
-    felt = shared.sensitivities(of, view.offset_m, view.east_gradient, view.north_gradient)
-    shared_m2 = felt.variance(_covariance_of_change(unknown, reference))
-    return shared_m2, _terms(view, count, sampling_m2, felt, unknown, setup) if setup.store_terms else {}
+def _felt(view: View, of: Basis) -> Sensitivities:
+    return shared.sensitivities(of, view.offset_m, view.east_gradient, view.north_gradient)
 
 
-def _view(surface: Surface, band: slice, seen: Bools, position_m: tuple[float, float, float]) -> View:
-    """See the cells of a band with the smoothed gradients of their own surface."""
+@dataclass(frozen=True)
+class _Judge:
+    """Fills correction, uncertainty, terms and quality of a measurement, band by band."""
+
+    result: Measurement
+    setup: Setup
+    unknown: Shared | None
+    reference: Reference | None
+    known: Bools
+    intensity: Floats32
+    levelled: tuple[Told, Adjustment, Bools] | None
+
+    def judge(self, band: slice) -> None:
+        """Fill a band of rows."""
+        surface, setup, reference = self.result.surface, self.setup, self.reference
+        seen = np.isfinite(surface.elevation_m[band])
+        if not seen.any():
+            return
+        count = surface.count[band][seen].astype(np.float64)
+        measured = self.known[band][seen]
+        flags = np.where(count < FEW_POINTS, Quality.FEW_POINTS, 0)
+        flags |= np.where(measured, 0, Quality.OUTSIDE_REFERENCE)
+        random_m2 = surface.random_variance_m2[band][seen].astype(np.float64)
+        if setup.position_m is None:
+            spread_m2 = np.nan_to_num(surface.spread_m[band][seen].astype(np.float64)) ** 2
+            random_m2 = np.maximum(spread_m2, setup.scanner.range_sigma_m**2) / count
+            shared_m2, terms = np.zeros_like(count), dict[str, Floats]()
+        else:
+            better_m = None if reference is None else reference.elevation_m
+            view = _view(setup, band, seen, surface.elevation_m, better_m)
+            flags |= np.where(view.cos_incidence < HIGH_INCIDENCE_COS, Quality.HIGH_INCIDENCE, 0)
+            sampling_m2 = slope_sampling_variance(setup.grid.cell_m, view.tan_slope, count)
+            sampling_m2[measured] = 0.0
+            own_m2 = view.shot_variance(setup.scanner, published=setup.published_budget)
+            random_m2 = np.where(measured, random_m2, own_m2 / count + sampling_m2)
+            shared_m2, terms = self._shared_and_terms(band, seen, view, count, sampling_m2)
+            flags |= self._stable(band, seen, view)
+        if reference is not None and not setup.published_budget:
+            own_m2 = _random(surface.random_variance_m2, surface.count, reference, band, seen)
+            before_m2 = reference.random_variance_m2[band][seen]
+            random_m2 = np.where(measured, own_m2 + before_m2, random_m2)
+        sigma_m = np.sqrt(random_m2 + shared_m2)
+        if setup.published_budget:
+            sigma_m = uncertainty.sigma_total_voordendag(sigma_m, setup.registration_sigma_m)
+        significant = change.significant(surface.change_m[band][seen], sigma_m)
+        self.result.uncertainty_m[band][seen] = sigma_m
+        self.result.random_uncertainty_m[band][seen] = np.sqrt(random_m2)
+        self.result.quality[band][seen] = flags | np.where(significant, Quality.CHANGE_SIGNIFICANT, 0)
+        for name, values in terms.items():
+            self.result.terms[name][band][seen] = values
+
+    def _shared_and_terms(
+        self, band: slice, seen: Bools, view: View, count: Floats, sampling_m2: Floats
+    ) -> tuple[Floats, dict[str, Floats]]:
+        """Take the adjustment off; return what cells share with others (n,) [m²] and the terms asked for [m]."""
+        setup, unknown, surface = self.setup, self.unknown, self.result.surface
+        if setup.position_m is None or unknown is None:
+            return np.zeros_like(count), {}
+        of = shared.basis(setup.grid, setup.position_m, setup.axis)
+        felt = _felt(view, of)
+        of_change = unknown
+        if self.levelled is not None:
+            told, found, _ = self.levelled
+            correction_m = found.effect(felt) - turned(felt, told.assumed_rad)
+            surface.elevation_m[band][seen] -= correction_m
+            surface.change_m[band][seen] -= correction_m.astype(np.float32)
+        elif self.reference is not None and self.reference.shared is not None:
+            of_change = unknown + self.reference.shared
+        if setup.published_budget:
+            terms = budget.terms_voordendag(view, setup.scanner) if setup.store_terms else {}
+            return np.zeros_like(count), terms
+        terms = (
+            budget.terms(view, count, sampling_m2, felt, unknown, setup.scanner) if setup.store_terms else {}
+        )
+        return felt.variance(of_change), terms
+
+    def _stable(self, band: slice, seen: Bools, view: View) -> Ints:
+        """Flag the stable ground that looks as it did."""
+        if self.levelled is None or self.reference is None:
+            return np.zeros(len(view.range_m), np.int64)
+        unlike = ground.looks_unlike(self.intensity[band][seen], self.reference.intensity[band][seen])
+        stable = self.levelled[2][band][seen] & self.known[band][seen] & ~unlike
+        return np.where(stable, Quality.STABLE_GROUND, 0)
+
+
+def _view(
+    setup: Setup, band: slice, seen: Bools, elevation_m: Floats, better_m: Floats | None = None
+) -> View:
+    """See the chosen cells of a band of a surface (ny, nx), with its smoothed gradients.
+
+    `better_m` (ny, nx) is taken where it is known.
+    """
+    assert setup.position_m is not None  # noqa: S101 - the callers' case
     first = max(band.start - MARGIN_ROWS, 0)
-    around = surface.elevation_m[first : band.stop + MARGIN_ROWS] - position_m[2]
+    rows = slice(first, band.stop + MARGIN_ROWS)
+    around = elevation_m[rows]
+    if better_m is not None:
+        around = np.where(np.isfinite(better_m[rows]), better_m[rows], around)
+    around = around - setup.position_m[2]
     east, north = (
         np.nan_to_num(g[band.start - first :][: seen.shape[0]][seen].astype(np.float64))
-        for g in smooth_gradient(around, surface.grid.cell_m)
+        for g in smooth_gradient(around, setup.grid.cell_m)
     )
     row, column = np.nonzero(seen)
-    points = surface.grid.x_m[column], surface.grid.y_m[band][row], surface.elevation_m[band][seen]
-    return View.of(points, position_m, east, north)
-
-
-def _covariance_of_change(unknown: Shared, reference: Reference | None) -> Floats:
-    """Covariance of what scan and reference do not share with each other."""
-    if reference is None or reference.shared is None:
-        return unknown.covariance
-    return unknown.covariance + reference.shared.covariance
-
-
-def _terms(
-    view: View,
-    count: Floats,
-    sampling_m2: Floats,
-    felt: shared.Sensitivities,
-    unknown: Shared,
-    setup: Setup,
-) -> dict[str, Floats]:
-    """Split the budget of a scan's own heights [m]: instrument, atmosphere, geometry.
-
-    Their squares add up to the variance as long as no adjustment has tied the shared parameters together.
-    """
-    by_air = np.array([name.startswith(("range_scale", "refraction")) for name in unknown.names])
-    range_m2 = uncertainty.range_variance(view.cos_incidence, view.cos_slope, setup.scanner.range_sigma_m)
-    beam_m2 = uncertainty.angle_variance(
-        view.range_m, view.cos_incidence, view.cos_slope, uncertainty.sigma_angle(setup.scanner)
-    )
-    air_m2, other_m2 = (
-        felt.variance(np.where(np.outer(of, of), unknown.covariance, 0.0)) for of in (by_air, ~by_air)
-    )
-    return {
-        "sigma_instrument": np.sqrt(range_m2 / count + other_m2),
-        "sigma_atmosphere": np.sqrt(air_m2),
-        "sigma_geometry": np.sqrt(beam_m2 / count + sampling_m2),
-    }
-
-
-def _terms_voordendag(view: View, setup: Setup) -> dict[str, Floats]:
-    """Split the published budget [m], for one point as in the paper's figures."""
-    constant_m = np.full_like(view.range_m, uncertainty.SIGMA_ATMOSPHERE_VOORDENDAG_M)
-    return {
-        "sigma_instrument": uncertainty.sigma_instrument(view.range_m),
-        "sigma_atmosphere": constant_m,
-        "sigma_geometry": uncertainty.sigma_geometry(
-            view.range_m,
-            view.cos_incidence,
-            view.cos_slope,
-            view.offset_m[2] / view.range_m,
-            setup.scanner.beam_divergence_rad,
-        ),
-    }
+    height_m = around[band.start - first :][: seen.shape[0]][seen] + setup.position_m[2]
+    points = setup.grid.x_m[column], setup.grid.y_m[band][row], height_m
+    return View.of(points, setup.position_m, east, north)
 
 
 def master(
     stack: Stack,
     base: Reference | None,
     unknown: list[Shared | None],
-    datum_m: float,
+    setup: Setup,
     version: str,
     scan_ids: tuple[str, ...],
+    habits: Habits,
 ) -> Reference:
     """Return the surface that change is measured from, from scans laid on `base`.
 
@@ -333,20 +386,47 @@ def master(
     """
     mean_m = stack.mean_residual()
     if base is None:
+        datum_m = float(np.round(setup.position_m[2])) if setup.position_m else 0.0
         elevation_m = np.where(np.isfinite(mean_m), smooth(mean_m, PROVISIONAL_CELLS), np.nan) + datum_m
     else:
         elevation_m = base.elevation_m + mean_m
     told = [one for one in unknown if one is not None]
     common = None
     if told:
-        covariance = sum((one.covariance for one in told), np.zeros_like(told[0].covariance)) / len(told) ** 2
-        common = Shared(told[0].names, told[0].units, np.zeros(len(covariance)), covariance)
+        total = told[0]
+        for one in told[1:]:
+            total = total + one
+        common = replace(
+            total,
+            estimate=np.zeros(len(total.names)),
+            covariance=total.covariance / len(told) ** 2,
+            noise_variance=total.noise_variance / len(told) ** 2,
+        )
+    factor, stable = np.ones(setup.grid.shape, np.float32), np.zeros(setup.grid.shape, bool)
+    if setup.position_m is not None:
+        factor, stable = _as_scans_show(stack, setup, elevation_m)
     return Reference(
         grid=stack.grid,
         version=version,
         elevation_m=elevation_m,
-        random_variance_m2=stack.random_variance(),
+        random_variance_m2=stack.random_variance() * factor,
         roughness_m2=stack.roughness().astype(np.float32),
         shared=common,
         scan_ids=scan_ids,
+        intensity=stack.intensity(),
+        variance_factor=factor,
+        stable=stable,
+        habits=habits,
     )
+
+
+def _as_scans_show(stack: Stack, setup: Setup, elevation_m: Floats) -> tuple[Floats32, Bools]:
+    """How much more cells vary from scan to scan than modelled, and which are stable (ny, nx)."""
+    assert setup.position_m is not None  # noqa: S101 - the caller's case
+    east, north = smooth_gradient(elevation_m - setup.position_m[2], setup.grid.cell_m)
+    tan_slope = np.hypot(east, north)
+    away_m = np.hypot(
+        setup.grid.x_m[None, :] - setup.position_m[0], setup.grid.y_m[:, None] - setup.position_m[1]
+    )
+    factor = stack.variance_factor(ground.classes(away_m, tan_slope))
+    return factor, np.isfinite(elevation_m) & (tan_slope > ground.STABLE_FLATTEST) & (factor < STEADY)

@@ -6,8 +6,9 @@ with row 0 in the north.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import IntFlag
+from math import radians
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,6 +30,7 @@ class Shots:
     y_m: Floats  # (n,)
     z_m: Floats  # (n,)
     time_s: Floats | None  # (n,)
+    intensity: Floats | None = None  # (n,) how bright, 0-1; None where the scan does not tell
 
     def __len__(self) -> int:
         """Return how many echoes there are."""
@@ -127,13 +129,42 @@ class Grid:
 class Shared:
     """What all points of a scan have in common and nobody knows exactly (EQUATIONS 6.1).
 
-    `estimate` and `covariance` are in the parameters' own units, given by `units`.
+    `estimate` and `covariance` are in the parameters' own units, given by `units`. `noise_variance` is what
+    each group of scan lines has of its own beyond the parameter of its place; nought but for the lean.
     """
 
     names: tuple[str, ...]
     units: tuple[str, ...]
     estimate: Floats  # (p,)
     covariance: Floats  # (p, p)
+    noise_variance: Floats  # (p,)
+
+    def __add__(self, other: Shared) -> Shared:
+        """Return what a sum or difference of two independent surfaces leaves unknown."""
+        return replace(
+            self,
+            covariance=self.covariance + other.covariance,
+            noise_variance=self.noise_variance + other.noise_variance,
+        )
+
+
+@dataclass(frozen=True)
+class Habits:
+    """How much a station's scans differ from what is assumed, one sigma each.
+
+    Start values: EQUATIONS 6.4; the tilt of a mount: ADJUSTMENT. A station learns its own.
+    """
+
+    tilt_rad: float = radians(0.008)
+    heading_rad: float = radians(0.0015)
+    translation_m: float = 0.003
+    range_bias_m: float = 0.004
+    range_scale_ppm: float = 0.8
+    refraction: float = 0.08
+    refraction_by_azimuth: float = 0.02
+    slow_motion_rad: float = radians(0.0018)
+    fast_motion_rad: float = radians(0.0010)
+    line_motion_rad: float = radians(0.0008)
 
 
 @dataclass(frozen=True)
@@ -192,3 +223,25 @@ class Reference:
     roughness_m2: Floats32  # (ny, nx) variance of the terrain about the surface within each cell
     shared: Shared | None  # None: given from outside, its shared errors unknown
     scan_ids: tuple[str, ...]
+    intensity: Floats32  # (ny, nx) mean brightness, 0-1; NaN where unknown
+    variance_factor: Floats32  # (ny, nx) of the cells' random variance as scans show it, against the modelled
+    stable: Bools  # (ny, nx) found steep and without change
+    habits: Habits  # of the station, as its scans show them
+
+    @classmethod
+    def given(cls, grid: Grid, version: str, elevation_m: Floats, stable: Bools | None = None) -> Reference:
+        """Return a surface that comes from outside: exact as far as anybody knows."""
+        exact = np.where(np.isfinite(elevation_m), 0.0, np.nan).astype(np.float32)
+        return cls(
+            grid=grid,
+            version=version,
+            elevation_m=elevation_m,
+            random_variance_m2=exact,
+            roughness_m2=exact,
+            shared=None,
+            scan_ids=(),
+            intensity=np.full(grid.shape, np.nan, np.float32),
+            variance_factor=np.ones(grid.shape, np.float32),
+            stable=np.zeros(grid.shape, bool) if stable is None else stable,
+            habits=Habits(),
+        )

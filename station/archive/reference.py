@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from dataclasses import asdict, fields
 from typing import Any
 
 import netCDF4
@@ -11,8 +12,9 @@ import numpy as np
 from station.archive.layout import Series, attributes, lay_out, put_raster, written_whole
 from station.archive.variables import FILL, Variable
 from station.errors import StoreError
-from station.quantities import Floats32, Reference, Shared
+from station.quantities import Floats32, Habits, Reference, Shared
 
+HABIT = "habit_"  # of the station, one sigma each, attributes of the file
 _ROWS = (
     Variable(
         "reference_elevation", ("y", "x"), "f4", "elevation of the reference surface at the cell centre", "m",
@@ -30,6 +32,27 @@ _ROWS = (
         "m",
         None,
         4,
+    ),
+    Variable(
+        "reference_variance_factor",
+        ("y", "x"),
+        "f4",
+        "random variance of a cell from scan to scan against the modelled",
+        "1",
+        None,
+        3,
+    ),
+    Variable(
+        "reference_intensity", ("y", "x"), "f4", "mean brightness of the cell's echoes, 0 to 1", "1", None, 4
+    ),
+    Variable(
+        "reference_stable", ("y", "x"), "i1", "ground found stable: steep and without change", None, None,
+        flag_values=(0, 1), flag_meanings="other stable",
+    ),
+    Variable(
+        "shared_parameter_noise_variance", ("parameter",), "f8",
+        "variance of the lean of each group of scan lines beyond the parameter",
+        comment="units are squares of parameter_unit",
     ),
     Variable(
         "shared_parameter_covariance", ("parameter", "parameter_2"), "f8",
@@ -50,23 +73,28 @@ def write_reference(series: Series, reference: Reference) -> None:
         parameters = (shared.names, shared.units) if shared is not None else ((), ())
         lay_out(file, series, f"Reference surface of {series.name or series.station_id}", None, parameters)
         file.setncatts({"reference_version": reference.version, "scan_ids": " ".join(reference.scan_ids)})
+        file.setncatts({f"{HABIT}{name}": value for name, value in asdict(reference.habits).items()})
         values = {
             "reference_elevation": reference.elevation_m,
             "reference_random_uncertainty": np.sqrt(reference.random_variance_m2),
             "reference_roughness": np.sqrt(reference.roughness_m2),
+            "reference_variance_factor": reference.variance_factor,
+            "reference_intensity": reference.intensity,
+            "reference_stable": reference.stable.astype(np.int8),
         }
         for row in _ROWS:
             if any(dim not in file.dimensions for dim in row.dims):
                 continue
             variable = file.createVariable(
                 row.name, row.dtype, row.dims, compression="zlib", complevel=1, shuffle=True,
-                fill_value=FILL, least_significant_digit=row.digits,
+                fill_value=FILL if row.dtype[0] == "f" else None, least_significant_digit=row.digits,
             )  # fmt: skip
             variable.setncatts(attributes(row, mapped=series.crs is not None))
             if row.is_raster:
                 put_raster(variable, None, values[row.name])
             elif shared is not None:
-                variable[:] = shared.covariance
+                noise = row.name == "shared_parameter_noise_variance"
+                variable[:] = shared.noise_variance if noise else shared.covariance
     with written_whole(series.folder / "reference.nc") as beside:
         os.link(kept, beside)
 
@@ -99,7 +127,8 @@ def _read(file: netCDF4.Dataset, series: Series) -> Reference:
             for name in ("parameter_name", "parameter_unit")
         )
         covariance = np.asarray(file["shared_parameter_covariance"][:], dtype=np.float64)
-        shared = Shared(names, units, np.zeros(len(names)), covariance)
+        noise = np.asarray(file["shared_parameter_noise_variance"][:], dtype=np.float64)
+        shared = Shared(names, units, np.zeros(len(names)), covariance, noise)
     return Reference(
         grid=grid,
         version=str(file.reference_version),
@@ -108,6 +137,12 @@ def _read(file: netCDF4.Dataset, series: Series) -> Reference:
         roughness_m2=_squared(file["reference_roughness"]),
         shared=shared,
         scan_ids=tuple(str(file.scan_ids).split()),
+        intensity=np.asarray(file["reference_intensity"][:].filled(np.nan), dtype=np.float32),
+        variance_factor=np.asarray(file["reference_variance_factor"][:].filled(1.0), dtype=np.float32),
+        stable=np.asarray(file["reference_stable"][:]) == 1,
+        habits=Habits(
+            **{field.name: float(file.getncattr(f"{HABIT}{field.name}")) for field in fields(Habits)}
+        ),
     )
 
 

@@ -16,7 +16,7 @@ import xarray as xr
 from station.archive.layout import Series, define, lay_out, put_raster, strings, text, written_whole
 from station.archive.variables import BY_NAME, TERMS, VARIABLES, VERDICTS
 from station.errors import StoreError
-from station.quantities import Measurement, Shared
+from station.quantities import Grid, Measurement, Shared
 
 STAMP = "%Y%m%dT%H%M%SZ"
 JOINED = {"days": "%Y%m%d", "months": "%Y%m"}  # kinds of joined files, by how each names its time
@@ -188,16 +188,37 @@ def said(path: Path) -> dict[str, str]:
         raise StoreError(f"{path}: cannot be read: {error}") from error
 
 
+def folder_of(site_or_folder: str | Path) -> Path:
+    """Return the data folder of a site file, or the folder itself."""
+    place = Path(site_or_folder)
+    if place.is_file() and place.suffix == ".toml":
+        from station.config import read_site  # noqa: PLC0415 - a folder needs no pydantic
+
+        return read_site(place).station.data
+    return place
+
+
+def series_in(site_or_folder: str | Path) -> Series:
+    """Return the store that lies in a folder; raise StoreError where there is none yet."""
+    folder = folder_of(site_or_folder)
+    try:
+        with netCDF4.Dataset(folder / "series.nc") as file:
+            x_m, y_m = (np.asarray(file[axis][:], dtype=np.float64) for axis in "xy")
+            x_bounds, y_bounds = (file[f"{axis}_bnds"][0] for axis in "xy")
+            west_m, north_m = float(x_bounds.min()), float(y_bounds.max())
+            grid = Grid(west_m, north_m, float(np.ptp(x_bounds)), len(x_m), len(y_m))
+            crs = str(file["crs"].crs_wkt) if "crs" in file.variables else None
+            return Series(folder, str(file.station_id), grid, crs)
+    except (OSError, RuntimeError, KeyError, IndexError, AttributeError) as error:
+        raise StoreError(f"{folder}: no series to be read there (station status): {error}") from error
+
+
 def open_series(site_or_folder: str | Path) -> xr.Dataset:
     """Return the whole series of a site file or data folder, lazily.
 
     Raises StoreError where there is none, or where a file it points to is gone: that would read as missing.
     """
-    place = Path(site_or_folder)
-    if place.is_file() and place.suffix == ".toml":
-        from station.config import read_site  # noqa: PLC0415 - a folder needs no pydantic
-
-        place = read_site(place).station.data
+    place = folder_of(site_or_folder)
     path = place / "series.nc"
     if not path.is_file():
         raise StoreError(f"{path}: no series yet; has a scan been processed? (station status)")
@@ -232,6 +253,7 @@ def _write(file: netCDF4.Dataset, series: Series, epoch: Epoch, name: str) -> No
     if shared is not None:
         define(file, BY_NAME["shared_parameter"], series, 1)[0] = shared.estimate
         define(file, BY_NAME["shared_parameter_covariance"], series, 1)[0] = shared.covariance
+        define(file, BY_NAME["shared_parameter_noise_variance"], series, 1)[0] = shared.noise_variance
     _write_words(file, series, epoch, name)
 
 

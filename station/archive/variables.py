@@ -126,7 +126,16 @@ VARIABLES: tuple[Variable, ...] = (
         "f4",
         "covariance of what all points of the scan share",
         None,
-        comment="of the scan alone; units are products of parameter_unit",
+        comment="against the reference where adjustment is joint, else of the scan alone; units are products of"
+        " parameter_unit",
+    ),
+    Variable(
+        "shared_parameter_noise_variance",
+        ("time", "parameter"),
+        "f8",
+        "variance of the lean of each group of scan lines beyond the parameter",
+        None,
+        comment="independent from group to group, of 0.2 degree each; units are squares of parameter_unit",
     ),
     Variable("scan_id", TEXT, "S1", "name of the scan"),
     Variable(
@@ -156,12 +165,33 @@ VARIABLES: tuple[Variable, ...] = (
     ),
     Variable("point_total", ("time",), "f8", "number of points in the scan", "1"),
     Variable("coverage", ("time",), "f8", "share of the grid's cells with points", "1"),
-    Variable("stable_nmad", ("time",), "f8", "robust standard deviation of the change on stable ground", "m"),
+    Variable("stable_count", ("time",), "f8", "number of cells of stable ground withheld from the fit", "1"),
+    Variable("stable_median", ("time",), "f8", "median change on withheld stable ground", "m"),
     Variable(
-        "stable_z_std", ("time",), "f8", "standard deviation of change over its sigma on stable ground", "1"
+        "stable_nmad",
+        ("time",),
+        "f8",
+        "robust standard deviation of the change on withheld stable ground",
+        "m",
     ),
+    Variable(
+        "stable_z_std",
+        ("time",),
+        "f8",
+        "robust standard deviation of change over its sigma on withheld stable ground",
+        "1",
+    ),
+    Variable(
+        "change_step", ("time",), "f8", "change of the moving ground that the adjustment allowed for", "m"
+    ),
+    Variable("scanner_east", ("time",), "f8", "easting of the scanner", "m"),
+    Variable("scanner_north", ("time",), "f8", "northing of the scanner", "m"),
+    Variable("scanner_height", ("time",), "f8", "height of the scanner", "m"),
+    Variable("scanner_axis_east", ("time",), "f8", "east component of the axis the head turns about", "1"),
+    Variable("scanner_axis_north", ("time",), "f8", "north component of the axis the head turns about", "1"),
     Variable("scan_sha256", TEXT, "S1", "SHA-256 of the scan file"),
     Variable("log_sha256", TEXT, "S1", "SHA-256 of the inclination log"),
+    Variable("adjustment", TEXT, "S1", "how the pose was found: joint, or none (filtered log only)"),
     Variable("sop_id", TEXT, "S1", "scanner orientation and position used"),
     Variable("lean_zero", ("time", "sentence"), "S1", "lean that the SOP holds, as a wave over one turn"),
     Variable("science_hash", TEXT, "S1", "identifier of the settings that change numbers"),

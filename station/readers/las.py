@@ -23,11 +23,14 @@ from station.quantities import Floats, HeadTrack, Shots
 from station.readers.las_layout import Layout, read_layout
 from station.readers.scan import WEEK_S, ScanHeader, foreign_code
 
-NEEDED = DecompressionSelection.base().decompress_z().decompress_gps_time()  # heeded in formats 6 and up
+NEEDED = (  # heeded in formats 6 and up
+    DecompressionSelection.base().decompress_z().decompress_gps_time().decompress_intensity()
+)
 BLOCKS_AT_ONCE = 4  # decoded together, a chunk a core; conversion still goes block by block, in the cache
 LONGEST_SCAN_S = 86_400.0
 GLANCE = 16  # points looked at in one place
 SKIP = 50_000  # points decoded at a time only to pass them
+BRIGHTEST = 1 / 65535  # intensity is of 16 bits: LAS 1.4 R15, table 7
 FEW_CHUNKS = 20  # with fewer, chunk starts are too far apart to follow the head
 
 Records = NDArray[np.void]
@@ -218,7 +221,8 @@ class _Check:
                     f"an echo {farthest_m:,.0f} m away, beyond scanner.range_max_m = {self._range_max_m:g}:"
                     " corrupt, or another unit, frame or scanner than the site file says"
                 )
-        return Shots(x_m, y_m, z_m, self._times(records) if timed else None)
+        brightness = records["intensity"] * BRIGHTEST
+        return Shots(x_m, y_m, z_m, self._times(records) if timed else None, brightness)
 
     def _coordinate(self, records: Records, axis: int) -> Floats:
         values = records["XYZ"[axis]] * self._layout.scale[axis]

@@ -62,8 +62,8 @@ class Layout:
 
     @property
     def record(self) -> np.dtype[np.void]:
-        """Where in a point its whole numbers X, Y, Z and its gps_time stand."""
-        names, kinds, places = ["X", "Y", "Z"], ["<i4"] * 3, [0, 4, 8]
+        """Where in a point its whole numbers X, Y, Z, its intensity and its gps_time stand."""
+        names, kinds, places = ["X", "Y", "Z", "intensity"], ["<i4"] * 3 + ["<u2"], [0, 4, 8, 12]
         if self.has_time:
             names, kinds = [*names, "gps_time"], [*kinds, "<f8"]
             places = [*places, 22 if self.point_format >= 6 else 20]

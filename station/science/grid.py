@@ -15,6 +15,8 @@ if TYPE_CHECKING:
 # Sums are of multiples of 2^-20 m (and m²), so that adding float64 is exact up to 2^33 and the order in
 # which points come cannot matter.
 QUANTUM = 2.0**20
+STEP_MOST = 4.0  # sigmas: beyond, something happened
+CLASS_STEPS = 10.0  # what the class of a cell weighs against the steps from scan to scan of its own
 ROUGHNESS_CELLS = 1.0  # one sigma of the neighbourhood that tells how rough a cell is
 
 
@@ -35,6 +37,7 @@ class Gridder:
         self._residual = np.zeros(cells)
         self._square = np.zeros(cells)
         self._variance = np.zeros(cells)
+        self._brightness = np.zeros(cells)
 
     def cells(self, x_m: Floats, y_m: Floats) -> tuple[Bools, Floats, Floats]:
         """Tell which points (n,) lie on the grid, and the column and row of those, in fractions of cells.
@@ -56,13 +59,15 @@ class Gridder:
             return np.zeros(len(cell), bool)
         return np.asarray(self.ground.known.ravel()[cell])
 
-    def add(self, cell: Ints, residual_m: Floats, variance_m2: Floats) -> None:
-        """Add points (n,): their cell, height above reference or datum, and random variance."""
+    def add(self, cell: Ints, residual_m: Floats, variance_m2: Floats, intensity: Floats | None) -> None:
+        """Add points (n,): their cell, height above reference or datum, random variance and brightness."""
         residual_m = np.rint(residual_m * QUANTUM) / QUANTUM
         np.add.at(self.count, cell, 1)
         np.add.at(self._residual, cell, residual_m)
         np.add.at(self._square, cell, np.rint(residual_m**2 * QUANTUM) / QUANTUM)
         np.add.at(self._variance, cell, np.rint(variance_m2 * QUANTUM) / QUANTUM)
+        if intensity is not None:
+            np.add.at(self._brightness, cell, np.rint(intensity * QUANTUM) / QUANTUM)
 
     def mean_residual(self) -> Floats:
         """Mean height above reference or datum (ny, nx) [m], NaN in empty cells.
@@ -72,6 +77,12 @@ class Gridder:
         mean_m = np.full(len(self.count), np.nan)
         np.divide(self._residual, self.count, out=mean_m, where=self.count > 0)
         return mean_m.reshape(self.grid.shape)
+
+    def intensity(self) -> Floats32:
+        """Mean brightness of each cell (ny, nx), 0-1, NaN in empty cells and in scans that do not tell."""
+        bright = np.full(len(self.count), np.nan, np.float32)
+        np.divide(self._brightness, self.count, out=bright, where=self._brightness > 0)
+        return bright.reshape(self.grid.shape)
 
     def spread(self) -> Floats32:
         """Standard deviation of the points in each cell (ny, nx) [m], NaN for fewer than two."""
@@ -99,17 +110,64 @@ class Stack:
     def __init__(self, grid: Grid) -> None:
         self.grid = grid
         self.count = np.zeros(grid.shape)
-        self._residual, self._variance, self._within, self._freedom = (np.zeros(grid.shape) for _ in range(4))
+        self._residual, self._variance, self._within, self._freedom, self._bright, self._lit = (
+            np.zeros(grid.shape) for _ in range(6)
+        )
+        self._steps, self._pairs = (np.zeros(grid.shape, np.float32) for _ in range(2))
+        self._last: tuple[Floats, Floats] | None = None
 
-    def add(self, gridder: Gridder) -> None:
-        """Add a scan."""
+    def add(
+        self, gridder: Gridder, correction_m: Floats32 | None = None, roughness_m2: Floats32 | None = None
+    ) -> None:
+        """Add a scan, its heights lowered by the correction (ny, nx).
+
+        `roughness_m2` of the reference it lies on, if any: then scans are also compared with each other.
+        """
         count = gridder.count.reshape(self.grid.shape).astype(np.float64)
         seen = count > 0
         self.count += count
-        self._residual[seen] += gridder.mean_residual()[seen] * count[seen]
+        mean_m = gridder.mean_residual()
+        if correction_m is not None:
+            mean_m -= correction_m
+        self._residual[seen] += mean_m[seen] * count[seen]
+        bright = gridder.intensity()
+        self._bright += np.nan_to_num(bright) * count
+        self._lit += np.where(np.isfinite(bright), count, 0)
+        if roughness_m2 is not None:
+            self._compare(mean_m, gridder.random_variance() + roughness_m2 / np.maximum(count, 1))
         self._variance[seen] += gridder.random_variance()[seen] * count[seen] ** 2
         self._within += np.nan_to_num(gridder.spread()).astype(np.float64) ** 2 * np.maximum(count - 1, 0)
         self._freedom += np.maximum(count - 1, 0)
+
+    def _compare(self, mean_m: Floats, variance_m2: Floats) -> None:
+        """Take the step from the scan before, in units of what it should be."""
+        if self._last is not None:
+            before_m, before_m2 = self._last
+            steps = (mean_m - before_m) ** 2 / (variance_m2 + before_m2)
+            there = np.isfinite(steps)
+            self._steps[there] += np.minimum(steps[there], STEP_MOST**2)
+            self._pairs[there] += 1
+        self._last = mean_m, variance_m2
+
+    def intensity(self) -> Floats32:
+        """Mean brightness of each cell (ny, nx), 0-1, NaN where unknown."""
+        bright = np.full(self.grid.shape, np.nan, np.float32)
+        np.divide(self._bright, self._lit, out=bright, where=self._lit > 0, casting="same_kind")
+        return bright
+
+    def variance_factor(self, classes: Ints) -> Floats32:
+        """Random variance that cells show from scan to scan against the modelled (ny, nx), drawn to its class.
+
+        `classes` (ny, nx) counts from nought. A cell's own few steps weigh as many against
+        `CLASS_STEPS` of its class. One where there is nothing to tell.
+        """
+        number = int(classes.max()) + 1
+        of_class = np.bincount(classes.ravel(), self._steps.ravel(), number)
+        pairs = np.bincount(classes.ravel(), self._pairs.ravel(), number)
+        ratio = (of_class + CLASS_STEPS) / (pairs + CLASS_STEPS)
+        return np.asarray(
+            (self._steps + CLASS_STEPS * ratio[classes]) / (self._pairs + CLASS_STEPS), dtype=np.float32
+        )
 
     def mean_residual(self) -> Floats:
         """Mean height of all points above reference or datum (ny, nx) [m], NaN in empty cells."""

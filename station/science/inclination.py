@@ -168,11 +168,12 @@ def window_length(values: Floats, rate_hz: float, cutoff_hz: float | None) -> in
 class Lean:
     """What the log says of a scan: the tilt to apply and how well it is known.
 
-    `noise_rad` is of one raw sample, `filtered_noise_rad` of the filtered signal, whose errors are common
+    `raw` is the same before the filter. `noise_rad` is of one raw sample, `filtered_noise_rad` of the filtered signal, whose errors are common
     to everything measured within `memory_s`. `gap_s` is the longest stretch without a sample.
     """
 
     tilt: Tilt
+    raw: Tilt
     mean_roll_rad: float
     mean_pitch_rad: float
     noise_rad: float
@@ -228,6 +229,7 @@ def relative_lean(
         noise_rad = float(np.sqrt(np.mean([np.var(roll - smooth_roll), np.var(pitch - smooth_pitch)])))
     return Lean(
         tilt=Tilt(even_s, smooth_roll, smooth_pitch),
+        raw=Tilt(even_s, roll, pitch),
         mean_roll_rad=float(log.roll_rad.mean()),
         mean_pitch_rad=float(log.pitch_rad.mean()),
         noise_rad=noise_rad,

@@ -14,13 +14,13 @@ from pyproj import CRS, Transformer
 from station.archive.layout import written_whole
 from station.config import Origin, Site, SopSection
 from station.errors import ConfigError, NotReadyError, ScanError
-from station.pipeline import Pose, Setup
-from station.quantities import Air, HeadTrack, InclinationLog, Shared
+from station.pipeline import Pose, Setup, Told
+from station.quantities import Air, Habits, HeadTrack, InclinationLog, Shared
 from station.readers.inclination import read_inclination
 from station.readers.scan import ScanReader, open_scan
 from station.readers.sop import read_matrix, sop_for
 from station.readers.weather import air_at, read_weather
-from station.science import inclination, pose, shared
+from station.science import inclination, pose, prior, shared
 from station.science.air import air_correction, standard_air
 from station.science.inclination import LEVEL, Cycle, Lean
 
@@ -35,6 +35,7 @@ class Gathered:
     setup: Setup
     pose: Pose
     unknown: Shared | None
+    told: Told | None
     lean: Lean | None
     air: Air | None
     lacking: tuple[str, ...]
@@ -58,13 +59,15 @@ def gather(
     """
     if site.scans.frame == "map":
         position_m = _map_position(site)
-        setup, unknown = setup_of(site, position_m), None
+        setup, unknown, told = setup_of(site, position_m), None, None
         if position_m is not None:  # registered by others: how well, nobody tells
             of = shared.basis(setup.grid, position_m)
-            unknown = shared.covariance_without_adjustment(
-                of, None, LEVEL, of.azimuth_rad, shared.HEAD_SPEED_RAD_S, weather_known=False
+            lines = prior.lines_of(of, np.eye(3), None)
+            told = Told(of, lines, np.zeros((3, of.line_count)), None, weather_known=False)
+            unknown = prior.covariance_without_adjustment(
+                of, lines, None, LEVEL, Habits(), weather_known=False
             )
-        return Gathered(setup, Pose(None, None, None), unknown, None, None, (), {})
+        return Gathered(setup, Pose(None, None, None), unknown, told, None, None, (), {})
     sop = sop_for(site.sop, start)
     frame, sop_id = frame_of(site, sop), sop_identity(sop)
     lacking: list[str] = []
@@ -79,14 +82,21 @@ def gather(
             _keep_zero(site, sop_id, zero)
     lean = _lean(site, log, track, zero, lacking)
     air, weather_known = _air(site, start + (end - start) / 2, frame.position_m[2], lacking)
-    setup = setup_of(site, frame.position_m)
+    rotation = frame.to_local[:3, :3]
+    axis = (float(rotation[0, 2]), float(rotation[1, 2]), float(rotation[2, 2]))
+    setup = setup_of(site, frame.position_m, axis)
     if wait_for_weather and site.weather is not None and not weather_known:
         raise NotReadyError(lacking[-1])
-    of = shared.basis(setup.grid, frame.position_m)
-    speed_rad_s = shared.HEAD_SPEED_RAD_S if track is None else inclination.head_speed(track)
-    unknown = shared.covariance_without_adjustment(
-        of, lean, zero or LEVEL, _in_scanner(of, frame), speed_rad_s, weather_known=weather_known
+    of = shared.basis(setup.grid, frame.position_m, axis)
+    lines = prior.lines_of(of, rotation, track)
+    unknown = prior.covariance_without_adjustment(
+        of, lines, lean, zero or LEVEL, Habits(), weather_known=weather_known
     )
+    assumed_rad, line_log = np.zeros((3, of.line_count)), None
+    if lean is not None:
+        assumed_rad = prior.turn_of(lean.tilt, rotation, lines.time_s)
+        if track is not None:
+            line_log = prior.line_log(of, lines, lean, zero or LEVEL, rotation)
     correction = None
     if site.air is not None:
         setting = site.air.scanner_setting
@@ -100,6 +110,7 @@ def gather(
         setup,
         Pose(frame, tilt, correction),
         unknown,
+        Told(of, lines, assumed_rad, line_log, weather_known=weather_known),
         lean,
         air if weather_known else None,
         tuple(lacking),
@@ -107,12 +118,17 @@ def gather(
     )
 
 
-def setup_of(site: Site, position_m: tuple[float, float, float] | None) -> Setup:
+def setup_of(
+    site: Site,
+    position_m: tuple[float, float, float] | None,
+    axis: tuple[float, float, float] = shared.UPRIGHT,
+) -> Setup:
     """Return what stays the same from scan to scan."""
     return Setup(
         scanner=site.instrument,
         grid=site.grid_cells,
         position_m=position_m,
+        axis=axis,
         min_points=site.grid.min_points,
         published_budget=site.uncertainty.model == "voordendag2023",
         registration_sigma_m=site.uncertainty.registration_sigma_m,
@@ -167,13 +183,6 @@ def _map_position(site: Site) -> tuple[float, float, float] | None:
     latitude, longitude, height_m = _degrees(site.map.origin)
     east_m, north_m, up_m = to_map.transform(longitude, latitude, height_m)
     return float(east_m), float(north_m), float(up_m)
-
-
-def _in_scanner(of: shared.Basis, frame: pose.Frame) -> np.ndarray[tuple[int], np.dtype[np.float64]]:
-    """Azimuth of the knots in the scanner's own frame [rad]."""
-    outward = np.stack([np.sin(of.azimuth_rad), np.cos(of.azimuth_rad), np.zeros(of.count)])
-    x, y, _ = frame.to_local[:3, :3].T @ outward
-    return np.asarray(np.arctan2(y, x))
 
 
 def _log(site: Site, path: Path | None, track: HeadTrack | None, lacking: list[str]) -> InclinationLog | None:

@@ -20,16 +20,31 @@ import numpy as np
 
 from station import __version__
 from station.archive import join, store
+from station.archive.aggregate import Aggregates
+from station.archive.areas import update_areas
 from station.archive.layout import Series
 from station.archive.reference import read_reference, write_reference
 from station.archive.series import build_series
 from station.config import Site
 from station.errors import NotReadyError, ScanError
-from station.pipeline import gridder_for, master, measure, survey
-from station.quantities import Measurement, Quality, Reference, Shared
+from station.pipeline import (
+    Told,
+    corrections,
+    gridder_for,
+    level,
+    master,
+    measure,
+    stable_figures,
+    survey,
+)
+from station.quantities import Bools, Habits, Measurement, Quality, Reference
+from station.readers.polygons import mask, read_polygons
 from station.readers.raster import read_geotiff
 from station.readers.scan import ScanReader, open_scan, utc_interval
-from station.science.grid import Stack
+from station.science import ground
+from station.science.adjustment import Adjustment, distrust
+from station.science.grid import Gridder, Stack
+from station.science.prior import learned
 from station.science.terrain import nodes_for
 from station.service.gather import Gathered, gather
 from station.service.inbox import Arrival
@@ -142,26 +157,54 @@ def _measure(
         survey(gridder, reader.blocks(), gathered.setup, gathered.pose, progress)
     if not gridder.count.any():
         raise ScanError("no point falls on the grid: wrong scans.frame, SOP, CRS or units?")
-    measured = measure(gridder, gathered.setup, gathered.unknown, reference)
+    progress()
+    levelled = _level(site, gridder, gathered, reference)
+    unknown, lacking = gathered.unknown, list(gathered.lacking)
+    if levelled is not None:
+        lacking += distrust(levelled[1], reference.habits) if reference else []
+        unknown = levelled[1].shared()
+    measured = measure(gridder, gathered.setup, unknown, reference, levelled)
     progress()
     return store.Epoch(
         start_s=start.timestamp(),
         end_s=end.timestamp(),
         scan_id=arrival.path.stem,
         measurement=measured,
-        shared=gathered.unknown,
-        verdict="degraded" if gathered.lacking else "good",
-        verdict_reason="; ".join(gathered.lacking),
-        numbers=_numbers(measured, gathered, reader.header.point_count),
+        shared=unknown,
+        verdict="degraded" if lacking else "good",
+        verdict_reason="; ".join(lacking),
+        numbers=_numbers(measured, gathered, reader.header.point_count, levelled),
         provenance={
             "scan_sha256": scan_sha256,
             "log_sha256": _sha256(arrival.log) if arrival.log else "",
             "science_hash": site.science_hash,
             "reference_version": reference.version if reference else "",
+            "adjustment": "joint" if levelled else "none",
             "software_version": __version__,
             **gathered.provenance,
         },
     )
+
+
+def _level(
+    site: Site, gridder: Gridder, gathered: Gathered, reference: Reference | None
+) -> tuple[Told, Adjustment, Bools] | None:
+    """Adjust a scan to the reference, where the site asks for it and there is one to adjust to."""
+    if site.adjustment.method == "none" or gathered.told is None or reference is None:
+        return None
+    stable = stable_ground(site, reference)
+    return gathered.told, level(gridder, gathered.setup, gathered.told, reference, stable), stable
+
+
+def stable_ground(site: Site, reference: Reference) -> Bools:
+    """Return which cells (ny, nx) are stable: those inside the owner's polygons, or those found."""
+    given = site.adjustment.stable
+    if given == "auto":
+        return reference.stable
+    stable = np.zeros(site.grid_cells.shape, bool)
+    for polygon in read_polygons(given, site.map.crs).values():
+        stable |= mask(polygon, site.grid_cells)
+    return stable
 
 
 def _same_as(series: Series, epoch: store.Epoch) -> store.Stored | None:
@@ -178,9 +221,10 @@ def _same_as(series: Series, epoch: store.Epoch) -> store.Stored | None:
 
 
 def build_reference(site: Site, arrivals: list[Arrival], version: str, progress: Progress) -> str:
-    """Make the master surface from scans and store it; return its version.
+    """Make the master surface from scans, adjusted together, and store it; return its version.
 
-    Thrice over the scans: their plain means, then twice their residuals to what there is.
+    Thrice over the scans: their plain means, then twice their residuals to what there is, each scan adjusted
+    to it. What the scans show of the station's habits is learned on the way.
     """
     series = series_of(site)
     scan_ids = tuple(arrival.path.stem for arrival in arrivals)
@@ -188,7 +232,13 @@ def build_reference(site: Site, arrivals: list[Arrival], version: str, progress:
     for _ in range(REFERENCE_PASSES):
         stack = Stack(series.grid)
         laid = [_lay_on(stack, site, arrival, surface, progress) for arrival in arrivals]
-        surface = master(stack, surface, [unknown for unknown, _ in laid], laid[0][1], version, scan_ids)
+        gathered = laid[0][0]
+        habits = surface.habits if surface else Habits()
+        if gathered.told is not None:
+            found = [(g.told.lines, f.estimate, f.covariance) for g, f in laid if g.told and f]
+            habits = learned(habits, gathered.told.of, found)
+        unknown = [one.unknown for one, _ in laid]
+        surface = master(stack, surface, unknown, gathered.setup, version, scan_ids, habits)
     if surface is not None:
         write_reference(series, surface)
     return version
@@ -196,15 +246,20 @@ def build_reference(site: Site, arrivals: list[Arrival], version: str, progress:
 
 def _lay_on(
     stack: Stack, site: Site, arrival: Arrival, surface: Reference | None, progress: Progress
-) -> tuple[Shared | None, float]:
-    """Add a scan to a stack; return what its points share and its datum [m]. Its own grid goes at once."""
+) -> tuple[Gathered, Adjustment | None]:
+    """Add a scan to a stack, adjusted to the surface there is. Its own grid goes at once."""
     with _opened(site, arrival.path) as reader:
         start, end, _ = utc_interval(reader, site.scans.name)
         gathered = gather(site, reader, arrival.log, start, end)
         gridder = gridder_for(gathered.setup, surface)
         survey(gridder, reader.blocks(), gathered.setup, gathered.pose, progress)
-    stack.add(gridder)
-    return gathered.unknown, gridder.datum_m
+    levelled = _level(site, gridder, gathered, surface)
+    correction_m = None
+    if levelled is not None and surface is not None:
+        correction_m = corrections(gridder, gathered.setup, levelled[0], surface, levelled[1])
+    stack.add(gridder, correction_m, surface.roughness_m2 if surface else None)
+    progress()
+    return gathered, levelled[1] if levelled else None
 
 
 def reference_of(site: Site) -> Reference | None:
@@ -217,19 +272,31 @@ def reference_of(site: Site) -> Reference | None:
     version = f"{given.stem}-{_sha256(given)[:8]}"
     if held is None or held.version != version:
         elevation_m = nodes_for(read_geotiff(given, series.grid, series.crs))
-        exact = np.where(np.isfinite(elevation_m), 0.0, np.nan).astype(np.float32)
-        write_reference(series, Reference(series.grid, version, elevation_m, exact, exact, None, ()))
+        steep = ground.steep(elevation_m, series.grid.cell_m)
+        write_reference(series, Reference.given(series.grid, version, elevation_m, steep))
         held = read_reference(series)
     return held
 
 
 def publish(site: Site, progress: Progress) -> None:
-    """Build `series.nc` anew over the epochs that exist; join them first where they are too many files."""
+    """Build `series.nc` anew over the epochs that exist, and `areas.nc` after it.
+
+    Epochs are joined first where they are too many files.
+    """
     series = series_of(site)
     if len(store.sources(series.path)) > MOST_SOURCES:
         join.join_closed(series, datetime.now(UTC), progress)
     build_series(series)
     progress()
+    update_areas(series, areas_of(site), Aggregates(series), progress)
+
+
+def areas_of(site: Site) -> dict[str, Bools]:
+    """Return the cells (ny, nx) of the areas that the site names."""
+    if site.areas is None:
+        return {}
+    found = read_polygons(site.areas.file, site.map.crs)
+    return {name: mask(polygon, site.grid_cells) for name, polygon in found.items()}
 
 
 def join_epochs(site: Site, progress: Progress) -> int:
@@ -280,13 +347,20 @@ def _sha256(path: Path) -> str:
         raise NotReadyError(f"{path.name} cannot be read: {error.strerror}") from error
 
 
-def _numbers(measured: Measurement, gathered: Gathered, points: int) -> dict[str, float]:
+def _numbers(
+    measured: Measurement, gathered: Gathered, points: int, levelled: tuple[Told, Adjustment, Bools] | None
+) -> dict[str, float]:
     """Return what the store keeps once per scan."""
-    lean, air = gathered.lean, gathered.air
+    lean, air, setup = gathered.lean, gathered.air, gathered.setup
     told = {
         "point_total": float(points),
         "coverage": float(np.mean(measured.surface.count > 0)),
     }
+    if setup.position_m is not None:
+        told |= dict(zip(("scanner_east", "scanner_north", "scanner_height"), setup.position_m, strict=True))
+        told |= {"scanner_axis_east": setup.axis[0], "scanner_axis_north": setup.axis[1]}
+    if levelled is not None:
+        told |= stable_figures(measured) | {"change_step": levelled[1].change_step_m}
     if lean is not None:
         told["platform_roll"] = math.degrees(lean.mean_roll_rad)
         told["platform_pitch"] = math.degrees(lean.mean_pitch_rad)
@@ -311,5 +385,8 @@ def _figures(epoch: store.Epoch, seconds: float) -> dict[str, float | str]:
         told["change_median_m"] = round(float(np.median(change_m)), 4)
         significant = (measured.quality & Quality.CHANGE_SIGNIFICANT) > 0
         told["significant_pct"] = round(100 * float(significant.sum()) / len(change_m), 1)
+    for figure in ("stable_nmad", "stable_z_std"):
+        if np.isfinite(epoch.numbers.get(figure, np.nan)):
+            told[figure] = round(epoch.numbers[figure], 3)
     told["seconds"] = round(seconds, 2)
     return told

@@ -1,0 +1,275 @@
+"""The joint estimate of one scan: pose, lean line by line, refraction and ranges, with their covariance.
+
+Stable ground, the inclination log, the weather and what is known beforehand are observations of the same
+unknowns. So is the ground that moves, as far as its change since the reference is smooth: how much it changed
+is chosen by what makes the scan most likely, a millimetre on a calm day, decimetres after snowfall.
+Source: EQUATIONS 6.3, ADJUSTMENT.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import linalg, sparse
+
+from station.quantities import Bools, Floats, Habits, Shared
+from station.science.patches import CHI2_MEDIAN, Kind, Patches
+from station.science.shared import GLOBAL, Basis, Sensitivities, by_knots, lines_from_knots
+
+ROUNDS = 4
+MOST_REFUSED = 0.3  # of the stable ground, before an adjustment is doubted
+MOVED_SIGMAS = 4.0  # of what the station does from scan to scan
+TUKEY = 4.685  # 95 % efficient for normal errors
+SCATTER_M = (0.002, 0.005)  # least and most that stable patches differ by beyond their cells' random errors
+SCATTER_MOST_M = 1.0  # the same of moving ones
+TOGETHER_MOST = 40.0  # patches of moving ground that are wrong as one
+CHANGE_AZIMUTH_KNOTS = 4  # knots of the lean, between knots of the change
+CHANGE_STRETCHES = 3  # of range, between knots of the change
+CHANGE_STEPS_M = tuple(float(step) for step in np.geomspace(0.001, 0.5, 10))
+UNIFORM_CHANGE = 3.0  # one sigma of what all the moving ground changes by, in steps of a knot's
+
+
+@dataclass(frozen=True)
+class LineLog:
+    """What the inclination log says of each group of lines, and what it may get wrong."""
+
+    lean_rad: Floats  # (lines,) along the line of sight
+    weight: Floats  # (lines,) 1 / rad², nought where there is none
+    faults: Floats  # (lines, f) effect of one sigma of each of its common errors [rad]
+
+
+@dataclass(frozen=True)
+class Adjustment:
+    """The scanner's state against the SOP: nine globals, the lean of each group of lines, refraction.
+
+    `change_step_m` is one sigma of the change between its knots that the moving ground shows;
+    `stable_weight` (patches,) how far each stable patch was trusted.
+    """
+
+    of: Basis
+    estimate: Floats  # (u,)
+    covariance: Floats  # (u, u)
+    change_step_m: float
+    stable_weight: Floats
+
+    def effect(self, felt: Sensitivities) -> Floats:
+        """Effect of the estimated state on heights (n,) [m], to be taken off."""
+        first, last = len(GLOBAL), len(GLOBAL) + self.of.line_count
+        before, after, share = felt.refraction_knot()
+        bend = self.estimate[last:]
+        return np.asarray(
+            self.estimate[:first] @ felt.globals_
+            + self.estimate[first:last][felt.line] * felt.lean
+            + (bend[before] * (1 - share) + bend[after] * share) * felt.refraction
+        )
+
+    def shared(self) -> Shared:
+        """The same by knots, for the store."""
+        return by_knots(self.of, self.estimate, self.covariance)
+
+
+def distrust(found: Adjustment, habits: Habits) -> list[str]:
+    """Say what speaks against an adjustment: nothing stable to hold on to, or more motion than a station's."""
+    reasons = []
+    if not len(found.stable_weight):
+        reasons.append("no stable ground seen")
+    elif np.mean(found.stable_weight < 0.1) > MOST_REFUSED:
+        refused = np.mean(found.stable_weight < 0.1)
+        reasons.append(f"stable ground disagrees with itself: {refused:.0%} of it left out")
+    tilt_rad = float(np.hypot(*found.estimate[:2]))
+    if tilt_rad > MOVED_SIGMAS * habits.tilt_rad:
+        reasons.append(f"scanner leans {np.degrees(tilt_rad):.3f} degree from its SOP: moved?")
+    for name, place, habit, unit in (
+        ("turned", slice(2, 3), habits.heading_rad, "rad"),
+        ("shifted", slice(3, 6), habits.translation_m, "m"),
+    ):
+        size = float(np.linalg.norm(found.estimate[place]))
+        if size > MOVED_SIGMAS * habit:
+            reasons.append(f"scanner {name} by {size:.2g} {unit} against its SOP: moved?")
+    return reasons
+
+
+def turned(felt: Sensitivities, assumed_rad: Floats) -> Floats:
+    """Effect on heights (n,) [m] of lines turned about east, north and up by (3, lines)."""
+    east, north, up = assumed_rad[:, felt.line]
+    return np.asarray(felt.globals_[0] * east + felt.globals_[1] * north - felt.globals_[2] * up)
+
+
+def prior_of_difference(of: Basis, prior: Floats, reference: Shared | None) -> Floats:
+    """Covariance of a scan's state against that of the reference, which is wrong itself."""
+    if reference is None:
+        return prior
+    return prior + lines_from_knots(of, reference.covariance)
+
+
+def adjust(patches: Patches, assumed_rad: Floats, prior: Floats, log: LineLog | None) -> Adjustment:
+    """Estimate the scanner's state from patches, the log and a prior covariance (u, u).
+
+    `assumed_rad` (3, lines) is the lean that the points were already turned by, about east, north and up.
+    Withheld patches are left out.
+    """
+    of = patches.felt.of
+    patches = patches.some(patches.kind <= Kind.STABLE)
+    moving = patches.kind == Kind.MOVING
+    wanted_m = patches.residual_m + turned(patches.felt, assumed_rad)
+    field, correlation = _change_field(patches, moving)
+    aside = _Aside(of, prior, log)
+    columns = [_design(patches.felt), sparse.csr_array((len(patches), aside.faults)), field]
+    whole = sparse.csr_array(sparse.hstack(columns))
+    normal, right = (np.zeros((whole.shape[1],) * n) for n in (2, 1))
+    normal[: aside.size, : aside.size], right[: aside.size] = aside.normal, aside.right
+    scatter_m2 = np.full(len(patches), SCATTER_M[0] ** 2)
+    trust = np.ones(len(patches))
+    for _ in range(ROUNDS):
+        weight = trust / (patches.variance_m2 + scatter_m2)
+        sums = (whole.T @ sparse.csr_array(whole.multiply(weight[:, None]))).toarray()
+        solved = _solve(normal + sums, right + whole.T @ (weight * wanted_m), aside.size, correlation)
+        left_m = wanted_m - whole @ solved.estimate
+        scatter_m2 = _scatter(patches, left_m, moving)
+        ratio = left_m / np.sqrt(patches.variance_m2 + scatter_m2) / TUKEY
+        trust = np.where(np.abs(ratio) < 1, (1 - ratio**2) ** 2, 0.0)
+    states = slice(len(prior))
+    covariance = solved.covariance()[states, states]
+    return Adjustment(of, solved.estimate[states], covariance, solved.step_m, trust[~moving])
+
+
+class _Aside:
+    """What prior and log alone say: normal equations of the state and the log's own faults."""
+
+    def __init__(self, of: Basis, prior: Floats, log: LineLog | None) -> None:
+        self.faults = 0 if log is None else log.faults.shape[1]
+        state = len(prior)
+        self.size = state + self.faults
+        self.normal = np.eye(self.size)
+        self.normal[:state, :state] = linalg.inv(prior)
+        self.right = np.zeros(self.size)
+        if log is None:
+            return
+        felt = np.zeros((of.line_count, self.size))
+        azimuth_rad = of.line_azimuth_rad
+        felt[:, 0], felt[:, 1] = np.cos(azimuth_rad), -np.sin(azimuth_rad)
+        felt[:, len(GLOBAL) : len(GLOBAL) + of.line_count] = np.eye(of.line_count)
+        felt[:, state:] = log.faults
+        weighted = felt * log.weight[:, None]
+        self.normal += felt.T @ weighted
+        self.right = weighted.T @ log.lean_rad
+
+
+def _design(felt: Sensitivities) -> sparse.csr_array:
+    """Matrix J (n, u)."""
+    of, count = felt.of, len(felt)
+    before, after, share = felt.refraction_knot()
+    last = len(GLOBAL) + of.line_count
+    rows = np.tile(np.arange(count), len(GLOBAL) + 3)
+    columns = np.concatenate(
+        [np.repeat(np.arange(len(GLOBAL)), count), len(GLOBAL) + felt.line, last + before, last + after]
+    )
+    values = np.concatenate(
+        [felt.globals_.ravel(), felt.lean, felt.refraction * (1 - share), felt.refraction * share]
+    )
+    return sparse.csr_array((values, (rows, columns)), shape=(count, last + of.refraction_count))
+
+
+def _change_field(patches: Patches, moving: Bools) -> tuple[sparse.csr_array, Floats]:
+    """Smooth change of the moving ground: matrix (n, knots) and correlation (knots, knots).
+
+    Knots lie in azimuth and range, the change is bilinear between them.
+    """
+    u, v = patches.felt.passed / CHANGE_AZIMUTH_KNOTS, (patches.stretch + 0.5) / CHANGE_STRETCHES
+    i, j = u.astype(np.int64), v.astype(np.int64)
+    u, v = u - i, v - j
+    along = int(j.max(initial=0)) + 2
+    corners = [(a, b) for a in (0, 1) for b in (0, 1)]
+    columns = np.concatenate([(i + a) * along + j + b for a, b in corners])
+    values = np.concatenate(
+        [np.where(moving, (u if a else 1 - u) * (v if b else 1 - v), 0) for a, b in corners]
+    )
+    rows = np.tile(np.arange(len(u)), len(corners))
+    held = values > 0
+    knots, columns = np.unique(columns[held], return_inverse=True)
+    field = sparse.csr_array((values[held], (rows[held], columns)), shape=(len(u), len(knots)))
+    return field, np.eye(len(knots)) + UNIFORM_CHANGE**2
+
+
+@dataclass(frozen=True)
+class _Solved:
+    """Solution of normal equations whose last unknowns have the prior that makes the data most likely."""
+
+    estimate: Floats
+    step_m: float
+    inverse: Floats  # of the block of the state and the log's faults
+    across: Floats  # what a unit of change does to these
+    change: Floats  # covariance of the change
+
+    def covariance(self) -> Floats:
+        """Covariance of the state and the log's faults."""
+        return self.inverse + self.across @ self.change @ self.across.T
+
+
+def _solve(normal: Floats, right: Floats, size: int, correlation: Floats) -> _Solved:
+    """Solve; how much the moving ground changed is chosen among steps by the likelihood."""
+    inverse = linalg.inv(normal[:size, :size])
+    across = -inverse @ normal[:size, size:]
+    reduced = normal[size:, size:] + normal[size:, :size] @ across
+    told = right[size:] + across.T @ right[:size]
+    precision = linalg.inv(correlation)
+    knots = len(told)
+    found = []
+    for step_m in CHANGE_STEPS_M:
+        root = linalg.cho_factor(reduced + precision / step_m**2, lower=True)
+        change_m = linalg.cho_solve(root, told)
+        spread = np.log(np.diag(root[0])).sum() + knots * np.log(step_m)
+        found.append((float(told @ change_m / 2 - spread), step_m, change_m, root))
+    _, step_m, change_m, root = max(found, key=lambda one: one[0])
+    state = inverse @ right[:size] + across @ change_m
+    return _Solved(
+        np.concatenate([state, change_m]), step_m, inverse, across, linalg.cho_solve(root, np.eye(knots))
+    )
+
+
+def _scatter(patches: Patches, left_m: Floats, moving: Bools) -> Floats:
+    """Variance (n,) [m²] of what patches have wrong beyond their cells' random errors.
+
+    What a smooth change cannot follow is wrong over several patches: these count as one.
+    """
+    scatter_m2 = np.empty(len(patches))
+    for chosen, most_m in ((moving, SCATTER_MOST_M), (~moving, SCATTER_M[1])):
+        if chosen.any():
+            scatter_m2[chosen] = _excess(left_m[chosen], patches.variance_m2[chosen], most_m)
+    if moving.any():
+        spread = np.sqrt(patches.variance_m2 + scatter_m2)
+        scatter_m2[moving] *= _together(patches.some(moving), (left_m / spread)[moving])
+    return scatter_m2
+
+
+def _excess(left_m: Floats, variance_m2: Floats, most_m: float) -> float:
+    """Variance that residuals have beyond their random errors [m²], robustly: by their median."""
+    low, high = SCATTER_M[0] ** 2, most_m**2
+    for _ in range(30):
+        middle = float(np.sqrt(low * high))
+        if np.median(left_m**2 / (variance_m2 + middle)) > CHI2_MEDIAN:
+            low = middle
+        else:
+            high = middle
+    return low
+
+
+def _together(patches: Patches, ratio: Floats) -> float:
+    """How many patches are wrong as one: the sum of the correlation over lines, times that over stretches."""
+    table = np.full((patches.felt.of.line_count, int(patches.stretch.max()) + 1), np.nan)
+    table[patches.felt.line, patches.stretch] = np.clip(ratio, -3, 3)
+    return min(_correlation_length(table, 20) * _correlation_length(table.T, 3), TOGETHER_MOST)
+
+
+def _correlation_length(table: Floats, furthest: int) -> float:
+    """Sum of the correlation between rows of a table, to either side, until it has died away."""
+    power = np.nanmean(table**2)
+    total = 1.0
+    for lag in range(1, min(furthest, len(table) - 1) + 1):
+        pairs = table[lag:] * table[:-lag]
+        like = float(np.nanmean(pairs) / power) if np.isfinite(pairs).any() else 0.0
+        if like < 0.05:
+            break
+        total += 2 * like
+    return total

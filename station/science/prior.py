@@ -1,0 +1,227 @@
+"""What is known of a scan before its points are looked at: how far its scanner, log and air may be off."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from station.quantities import Floats, Habits, HeadTrack, Shared, Tilt
+from station.science.adjustment import LineLog
+from station.science.inclination import Cycle, Lean
+from station.science.shared import GLOBAL, Basis, by_knots
+
+REFRACTION_MEMORY_RAD = math.radians(15.0)
+RANGE_SCALE_UNKNOWN_PPM = 4.0  # no weather: 5 K and 5 hPa off, 0.737 ppm/K, 0.290 ppm/hPa, EQUATIONS 5.8
+CYCLE_CHANGE_RAD = math.radians(0.002)
+CYCLE_CHANGE_SHARE = 0.2  # of its amplitude, between scans: EQUATIONS 2.7
+CYCLE_LARGEST_RAD = math.radians(0.05)  # a larger wave is the mount's lean, which does not change
+SLOW_MOTION_S = 300.0
+FAST_MOTION_S = 3.0
+SENSOR_BIAS_RAD = math.radians(0.0015)
+SCANS_WORTH = 8  # what start values weigh against scans
+MOTIONS = ("slow_motion_rad", "fast_motion_rad", "line_motion_rad")
+SHOWN = {  # habits by the global parameters that show them
+    "tilt_rad": slice(2),
+    "heading_rad": slice(2, 3),
+    "translation_m": slice(3, 6),
+    "range_bias_m": slice(6, 7),
+    "range_scale_ppm": slice(7, 8),
+    "refraction": slice(8, 9),
+}
+HEAD_SPEED_RAD_S = math.radians(0.13)  # where the scan does not tell; EQUATIONS 2.10
+
+
+def globals_sigma(habits: Habits, *, weather_known: bool) -> Floats:
+    """One sigma of each global parameter (9,)."""
+    scale_ppm = habits.range_scale_ppm if weather_known else RANGE_SCALE_UNKNOWN_PPM
+    return np.array(
+        [habits.tilt_rad, habits.tilt_rad, habits.heading_rad, *[habits.translation_m] * 3]
+        + [habits.range_bias_m, scale_ppm, habits.refraction]
+    )
+
+
+@dataclass(frozen=True)
+class Lines:
+    """How the head passed the groups of lines: azimuth in the scanner's own frame, and when.
+
+    Azimuth about the scanner's z axis, counter-clockwise from x; `time_s` in the scan's time base.
+    """
+
+    azimuth_rad: Floats  # (lines,)
+    time_s: Floats  # (lines,)
+
+
+def lines_of(of: Basis, to_local: Floats, track: HeadTrack | None) -> Lines:
+    """Return when the head passed each group of lines, from its track; without one, at a usual speed.
+
+    `to_local` (3, 3) turns the scanner's frame into the map's. Beyond the scan the head is taken to go on.
+    """
+    x, y, _ = to_local.T @ of.outward
+    azimuth_rad = np.unwrap(np.arctan2(y, x))
+    if track is None:
+        return Lines(azimuth_rad, np.abs(azimuth_rad - azimuth_rad[0]) / HEAD_SPEED_RAD_S)
+    middle = (track.azimuth_rad.min() + track.azimuth_rad.max()) / 2
+    azimuth_rad = middle + (azimuth_rad - middle + math.pi) % (2 * math.pi) - math.pi
+    onwards = np.argsort(track.azimuth_rad)
+    passed_rad, passed_s = track.azimuth_rad[onwards], track.time_s[onwards]
+    beyond = np.polynomial.Polynomial.fit(passed_rad, passed_s, 1)
+    inside = (azimuth_rad >= passed_rad[0]) & (azimuth_rad <= passed_rad[-1])
+    return Lines(
+        azimuth_rad, np.where(inside, np.interp(azimuth_rad, passed_rad, passed_s), beyond(azimuth_rad))
+    )
+
+
+def turn_of(tilt: Tilt, to_local: Floats, time_s: Floats) -> Floats:
+    """Rotation about east, north and up (3, n) [rad] that a lean of the scanner is at some times (n,)."""
+    roll_rad, pitch_rad = (np.interp(time_s, tilt.time_s, v) for v in (tilt.roll_rad, tilt.pitch_rad))
+    return np.asarray(to_local @ np.stack([roll_rad, pitch_rad, np.zeros_like(roll_rad)]))
+
+
+def line_log(of: Basis, lines: Lines, lean: Lean, zero: Cycle, to_local: Floats) -> LineLog:
+    """Return what the log says of each group of lines, projected on the line of sight, and its faults.
+
+    Source: ADJUSTMENT, observation 2; EQUATIONS 6.3.
+    """
+    onwards = np.argsort(lines.time_s)
+    times_s = lines.time_s[onwards]
+    edges_s = (times_s[1:] + times_s[:-1]) / 2
+    time_s = lean.raw.time_s
+    inside = (time_s >= 2 * times_s[0] - edges_s[0]) & (time_s <= 2 * times_s[-1] - edges_s[-1])
+    line = onwards[np.searchsorted(edges_s, time_s[inside])]
+    east, north, _ = turn_of(lean.raw, to_local, time_s[inside])
+    azimuth_rad = of.line_azimuth_rad
+    sight_rad = np.cos(azimuth_rad[line]) * east - np.sin(azimuth_rad[line]) * north
+    count = np.bincount(line, minlength=of.line_count)
+    one = np.ones_like(azimuth_rad)
+    faults = np.concatenate(
+        [
+            np.stack([np.cos(azimuth_rad), -np.sin(azimuth_rad)], axis=-1) * SENSOR_BIAS_RAD,
+            np.stack([one, np.cos(2 * azimuth_rad), np.sin(2 * azimuth_rad)], axis=-1) * CYCLE_CHANGE_RAD,
+            cycle_changes(lines, zero),
+        ],
+        axis=1,
+    )
+    return LineLog(
+        np.bincount(line, sight_rad, of.line_count) / np.maximum(count, 1), count / lean.noise_rad**2, faults
+    )
+
+
+def motions(lines: Lines) -> tuple[Floats, Floats, Floats]:
+    """Correlations (lines, lines) of slow, fast and line motion.
+
+    Source: EQUATIONS 6.3.
+    """
+    apart_s = np.abs(np.subtract.outer(lines.time_s, lines.time_s))
+    return np.exp(-apart_s / SLOW_MOTION_S), np.exp(-apart_s / FAST_MOTION_S), np.eye(len(apart_s))
+
+
+def motion(habits: Habits, lines: Lines) -> Floats:
+    """Covariance of the lean along the line of sight (lines, lines) [rad²]."""
+    slow, fast, white = motions(lines)
+    return np.asarray(
+        habits.slow_motion_rad**2 * slow
+        + habits.fast_motion_rad**2 * fast
+        + habits.line_motion_rad**2 * white
+    )
+
+
+def bending(habits: Habits, of: Basis) -> Floats:
+    """Covariance of the refraction that varies with azimuth (knots, knots)."""
+    apart_rad = np.abs(np.subtract.outer(of.refraction_azimuth_rad, of.refraction_azimuth_rad))
+    apart_rad = np.minimum(apart_rad, 2 * math.pi - apart_rad)
+    return np.asarray(habits.refraction_by_azimuth**2 * np.exp(-apart_rad / REFRACTION_MEMORY_RAD))
+
+
+def by_line(of: Basis, globals_sigma: Floats, lean: Floats, bend: Floats) -> Floats:
+    """Covariance of globals, leans of lines and refraction knots, independent of each other."""
+    first, last = len(GLOBAL), len(GLOBAL) + of.line_count
+    covariance = np.zeros((last + of.refraction_count,) * 2)
+    covariance[:first, :first] = np.diag(np.square(globals_sigma))
+    covariance[first:last, first:last] = lean
+    covariance[last:, last:] = bend
+    return covariance
+
+
+def covariance_without_adjustment(
+    of: Basis, lines: Lines, lean: Lean | None, zero: Cycle, habits: Habits, *, weather_known: bool
+) -> Shared:
+    """Return what is unknown of a scan corrected by its log and the weather alone, all estimates nought.
+
+    What the log cannot know is here: its bias, the change of its cyclic error, the noise the filter leaves,
+    the motion it takes away; without a log, all motion.
+    """
+    told = replace(habits, tilt_rad=SENSOR_BIAS_RAD) if lean else habits
+    covariance = by_line(
+        of,
+        globals_sigma(told, weather_known=weather_known),
+        _missed_by_log(lines, lean, zero, habits) if lean else motion(habits, lines),
+        bending(habits, of),
+    )
+    return by_knots(of, np.zeros(len(covariance)), covariance)
+
+
+def _missed_by_log(lines: Lines, lean: Lean, zero: Cycle, habits: Habits) -> Floats:
+    """Covariance (lines, lines) of the lean along the line of sight that the filtered log leaves [rad²]."""
+    _, fast, white = motions(lines)
+    apart_s = np.abs(np.subtract.outer(lines.time_s, lines.time_s))
+    apart_rad = np.subtract.outer(lines.azimuth_rad, lines.azimuth_rad)
+    # The share of the slow motion's spectrum (a Lorentzian) that lies above the cut-off.
+    missed = 1 - 2 / math.pi * math.atan(2 * math.pi * lean.cutoff_hz * SLOW_MOTION_S)
+    width_s = lean.memory_s / (2 * math.sqrt(math.pi))  # of the Gaussian window with the same memory
+    noise = np.exp(-((apart_s / width_s) ** 2) / 4) * np.cos(apart_rad)
+    changes = cycle_changes(lines, zero)
+    return np.asarray(
+        habits.fast_motion_rad**2 * fast
+        + habits.line_motion_rad**2 * white
+        + habits.slow_motion_rad**2 * missed * np.exp(-apart_s / max(lean.memory_s, 1.0))
+        + lean.filtered_noise_rad**2 * noise
+        + CYCLE_CHANGE_RAD**2 * np.cos(apart_rad) ** 2
+        + changes @ changes.T
+    )
+
+
+def cycle_changes(lines: Lines, zero: Cycle) -> Floats:
+    """Effect on the line of sight (lines, 2) of one sigma of change in the sensor's waves [rad].
+
+    Source: EQUATIONS 2.7.
+    """
+    cos, sin = np.cos(lines.azimuth_rad), np.sin(lines.azimuth_rad)
+    waves = [
+        (wave[1] * cos + wave[2] * sin)
+        * arm
+        * min(1.0, CYCLE_LARGEST_RAD / max(math.hypot(*wave[1:]), 1e-12))
+        for wave, arm in ((zero.roll_rad, sin), (zero.pitch_rad, -cos))
+    ]
+    return CYCLE_CHANGE_SHARE * np.stack(waves, axis=-1)
+
+
+def learned(start: Habits, of: Basis, scans: list[tuple[Lines, Floats, Floats]]) -> Habits:
+    """Return the habits that estimates (u,) and covariances (u, u) of several scans speak for.
+
+    Each variance is what the scans show (estimate squared plus what is unknown of it), drawn to its start
+    value as if that came from `SCANS_WORTH` scans. Motions are told apart by their correlation in time, by a
+    step of the expectation-maximisation of variance components.
+    """
+    if len(scans) < 2:
+        return start
+    first, last = len(GLOBAL), len(GLOBAL) + of.line_count
+    shown = np.mean([e**2 + np.diag(c) for _, e, c in scans], axis=0) * len(scans) / (len(scans) - 1)
+
+    def drawn(name: str, variance: float) -> float:
+        mass = len(scans) + SCANS_WORTH
+        return math.sqrt((variance * len(scans) + getattr(start, name) ** 2 * SCANS_WORTH) / mass)
+
+    seen = {name: float(shown[place].mean()) for name, place in SHOWN.items()}
+    seen["refraction_by_azimuth"] = float(shown[last:].mean())
+    lean = slice(first, last)
+    for name, component in zip(MOTIONS, range(3), strict=True):
+        ratios = []
+        for lines, estimate, covariance in scans:
+            weight = np.linalg.inv(motion(start, lines))
+            kernel = motions(lines)[component]
+            moved = np.outer(estimate[lean], estimate[lean]) + covariance[lean, lean]
+            ratios.append(np.sum((weight @ kernel @ weight) * moved) / np.sum(weight * kernel))
+        seen[name] = getattr(start, name) ** 2 * float(np.mean(ratios))
+    return replace(start, **{name: drawn(name, variance) for name, variance in seen.items()})

@@ -1,0 +1,45 @@
+"""How shots and cells are seen from the scanner."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from station.quantities import Floats, Scanner
+from station.science import uncertainty
+
+Points = tuple[Floats, Floats, Floats]
+
+
+@dataclass(frozen=True)
+class View:
+    """How shots or cells (n,) are seen from the scanner."""
+
+    offset_m: Points
+    east_gradient: Floats
+    north_gradient: Floats
+    range_m: Floats
+    cos_incidence: Floats
+    cos_slope: Floats
+
+    @classmethod
+    def of(cls, points: Points, position_m: tuple[float, float, float], east: Floats, north: Floats) -> View:
+        """See map points with the given terrain gradients from a position."""
+        x_m, y_m, z_m = (axis - origin for axis, origin in zip(points, position_m, strict=True))
+        range_m = np.maximum(np.sqrt(x_m**2 + y_m**2 + z_m**2), 1e-3)
+        cos_slope = 1 / np.sqrt(1 + east**2 + north**2)
+        cos_incidence = np.abs(z_m - east * x_m - north * y_m) * cos_slope / range_m
+        return cls((x_m, y_m, z_m), east, north, range_m, np.minimum(cos_incidence, 1.0), cos_slope)
+
+    @property
+    def tan_slope(self) -> Floats:
+        """Steepness of the terrain (n,) [1]."""
+        return np.hypot(self.east_gradient, self.north_gradient)
+
+    def shot_variance(self, scanner: Scanner, *, published: bool) -> Floats:
+        """Random variance of one shot's height [m²], by the corrected or by the published budget."""
+        seen = self.range_m, self.cos_incidence, self.cos_slope
+        if published:
+            return uncertainty.shot_variance_voordendag(*seen, self.offset_m[2] / self.range_m, scanner)
+        return uncertainty.shot_variance(*seen, scanner)
