@@ -15,8 +15,8 @@ from station.service.inbox import Arrival
 from station.simulation.scenario import named
 from station.simulation.station import simulate
 
-REFERENCE = 4  # scans
-CALM = replace(named("quiet", hours=7), reference_scans=REFERENCE)
+REFERENCE = 3  # scans
+CALM = replace(named("quiet", hours=6), reference_scans=REFERENCE)
 PERFECT = CALM.without_errors()
 SHOTS_ONLY = {"range_noise_m": 0.01, "beam_divergence_mrad": 0.12, "line_jitter_deg": 0.0008}
 BOX = 10  # cells of 10 m
@@ -128,9 +128,7 @@ def test_the_adjustment_is_as_good_as_by_hand(calm):
     assert np.abs(error).max() < 0.10
     assert 0.6 < np.sqrt(np.mean((error / sigma) ** 2)) < 1.4
     assert {outcome.verdict for outcome in calm.outcomes} == {"good"}
-    assert calm.series.adjustment.values.tolist() == [b"joint"] * 3 or {
-        str(word) for word in calm.series.adjustment.values
-    } == {"joint"}
+    assert calm.series.adjustment.values.tolist() == ["joint"] * 3
 
 
 def test_cells_and_areas_are_as_sure_as_they_say(calm):
@@ -165,7 +163,7 @@ def test_named_areas_come_with_every_epoch(calm):
 
 def test_snow_on_stable_ground_is_not_taken_for_a_lean(tmp_path):
     """0.4 m of patchy snow on everything below 40-50°, on rock too."""
-    scenario = replace(CALM, snowfall_m=0.4, snow_hours=(3.5, 5.0))
+    scenario = replace(CALM, snowfall_m=0.4, snow_hours=(2.5, 4.0))
     simulate(tmp_path / "station", scenario)
     measured = Measured(tmp_path / "station")
     error, _, _ = measured.boxes()
@@ -175,8 +173,9 @@ def test_snow_on_stable_ground_is_not_taken_for_a_lean(tmp_path):
     assert np.sqrt(np.mean(error**2)) < np.sqrt(np.mean(fixed**2)) / 2
 
 
+@pytest.mark.slow
 def test_an_avalanche_keeps_its_height_and_its_place(tmp_path):
-    scenario = replace(CALM, avalanche_m=2.0, avalanche_hour=5.0, avalanche_size=0.4)
+    scenario = replace(CALM, avalanche_m=2.0, avalanche_hour=4.0, avalanche_size=0.4)
     simulate(tmp_path / "station", scenario)
     measured = Measured(tmp_path / "station")
     true = measured.true_change[-1]
@@ -189,6 +188,7 @@ def test_an_avalanche_keeps_its_height_and_its_place(tmp_path):
     assert np.sqrt(np.mean(error**2)) < 0.03
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("spoil", "reason"),
     [("log", "inclination log missing"), ("weather", "weather"), ("ground", "no stable ground")],

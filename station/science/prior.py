@@ -9,7 +9,7 @@ import numpy as np
 
 from station.quantities import Floats, Habits, HeadTrack, Shared, Tilt
 from station.science.adjustment import LineLog
-from station.science.inclination import Cycle, Lean
+from station.science.inclination import SENSOR_STEP_RAD, Cycle, Lean
 from station.science.shared import GLOBAL, Basis, by_knots
 
 REFRACTION_MEMORY_RAD = math.radians(15.0)
@@ -101,9 +101,9 @@ def line_log(of: Basis, lines: Lines, lean: Lean, zero: Cycle, to_local: Floats)
         ],
         axis=1,
     )
-    return LineLog(
-        np.bincount(line, sight_rad, of.line_count) / np.maximum(count, 1), count / lean.noise_rad**2, faults
-    )
+    noise_rad = max(lean.noise_rad, SENSOR_STEP_RAD)
+    mean_rad = np.bincount(line, sight_rad, of.line_count) / np.maximum(count, 1)
+    return LineLog(mean_rad, count / noise_rad**2, faults)
 
 
 def motions(lines: Lines) -> tuple[Floats, Floats, Floats]:
