@@ -37,7 +37,7 @@ def disturbed(folder: Path, seed: int, case: str) -> dict[str, object]:
     _spoil(home, case, scenario.reference_scans)
     outcomes = processed(home, METHODS["joint_good"])
     result = Result(home, METHODS["joint_good"])
-    reasons = Counter(str(one["reason"]) for one in outcomes if one["reason"])
+    reasons = Counter(str(one["reason"]).split(" of 2")[0] for one in outcomes if one["reason"])
     known = Calibration(result)
     targets = known.targets("100 m")
     z = np.array([known.z(targets, epoch)[0] for epoch in range(len(result.error_m))])
