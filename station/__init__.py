@@ -48,3 +48,15 @@ def variance(
     found = Aggregates(series_in(site_or_folder))
     other = None if epoch2 is None else found.row(epoch2)
     return found.variance(np.asarray(weights, dtype=np.float64), found.row(epoch), other)
+
+
+def coarsened(site_or_folder: str | Path, epoch: Epoch, cells: int) -> xr.Dataset:
+    """Elevation change of an epoch in blocks of cells × cells, with its uncertainty, for cells of few points.
+
+    Raises StoreError where there is no series.
+    """
+    from station.archive.aggregate import Aggregates  # noqa: PLC0415
+    from station.archive.store import series_in  # noqa: PLC0415
+
+    found = Aggregates(series_in(site_or_folder))
+    return found.coarsened(found.row(epoch), cells)

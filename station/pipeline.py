@@ -40,6 +40,7 @@ MARGIN_ROWS = 4  # rows beyond a band that its smoothed gradient looks at
 FEW_POINTS = 3
 FEW_STABLE = 20  # cells, that say nothing of a spread
 PROVISIONAL_CELLS = 1.0  # one sigma of the smoothing before residuals are taken
+UNCHANGED_SIGMAS = 3.0  # of a mean over many scans, on ground that stays
 STEADY = 3.0  # times its modelled variance from scan to scan, which ground found stable may show
 HIGH_INCIDENCE_COS = float(np.cos(np.radians(80.0)))
 
@@ -217,7 +218,7 @@ def measure(
         quality=np.zeros(grid.shape, np.uint8),
         terms={
             name: np.full(grid.shape, np.nan, np.float32)
-            for name in ("sigma_instrument", "sigma_atmosphere", "sigma_geometry")
+            for name in (budget.TERMS if setup.published_budget else (*budget.TERMS, *budget.PUBLISHED))
             if setup.store_terms and setup.position_m is not None
         },
     )
@@ -228,7 +229,7 @@ def measure(
 
 
 def stable_figures(measured: Measurement) -> dict[str, float]:
-    """Return how a scan does on the stable ground it was not fitted to: number of cells, median, spread, z."""
+    """Return how a scan does on stable ground it was not fitted to: number of cells, median, spread, z."""
     surface = measured.surface
     chosen = ((measured.quality & Quality.STABLE_GROUND) > 0) & ground.withheld(surface.grid)
     change_m, sigma_m = surface.change_m[chosen], measured.uncertainty_m[chosen]
@@ -313,27 +314,26 @@ class _Judge:
     def _shared_and_terms(
         self, band: slice, seen: Bools, view: View, count: Floats, sampling_m2: Floats
     ) -> tuple[Floats, dict[str, Floats]]:
-        """Take the adjustment off; return what cells share with others (n,) [m²] and the terms asked for [m]."""
+        """Take the adjustment off; return what cells share with others (n,) [m²], and terms asked for [m]."""
         setup, unknown, surface = self.setup, self.unknown, self.result.surface
+        shared_m2, terms = np.zeros_like(count), dict[str, Floats]()
+        if setup.store_terms and setup.published_budget:
+            terms = budget.terms_voordendag(view, setup.scanner)
         if setup.position_m is None or unknown is None:
-            return np.zeros_like(count), {}
-        of = shared.basis(setup.grid, setup.position_m, setup.axis)
-        felt = _felt(view, of)
-        of_change = unknown
+            return shared_m2, terms
+        felt = _felt(view, shared.basis(setup.grid, setup.position_m, setup.axis))
         if self.levelled is not None:
             told, found, _ = self.levelled
             correction_m = found.effect(felt) - turned(felt, told.assumed_rad)
             surface.elevation_m[band][seen] -= correction_m
             surface.change_m[band][seen] -= correction_m.astype(np.float32)
-        elif self.reference is not None and self.reference.shared is not None:
-            of_change = unknown + self.reference.shared
         if setup.published_budget:
-            terms = budget.terms_voordendag(view, setup.scanner) if setup.store_terms else {}
-            return np.zeros_like(count), terms
-        terms = (
-            budget.terms(view, count, sampling_m2, felt, unknown, setup.scanner) if setup.store_terms else {}
-        )
-        return felt.variance(of_change), terms
+            return shared_m2, terms
+        if setup.store_terms:
+            terms = budget.terms(view, count, sampling_m2, felt, unknown, setup.scanner)
+            terms |= budget.published(view, count, setup.scanner)
+        before = self.reference.shared if self.reference is not None and self.levelled is None else None
+        return felt.variance(unknown if before is None else unknown + before), terms
 
     def _stable(self, band: slice, seen: Bools, view: View) -> Ints:
         """Flag the stable ground that looks as it did."""
@@ -414,6 +414,28 @@ def master(
         shared=common,
         scan_ids=scan_ids,
         intensity=stack.intensity(),
+        variance_factor=factor,
+        stable=stable,
+        habits=habits,
+    )
+
+
+def improved(base: Reference, stack: Stack, setup: Setup, version: str, habits: Habits) -> Reference:
+    """Return a reference whose stable ground is the mean of more scans, laid on it and adjusted to it.
+
+    Elsewhere it stays as it is: it is what change counts from. What scans show of cells is learned anew.
+    """
+    mean_m, mean_m2 = stack.mean_residual(), stack.random_variance()
+    factor, steady = _as_scans_show(stack, setup, base.elevation_m)
+    mean_m2 *= factor
+    still = np.abs(mean_m) < UNCHANGED_SIGMAS * np.sqrt(mean_m2 + base.random_variance_m2)
+    stable = steady & still
+    elevation_m = base.elevation_m + np.where(stable, mean_m, 0.0)
+    return replace(
+        base,
+        version=version,
+        elevation_m=elevation_m,
+        random_variance_m2=np.where(stable, mean_m2, base.random_variance_m2).astype(np.float32),
         variance_factor=factor,
         stable=stable,
         habits=habits,

@@ -6,12 +6,13 @@ import numpy as np
 import pytest
 
 from station.pipeline import Pose, Setup, gridder_for, master, measure, survey
-from station.quantities import Air, Grid, Quality, Reference, Scanner, Shots, Tilt
+from station.quantities import Air, Grid, Habits, Quality, Reference, Scanner, Shots, Tilt
 from station.science.air import air_correction
 from station.science.grid import Stack
 from station.science.inclination import LEVEL
 from station.science.pose import frame_by_origin, frame_in_local_map
-from station.science.shared import basis, covariance_without_adjustment
+from station.science.prior import covariance_without_adjustment, lines_of
+from station.science.shared import basis
 
 VZ6000 = Scanner("vz", 1.064, 0.12e-3, 0.0, 0.010, math.radians(0.0005), math.radians(0.008), 6000.0)
 GRID = Grid(west_m=1500.0, north_m=600.0, cell_m=4.0, nx=150, ny=300)
@@ -49,7 +50,7 @@ def spots(count, seed):
 
 def truth():
     x_m, y_m = np.meshgrid(GRID.x_m, GRID.y_m)
-    return Reference(GRID, "truth", height(x_m, y_m), *[np.zeros(GRID.shape, np.float32)] * 2, None, ())
+    return Reference.given(GRID, "truth", height(x_m, y_m))
 
 
 def scanned(shots, reference, unknown=None, **settings):
@@ -93,9 +94,9 @@ def test_a_master_from_scans_finds_the_truth_and_its_own_error():
     for _ in range(3):
         stack = Stack(GRID)
         for shots in scans:
-            _, gridder, _ = scanned(shots, made)
+            _, gridder, setup = scanned(shots, made)
             stack.add(gridder)
-        made = master(stack, made, [None], gridder.datum_m, "1", ("a",))
+        made = master(stack, made, [None], setup, "1", ("a",), Habits())
     error = made.elevation_m - height(x_m, y_m)
     assert np.nanmedian(error) == pytest.approx(0.0, abs=1e-3)
     assert 1.4826 * np.nanmedian(np.abs(error)) < 0.03
@@ -119,14 +120,18 @@ def test_roughness_within_cells_is_found():
 
 def test_shared_errors_go_into_the_cell_and_its_terms():
     of = basis(GRID, SCANNER)
-    unknown = covariance_without_adjustment(
-        of, None, LEVEL, np.zeros(of.count), math.radians(0.13), weather_known=True
-    )
+    lines = lines_of(of, np.eye(3), None)
+    unknown = covariance_without_adjustment(of, lines, None, LEVEL, Habits(), weather_known=True)
     measured, *_ = scanned(shots_at(*spots(50_000, 4)), truth(), unknown, store_terms=True)
-    total = np.sqrt(sum(np.square(term) for term in measured.terms.values()))
+    ours = ("sigma_instrument", "sigma_atmosphere", "sigma_geometry")
+    total = np.sqrt(sum(np.square(measured.terms[name]) for name in ours))
     seen = np.isfinite(measured.uncertainty_m)
     assert measured.uncertainty_m[seen] == pytest.approx(total[seen], rel=1e-3)
     assert (measured.uncertainty_m > measured.random_uncertainty_m)[seen].all()
+    # the published budgets take a lean of 0.008° for each point's own, and for no other cell's
+    lean_m = 1800 * math.radians(0.008) / np.sqrt(measured.surface.count[seen].mean())
+    for name in ("sigma_hartzell2015", "sigma_voordendag2023"):
+        assert np.median(measured.terms[name][seen]) == pytest.approx(lean_m, rel=0.35)
 
 
 def test_published_budget_on_request():

@@ -2,21 +2,35 @@
 
 from __future__ import annotations
 
-from functools import cached_property
+from dataclasses import dataclass
 from typing import Any
 
 import netCDF4
 import numpy as np
+import xarray as xr
 
 from station.archive.layout import Series, strings
 from station.archive.reference import read_reference
 from station.archive.store import Row, rows
 from station.errors import StoreError
-from station.quantities import Bools, Floats, Reference, Shared
+from station.quantities import Bools, Floats, Grid, Reference, Shared
 from station.science.shared import Sensitivities, aggregate_variance, basis, cell_sensitivities
 from station.science.terrain import smooth_gradient
 
+MARGIN_CELLS = 6  # that a smoothed gradient looks beyond a cell
 CHANGE, RANDOM = "elevation_change", "elevation_change_random_uncertainty"
+
+
+@dataclass(frozen=True)
+class _Held:
+    """What an epoch keeps of some cells (n,)."""
+
+    change_m: Floats
+    random_m: Floats
+    unknown: Shared | None
+    scanner: tuple[float, ...]  # where it stood and what it turned about
+    reference: Reference
+    adjusted: bool  # to the reference, so that `unknown` is against that
 
 
 class Aggregates:
@@ -24,17 +38,19 @@ class Aggregates:
 
     def __init__(self, series: Series) -> None:
         self._series = series
+        self._references: dict[str | None, Reference] = {}
 
-    @cached_property
-    def _reference(self) -> Reference:
-        found = read_reference(self._series)
-        if found is None:
-            raise StoreError(f"{self._series.folder}: no reference yet, so there is no change to sum up")
-        return found
+    def reference(self, version: str | None = None) -> Reference:
+        """Return a surface that change is measured from, the newest or a version.
 
-    @cached_property
-    def _gradient(self) -> tuple[Any, Any]:
-        return smooth_gradient(self._reference.elevation_m, self._series.grid.cell_m)
+        Raises StoreError where it is not there.
+        """
+        if version not in self._references:
+            found = read_reference(self._series, version)
+            if found is None:
+                raise StoreError(f"{self._series.folder}: no reference {version or 'yet'}: nothing to sum up")
+            self._references[version] = found
+        return self._references[version]
 
     def row(self, epoch: int | str | np.datetime64) -> Row:
         """Find an epoch by its place in the series or by the time nearest to its middle (UTC)."""
@@ -52,30 +68,35 @@ class Aggregates:
         `weights` (ny, nx), nought outside. The unit is that of the weights squared, times m². Cells without a
         change count nothing. Source: EQUATIONS 6.2.
         """
-        cells = np.isfinite(self._reference.elevation_m) & (weights != 0)
-        epochs = [row] if other is None else [row, other]
-        held = [self._read(one, cells) for one in epochs]
-        seen = np.logical_and.reduce([np.isfinite(random_m) for _, random_m, _, _ in held])
+        cells = weights != 0
+        held = [self._read(one, cells) for one in ([row] if other is None else [row, other])]
+        seen = np.logical_and.reduce([np.isfinite(one.random_m) for one in held])
         chosen = cells.copy()
         chosen[cells] = seen
         weights = weights[chosen]
-        before_m2 = self._reference.random_variance_m2[chosen].astype(np.float64)
         total = 0.0
-        for _, random_m, unknown, scanner in held:
-            random_m2 = random_m[seen] ** 2
-            if other is not None:  # what the reference does not know is in both and goes
-                random_m2 = np.maximum(random_m2 - before_m2, 0.0)
-            if unknown is None or scanner is None:
+        for one in held:
+            random_m2 = one.random_m[seen] ** 2
+            if other is not None:  # what one reference does not know is in both and goes
+                before_m2 = one.reference.random_variance_m2[chosen]
+                random_m2 = np.maximum(random_m2 - before_m2, 0.0) + self._apart(held, chosen) * before_m2
+            unknown = one.unknown
+            if unknown is None:
                 total += float(np.sum(weights**2 * random_m2))
                 continue
-            if other is None:
-                unknown = self._with_reference(unknown, row)
-            total += aggregate_variance(weights, random_m2, self._felt(chosen, scanner), unknown)
+            if other is None and not one.adjusted and one.reference.shared is not None:
+                unknown = unknown + one.reference.shared
+            total += aggregate_variance(weights, random_m2, self._felt(one, chosen), unknown)
         return total
+
+    def _apart(self, held: list[_Held], cells: Bools) -> Bools:
+        """Tell where the references of two epochs are not one surface."""
+        one, other = (epoch.reference.elevation_m[cells] for epoch in held)
+        return np.asarray(one != other)
 
     def mean_change(self, cells: Bools, row: Row) -> tuple[float, float, float]:
         """Mean change of the cells (ny, nx) in an epoch [m], one sigma [m], share of cells with a change."""
-        change_m = self._read(row, cells)[0]
+        change_m = self._read(row, cells).change_m
         seen = np.isfinite(change_m)
         if not seen.any():
             return np.nan, np.nan, 0.0
@@ -84,32 +105,62 @@ class Aggregates:
         sigma_m = float(np.sqrt(self.variance(weights, row)))
         return float(change_m[seen].mean()), sigma_m, float(seen.mean())
 
-    def _felt(self, cells: Bools, scanner: tuple[float, ...]) -> Sensitivities:
-        east_m, north_m, height_m, axis_east, axis_north = scanner
+    def coarsened(self, row: Row, cells: int) -> xr.Dataset:
+        """Change in blocks of cells × cells of an epoch, every point counting the same, and one sigma [m].
+
+        `point_count` is the sum. Shared errors are taken as one within a block. Rows and columns that fill
+        no block are left out.
+        """
+        grid = self._series.grid
+        ny, nx = grid.ny // cells, grid.nx // cells
+        if not ny or not nx:
+            raise ValueError(f"blocks of {cells} cells do not fit a grid of {grid.ny} by {grid.nx}")
+        with netCDF4.Dataset(row.path) as file:
+            change_m, random_m, sigma_m, count = (
+                np.ma.filled(file[name][row.index].astype(np.float64), np.nan)[: ny * cells, : nx * cells]
+                for name in (CHANGE, RANDOM, "elevation_change_uncertainty", "point_count")
+            )
+        count = np.where(np.isfinite(change_m), count, 0.0)
+
+        def total(values: Floats) -> Floats:
+            return np.asarray(np.nansum(values.reshape(ny, cells, nx, cells), axis=(1, 3)))
+
+        points = total(count)
+        with np.errstate(invalid="ignore", divide="ignore"):
+            random_m2 = total(count**2 * random_m**2) / points**2
+            shared_m2 = total(count * (sigma_m**2 - random_m**2)) / points
+            rasters = {
+                CHANGE: total(count * change_m) / points,
+                "elevation_change_uncertainty": np.sqrt(random_m2 + np.maximum(shared_m2, 0.0)),
+                RANDOM: np.sqrt(random_m2),
+                "point_count": points,
+            }
+        y_m = grid.y_m[: ny * cells].reshape(ny, cells).mean(axis=1)
+        x_m = grid.x_m[: nx * cells].reshape(nx, cells).mean(axis=1)
+        return xr.Dataset({name: (("y", "x"), v) for name, v in rasters.items()}, {"y": y_m, "x": x_m})
+
+    def _felt(self, held: _Held, cells: Bools) -> Sensitivities:
+        grid, elevation_m = self._series.grid, held.reference.elevation_m
+        east_m, north_m, height_m, axis_east, axis_north = held.scanner
         up = float(np.sqrt(max(1 - axis_east**2 - axis_north**2, 0.0)))
         position_m = east_m, north_m, height_m
-        of = basis(self._series.grid, position_m, (axis_east, axis_north, up))
-        return cell_sensitivities(
-            of, self._series.grid, position_m, self._reference.elevation_m, self._gradient, cells
-        )
+        of = basis(grid, position_m, (axis_east, axis_north, up))
+        rows, columns = _box(cells, MARGIN_CELLS)
+        corner_m = grid.west_m + columns.start * grid.cell_m, grid.north_m - rows.start * grid.cell_m
+        around = elevation_m[rows, columns]
+        part = Grid(*corner_m, grid.cell_m, around.shape[1], around.shape[0])
+        gradient = smooth_gradient(around, grid.cell_m)
+        return cell_sensitivities(of, part, position_m, around, gradient, cells[rows, columns])
 
-    def _with_reference(self, unknown: Shared, row: Row) -> Shared:
-        """Add what the reference does not know, unless the scan was adjusted to it."""
+    def _read(self, row: Row, cells: Bools) -> _Held:
+        """Read what an epoch keeps of the chosen cells (ny, nx)."""
         with netCDF4.Dataset(row.path) as file:
-            joint = str(file["adjustment"][row.index]) == "joint"
-        common = self._reference.shared
-        return unknown if joint or common is None else unknown + common
-
-    def _read(self, row: Row, cells: Bools) -> tuple[Floats, Floats, Shared | None, tuple[float, ...] | None]:
-        """Change and random sigma of some cells (n,) [m], what they share, and where the scanner stood."""
-        with netCDF4.Dataset(row.path) as file:
-            if cells.any():
-                change_m, random_m = (_cells(file[name], row.index, cells) for name in (CHANGE, RANDOM))
-            else:
-                change_m, random_m = np.empty(0), np.empty(0)
+            reference = self.reference(str(file["reference_version"][row.index]))
+            change_m, random_m = (_cells(file[name], row.index, cells) for name in (CHANGE, RANDOM))
             scanner = tuple(float(np.ma.filled(file[name][row.index], np.nan)) for name in SCANNER)
+            joint = str(file["adjustment"][row.index]) == "joint"
             if "parameter_name" not in file.variables or not np.isfinite(scanner).all():
-                return change_m, random_m, None, None
+                return _Held(change_m, random_m, None, scanner, reference, joint)
             file.set_auto_chartostring(False)
             names, units = (tuple(strings(np.ma.getdata(file[name][:]))) for name in PARAMETER)
             estimate, covariance, noise = (
@@ -118,7 +169,8 @@ class Aggregates:
                     "shared_parameter", "shared_parameter_covariance", "shared_parameter_noise_variance"
                 )
             )  # fmt: skip
-        return change_m, random_m, Shared(names, units, estimate, covariance, noise), scanner
+        unknown = Shared(names, units, estimate, covariance, noise)
+        return _Held(change_m, random_m, unknown, scanner, reference, joint)
 
 
 SCANNER = ("scanner_east", "scanner_north", "scanner_height", "scanner_axis_east", "scanner_axis_north")
@@ -127,7 +179,19 @@ PARAMETER = ("parameter_name", "parameter_unit")
 
 def _cells(variable: Any, index: int, cells: Bools) -> Floats:  # noqa: ANN401 - netCDF4 has no types
     """Read the chosen cells (n,) of a raster, and no more of it than their bounding box."""
-    row, column = np.flatnonzero(cells.any(axis=1)), np.flatnonzero(cells.any(axis=0))
-    box = slice(row[0], row[-1] + 1), slice(column[0], column[-1] + 1)
-    values = np.ma.filled(variable[index, box[0], box[1]].astype(np.float64), np.nan)
+    if not cells.any():
+        return np.empty(0)
+    box = _box(cells, 0)
+    values = np.ma.filled(variable[(index, *box)].astype(np.float64), np.nan)
     return np.asarray(values[cells[box]])
+
+
+def _box(cells: Bools, margin: int) -> tuple[slice, slice]:
+    """Rows and columns that hold the chosen cells (ny, nx), and so many beyond."""
+    rows, columns = (np.flatnonzero(cells.any(axis=axis)) for axis in (1, 0))
+    if not len(rows):
+        return slice(0, 1), slice(0, 1)
+    return (
+        slice(max(rows[0] - margin, 0), rows[-1] + 1 + margin),
+        slice(max(columns[0] - margin, 0), columns[-1] + 1 + margin),
+    )

@@ -99,9 +99,9 @@ def write_reference(series: Series, reference: Reference) -> None:
         os.link(kept, beside)
 
 
-def read_reference(series: Series) -> Reference | None:
-    """Read `reference.nc`; None where there is none yet; StoreError where it does not fit the grid."""
-    path = series.folder / "reference.nc"
+def read_reference(series: Series, version: str | None = None) -> Reference | None:
+    """Read the newest reference or a version; None where there is none; StoreError where it fits no grid."""
+    path = series.folder / ("reference.nc" if version is None else f"reference_{version}.nc")
     if not path.is_file():
         return None
     try:

@@ -113,6 +113,28 @@ VARIABLES: tuple[Variable, ...] = (
     Variable("sigma_atmosphere", RASTER, "f4", "uncertainty from the atmosphere", "m", None, 3),
     Variable("sigma_geometry", RASTER, "f4", "uncertainty from the scanning geometry", "m", None, 3),
     Variable(
+        "sigma_voordendag2023",
+        RASTER,
+        "f4",
+        "uncertainty as Voordendag et al. (2023) state it",
+        "m",
+        None,
+        3,
+        None,
+        "Eq. 1-2, for comparison: takes what all points share for random",
+    ),
+    Variable(
+        "sigma_hartzell2015",
+        RASTER,
+        "f4",
+        "uncertainty as Hartzell et al. (2015) state it",
+        "m",
+        None,
+        3,
+        None,
+        "Eq. 9 and 12, for comparison: takes what all points share for random",
+    ),
+    Variable(
         "shared_parameter",
         ("time", "parameter"),
         "f8",
@@ -126,8 +148,8 @@ VARIABLES: tuple[Variable, ...] = (
         "f4",
         "covariance of what all points of the scan share",
         None,
-        comment="against the reference where adjustment is joint, else of the scan alone; units are products of"
-        " parameter_unit",
+        comment="against the reference where adjustment is joint, else of the scan alone;"
+        " units are products of parameter_unit",
     ),
     Variable(
         "shared_parameter_noise_variance",
@@ -202,4 +224,10 @@ VARIABLES: tuple[Variable, ...] = (
 
 BY_NAME = {variable.name: variable for variable in VARIABLES}
 TEXT_LENGTH = {"text": 64, "sentence": 256}
-TERMS = ("sigma_instrument", "sigma_atmosphere", "sigma_geometry")
+TERMS = (
+    "sigma_instrument",
+    "sigma_atmosphere",
+    "sigma_geometry",
+    "sigma_voordendag2023",
+    "sigma_hartzell2015",
+)

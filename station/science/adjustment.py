@@ -17,11 +17,13 @@ from station.quantities import Bools, Floats, Habits, Shared
 from station.science.patches import CHI2_MEDIAN, Kind, Patches
 from station.science.shared import GLOBAL, Basis, Sensitivities, by_knots, lines_from_knots
 
-ROUNDS = 4
+ROUNDS = 5
+ROUNDS_TRUSTING = 2  # until the scatter is known: else whole lines are left out that moving ground pulls away
+TRUSTED = 0.1  # weight of a patch that has not been left out
 MOST_REFUSED = 0.3  # of the stable ground, before an adjustment is doubted
 MOVED_SIGMAS = 4.0  # of what the station does from scan to scan
 TUKEY = 4.685  # 95 % efficient for normal errors
-SCATTER_M = (0.002, 0.005)  # least and most that stable patches differ by beyond their cells' random errors
+SCATTER_M = (0.002, 0.02)  # least and most that stable patches differ by beyond their cells' random errors
 SCATTER_MOST_M = 1.0  # the same of moving ones
 TOGETHER_MOST = 40.0  # patches of moving ground that are wrong as one
 CHANGE_AZIMUTH_KNOTS = 4  # knots of the lean, between knots of the change
@@ -64,19 +66,23 @@ class Adjustment:
             + (bend[before] * (1 - share) + bend[after] * share) * felt.refraction
         )
 
+    @property
+    def refused(self) -> float:
+        """Share of the stable patches that fit nothing else; nought where there is none."""
+        return float(np.mean(self.stable_weight < TRUSTED)) if len(self.stable_weight) else 0.0
+
     def shared(self) -> Shared:
         """The same by knots, for the store."""
         return by_knots(self.of, self.estimate, self.covariance)
 
 
 def distrust(found: Adjustment, habits: Habits) -> list[str]:
-    """Say what speaks against an adjustment: nothing stable to hold on to, or more motion than a station's."""
+    """Say what speaks against an adjustment: nothing stable to hold on to, or unusual motion."""
     reasons = []
     if not len(found.stable_weight):
         reasons.append("no stable ground seen")
-    elif np.mean(found.stable_weight < 0.1) > MOST_REFUSED:
-        refused = np.mean(found.stable_weight < 0.1)
-        reasons.append(f"stable ground disagrees with itself: {refused:.0%} of it left out")
+    elif found.refused > MOST_REFUSED:
+        reasons.append(f"stable ground disagrees with itself: {found.refused:.0%} of it left out")
     tilt_rad = float(np.hypot(*found.estimate[:2]))
     if tilt_rad > MOVED_SIGMAS * habits.tilt_rad:
         reasons.append(f"scanner leans {np.degrees(tilt_rad):.3f} degree from its SOP: moved?")
@@ -121,12 +127,14 @@ def adjust(patches: Patches, assumed_rad: Floats, prior: Floats, log: LineLog | 
     normal[: aside.size, : aside.size], right[: aside.size] = aside.normal, aside.right
     scatter_m2 = np.full(len(patches), SCATTER_M[0] ** 2)
     trust = np.ones(len(patches))
-    for _ in range(ROUNDS):
+    for round_ in range(ROUNDS):
         weight = trust / (patches.variance_m2 + scatter_m2)
         sums = (whole.T @ sparse.csr_array(whole.multiply(weight[:, None]))).toarray()
         solved = _solve(normal + sums, right + whole.T @ (weight * wanted_m), aside.size, correlation)
         left_m = wanted_m - whole @ solved.estimate
         scatter_m2 = _scatter(patches, left_m, moving)
+        if round_ < ROUNDS_TRUSTING:
+            continue
         ratio = left_m / np.sqrt(patches.variance_m2 + scatter_m2) / TUKEY
         trust = np.where(np.abs(ratio) < 1, (1 - ratio**2) ** 2, 0.0)
     states = slice(len(prior))
@@ -142,7 +150,7 @@ class _Aside:
         state = len(prior)
         self.size = state + self.faults
         self.normal = np.eye(self.size)
-        self.normal[:state, :state] = linalg.inv(prior)
+        self.normal[:state, :state] = _inverse(prior)
         self.right = np.zeros(self.size)
         if log is None:
             return
@@ -209,11 +217,11 @@ class _Solved:
 
 def _solve(normal: Floats, right: Floats, size: int, correlation: Floats) -> _Solved:
     """Solve; how much the moving ground changed is chosen among steps by the likelihood."""
-    inverse = linalg.inv(normal[:size, :size])
+    inverse = _inverse(normal[:size, :size])
     across = -inverse @ normal[:size, size:]
     reduced = normal[size:, size:] + normal[size:, :size] @ across
     told = right[size:] + across.T @ right[:size]
-    precision = linalg.inv(correlation)
+    precision = _inverse(correlation)
     knots = len(told)
     found = []
     for step_m in CHANGE_STEPS_M:
@@ -228,6 +236,13 @@ def _solve(normal: Floats, right: Floats, size: int, correlation: Floats) -> _So
     )
 
 
+def _inverse(matrix: Floats) -> Floats:
+    """Inverse of a covariance or a normal matrix whose unknowns have units of very different size."""
+    scale = 1 / np.sqrt(np.diag(matrix))
+    root = linalg.cho_factor(matrix * np.outer(scale, scale), lower=True)
+    return np.asarray(linalg.cho_solve(root, np.eye(len(matrix))) * np.outer(scale, scale))
+
+
 def _scatter(patches: Patches, left_m: Floats, moving: Bools) -> Floats:
     """Variance (n,) [m²] of what patches have wrong beyond their cells' random errors.
 
@@ -236,10 +251,9 @@ def _scatter(patches: Patches, left_m: Floats, moving: Bools) -> Floats:
     scatter_m2 = np.empty(len(patches))
     for chosen, most_m in ((moving, SCATTER_MOST_M), (~moving, SCATTER_M[1])):
         if chosen.any():
-            scatter_m2[chosen] = _excess(left_m[chosen], patches.variance_m2[chosen], most_m)
-    if moving.any():
-        spread = np.sqrt(patches.variance_m2 + scatter_m2)
-        scatter_m2[moving] *= _together(patches.some(moving), (left_m / spread)[moving])
+            found_m2 = _excess(left_m[chosen], patches.variance_m2[chosen], most_m)
+            spread = np.sqrt(patches.variance_m2[chosen] + found_m2)
+            scatter_m2[chosen] = found_m2 * _together(patches.some(chosen), left_m[chosen] / spread)
     return scatter_m2
 
 

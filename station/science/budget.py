@@ -11,6 +11,9 @@ from station.science import uncertainty
 from station.science.shared import Sensitivities
 from station.science.view import View
 
+TERMS = ("sigma_instrument", "sigma_atmosphere", "sigma_geometry")
+PUBLISHED = ("sigma_voordendag2023", "sigma_hartzell2015")
+
 
 def terms(
     view: View,
@@ -59,4 +62,20 @@ def terms_voordendag(view: View, scanner: Scanner) -> dict[str, Floats]:
             view.offset_m[2] / view.range_m,
             scanner.beam_divergence_rad,
         ),
+    }
+
+
+def published(view: View, count: Floats, scanner: Scanner) -> dict[str, Floats]:
+    """Uncertainty of a cell as the papers state it [m]: every error its point's own, over the root of n.
+
+    Source: Voordendag et al. (2023), Eq. 1-2; Hartzell et al. (2015), Eq. 9 and 12, with the tilt's noise as
+    part of each point's covariance (EQUATIONS 2.9). For comparison: what points share they take for random.
+    """
+    seen = view.range_m, view.cos_incidence, view.cos_slope
+    voordendag_m2 = uncertainty.shot_variance_voordendag(*seen, view.offset_m[2] / view.range_m, scanner)
+    lean_m = np.hypot(view.offset_m[0], view.offset_m[1]) * scanner.inclination_sigma_rad
+    hartzell_m2 = uncertainty.shot_variance(*seen, scanner) + lean_m**2
+    return {
+        "sigma_voordendag2023": np.sqrt(voordendag_m2 / count),
+        "sigma_hartzell2015": np.sqrt(hartzell_m2 / count),
     }

@@ -156,10 +156,10 @@ class Stack:
         return bright
 
     def variance_factor(self, classes: Ints) -> Floats32:
-        """Random variance that cells show from scan to scan against the modelled (ny, nx), drawn to its class.
+        """Random variance that cells show from scan to scan against the modelled (ny, nx).
 
-        `classes` (ny, nx) counts from nought. A cell's own few steps weigh as many against
-        `CLASS_STEPS` of its class. One where there is nothing to tell.
+        It is drawn to that of the cell's class, of `classes` (ny, nx) from nought: its own few steps weigh
+        against `CLASS_STEPS` of the class. One where there is nothing to tell.
         """
         number = int(classes.max()) + 1
         of_class = np.bincount(classes.ravel(), self._steps.ravel(), number)

@@ -12,7 +12,8 @@ BLOCK_M = 50.0  # of stable ground, withheld together
 WITHHELD_EVERY = 10
 MOVING_STEEPEST = np.tan(np.radians(37.0))  # steeper ground holds snow here and not there
 STABLE_FLATTEST = np.tan(np.radians(40.0))  # of ground found stable: steep enough not to hold snow
-BRIGHTER = 1.5  # rock under snow reflects 1064 nm two to four times as well
+BRIGHTER = 1.25  # rock under 1 cm of snow or more; it reflects 1064 nm two to four times as well
+DARKER = 0.5  # rock that snow has left; wet rock alone is not as dark
 CLASS_RANGE_M = 500.0
 CLASS_SLOPE = 0.25
 
@@ -46,8 +47,7 @@ def looks_unlike(intensity: Floats32, reference: Floats32) -> Bools:
 
     False where either is unknown.
     """
-    with np.errstate(invalid="ignore", divide="ignore"):
-        return np.asarray(np.abs(np.log(intensity / reference)) > np.log(BRIGHTER))
+    return np.asarray((intensity > BRIGHTER * reference) | (intensity < DARKER * reference))
 
 
 def classes(range_m: Floats, tan_slope: Floats) -> Ints:

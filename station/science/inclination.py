@@ -15,6 +15,9 @@ SENSOR_STEP_RAD = math.radians(0.001)  # the log's last digit
 HAMPEL_HALF_WIDTH = 7  # samples
 HAMPEL_SIGMAS = 5.0
 WINDOW_SAMPLES = (5, 301)  # shortest that filters, longest that still follows five minutes
+# A minute's window for a scan that is adjusted: what is faster the adjustment finds from the raw log and the
+# ground, while noise that a short window lets through differs from shot to shot and is lost to it.
+GENTLE_CUTOFF_HZ = 0.82 / 61
 BLACKMAN_CUTOFF = 0.82  # -3 dB frequency of an N-sample Blackman window times N, EQUATIONS 2.8
 CYCLE_PRIOR_RAD = math.radians(0.05)  # largest cyclic error seen at Helheim, EQUATIONS 2.7
 OFFSET_PRIOR_S = 2.5  # clocks differ by up to 5 s, taken as two sigma: Voordendag et al. (2023), section 3.1
@@ -168,8 +171,9 @@ def window_length(values: Floats, rate_hz: float, cutoff_hz: float | None) -> in
 class Lean:
     """What the log says of a scan: the tilt to apply and how well it is known.
 
-    `raw` is the same before the filter. `noise_rad` is of one raw sample, `filtered_noise_rad` of the filtered signal, whose errors are common
-    to everything measured within `memory_s`. `gap_s` is the longest stretch without a sample.
+    `raw` is the same before the filter. `noise_rad` is of one raw sample, `filtered_noise_rad` of the
+    filtered signal, whose errors are common to everything measured within `memory_s`. `gap_s` is the longest
+    stretch without a sample.
     """
 
     tilt: Tilt

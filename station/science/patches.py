@@ -84,8 +84,8 @@ def collect(of: Basis, bands: Iterable[Cells], reach_m: float) -> Patches:
         stretch = np.minimum((cells.range_m[used] / STRETCH_M).astype(np.int64), stretches - 1)
         key = cells.kind[used] * a_kind + felt.line[used] * stretches + stretch
         weight = 1 / cells.variance_m2[used]
-        for total, effect in zip(sums, [*felt.globals_, felt.lean, felt.refraction], strict=False):
-            total += np.bincount(key, weight * effect[used], size)
+        for row, effect in enumerate([*felt.globals_, felt.lean, felt.refraction]):
+            sums[row] += np.bincount(key, weight * effect[used], size)
         sums[-1] += np.bincount(key, weight, size)
         held.append(
             (key.astype(np.int32), cells.residual_m[used].astype(np.float32), weight.astype(np.float32))

@@ -36,10 +36,8 @@ HEAD_SPEED_RAD_S = math.radians(0.13)  # where the scan does not tell; EQUATIONS
 def globals_sigma(habits: Habits, *, weather_known: bool) -> Floats:
     """One sigma of each global parameter (9,)."""
     scale_ppm = habits.range_scale_ppm if weather_known else RANGE_SCALE_UNKNOWN_PPM
-    return np.array(
-        [habits.tilt_rad, habits.tilt_rad, habits.heading_rad, *[habits.translation_m] * 3]
-        + [habits.range_bias_m, scale_ppm, habits.refraction]
-    )
+    turns, shifts = (habits.tilt_rad, habits.tilt_rad, habits.heading_rad), (habits.translation_m,) * 3
+    return np.array([*turns, *shifts, habits.range_bias_m, scale_ppm, habits.refraction])
 
 
 @dataclass(frozen=True)

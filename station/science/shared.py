@@ -39,8 +39,8 @@ MOST_LEANING_COS = math.cos(math.radians(10.0))  # beyond, a sector on the map s
 class Basis:
     """The parameters of a station: nine, then lean and refraction at knots from azimuth `start_rad` on.
 
-    Azimuths are those of the scanner's head: about its axis of rotation, given as (east, north, up), clockwise
-    from grid north, so that a scan line has one, however the mount leans. `closed`: the knots go all the way
+    Azimuths are those of the scanner's head: about its axis of rotation (east, north, up), clockwise from
+    grid north, so that a scan line has one, however the mount leans. `closed`: the knots go all the way
     round.
     """
 
@@ -104,7 +104,9 @@ class Basis:
         """How many knots of the lean the head has passed when it looks there (n,), in fractions of knots."""
         clockwise = _clockwise(self.axis)
         east, north = (sum(e * p for e, p in zip(axis, offset_m, strict=True)) for axis in clockwise)
-        passed = ((np.arctan2(east, north) - self.start_rad) % (2 * math.pi)) / LEAN_KNOT_RAD
+        passed: Floats = (
+            np.asarray((np.arctan2(east, north) - self.start_rad) % (2 * math.pi)) / LEAN_KNOT_RAD
+        )
         if self.closed:
             return np.minimum(passed, np.nextafter(self.intervals, 0))
         beyond = (self.intervals + 2 * math.pi / LEAN_KNOT_RAD) / 2  # nearer the first knot than the last

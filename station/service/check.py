@@ -16,7 +16,7 @@ from station.readers.weather import air_at, read_weather
 from station.service import child
 from station.service.gather import frame_of
 from station.service.once import arrival_of
-from station.service.tasks import rehearse, series_of
+from station.service.tasks import areas_of, polygons, rehearse, series_of
 
 Finding = dict[str, str]  # level (ok, warning, fault), what, says
 EPOCH_BYTES_PER_CELL = 16  # of an epoch without compression
@@ -29,6 +29,7 @@ def check(site_path: Path) -> list[Finding]:
     return [
         _finding("ok", "config", f"{site_path}: {site.station.name or site.station.id}"),
         *_pose(site),
+        *_polygons(site),
         *_folders(site),
         *_clock(),
         *_weather(site),
@@ -66,6 +67,20 @@ def _pose(site: Site) -> Iterator[Finding]:
         )
         if away_m > site.scanner.range_max_m:
             yield _finding("fault", "grid", f"begins {away_m:,.0f} m from the scanner: beyond range_max_m")
+
+
+def _polygons(site: Site) -> Iterator[Finding]:
+    """Tell how many cells the named polygons hold."""
+    try:
+        named = {f"area {name}": cells for name, cells in areas_of(site).items()}
+        if isinstance(site.adjustment.stable, Path) and site.adjustment.method == "joint":
+            named["stable ground"] = polygons(site.adjustment.stable, site)
+    except StationError as error:
+        yield _finding("fault", "polygons", str(error))
+        return
+    for name, cells in named.items():
+        says = f"{name}: {int(cells.sum()):,} cells of the grid"
+        yield _finding("ok" if cells.any() else "fault", "polygons", says)
 
 
 def _folders(site: Site) -> Iterator[Finding]:

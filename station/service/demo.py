@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import sys
 from pathlib import Path
 
@@ -12,12 +11,10 @@ from rich.console import Console
 from rich.progress import Progress
 from rich.table import Table
 
-from station.archive.reference import read_reference
+from station.archive.aggregate import Aggregates
 from station.archive.store import open_series
 from station.config import Site, read_site
 from station.quantities import Quality
-from station.science import shared, terrain
-from station.service.gather import frame_of
 from station.service.journal import Entry, State
 from station.service.once import one_line, process_scans
 from station.service.tasks import series_of
@@ -55,31 +52,22 @@ def run_demo(folder: Path, hours: int) -> int:
 
 def _what_changed(site: Site, series: xr.Dataset, truth: xr.Dataset) -> Table:
     """Compare the mean change of the glacier with the truth, scan by scan."""
-    store = series_of(site)
-    reference = read_reference(store)
-    assert reference is not None  # noqa: S101 - the demo has scans enough
+    found = Aggregates(series_of(site))
     in_truth = [str(scan_id) for scan_id in truth.scan_id.values]
-    zero = truth.change.values[[in_truth.index(scan_id) for scan_id in reference.scan_ids]].mean(axis=0)
-    position_m = frame_of(site, site.sop[0]).position_m
-    of = shared.basis(store.grid, position_m)
-    gradient = terrain.smooth_gradient(reference.elevation_m, store.grid.cell_m)
+    zero = truth.change.values[[in_truth.index(scan_id) for scan_id in found.reference().scan_ids]].mean(
+        axis=0
+    )
+    ice = truth.ice.values > 0.5
     table = Table(title="Mean change of the glacier", caption="against the mean of the reference's scans")
     for name in ("scan", "measured, m", "± 1 σ, m", "true, m", "cells changed at 95 %"):
         table.add_column(name, justify="left" if name == "scan" else "right", no_wrap=True)
     for i, scan_id in enumerate(str(one) for one in series.scan_id.values):
-        change_m = series.elevation_change[i].values
-        ice = (truth.ice.values > 0.5) & np.isfinite(change_m)
-        felt = shared.cell_sensitivities(of, store.grid, position_m, reference.elevation_m, gradient, ice)
-        random_m2 = series.elevation_change_random_uncertainty[i].values[ice].astype(np.float64) ** 2
-        covariance = series.shared_parameter_covariance[i].values.astype(np.float64)
-        if reference.shared is not None:
-            covariance = covariance + reference.shared.covariance
-        mean = np.full(ice.sum(), 1 / ice.sum())
-        sigma_m = math.sqrt(shared.aggregate_variance(mean, random_m2, felt, covariance))
-        true_m = (truth.change.values[in_truth.index(scan_id)] - zero)[ice].mean()
-        certain = (series.quality[i].values[ice].astype(int) & Quality.CHANGE_SIGNIFICANT) > 0
+        measured_m, sigma_m, _ = found.mean_change(ice, found.row(i))
+        seen = ice & np.isfinite(series.elevation_change[i].values)
+        true_m = (truth.change.values[in_truth.index(scan_id)] - zero)[seen].mean()
+        certain = (series.quality[i].values[seen].astype(int) & Quality.CHANGE_SIGNIFICANT) > 0
         told = (
-            f"{change_m[ice].mean():+.3f}",
+            f"{measured_m:+.3f}",
             f"{sigma_m:.3f}",
             f"{true_m:+.3f}",
             f"{100 * certain.mean():.0f} %",

@@ -229,6 +229,8 @@ def _lean(
     if log is None or zero is None or site.inclination is None:
         return None
     cutoff_hz = None if site.inclination.cutoff_hz == "auto" else site.inclination.cutoff_hz
+    if cutoff_hz is None and site.adjustment.method == "joint":
+        cutoff_hz = inclination.GENTLE_CUTOFF_HZ
     sigma_rad = site.instrument.inclination_sigma_rad
     filtered = site.inclination.filter == "blackman"
     lean = inclination.relative_lean(log, track, zero, sigma_rad, cutoff_hz, filtered=filtered)

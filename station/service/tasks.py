@@ -26,11 +26,12 @@ from station.archive.layout import Series
 from station.archive.reference import read_reference, write_reference
 from station.archive.series import build_series
 from station.config import Site
-from station.errors import NotReadyError, ScanError
+from station.errors import NotReadyError, ScanError, StoreError
 from station.pipeline import (
     Told,
     corrections,
     gridder_for,
+    improved,
     level,
     master,
     measure,
@@ -50,6 +51,7 @@ from station.service.gather import Gathered, gather
 from station.service.inbox import Arrival
 
 Progress = Callable[[], None]
+MOST_REFUSED = 0.6  # of the stable ground; then the filtered log alone is safer
 MOST_SOURCES = 400  # of the series: past the limit of open files some readers return wrong data
 REFERENCE_PASSES = 3  # a third improves the second by a tenth, a fourth the third by nothing measurable
 
@@ -160,9 +162,12 @@ def _measure(
     progress()
     levelled = _level(site, gridder, gathered, reference)
     unknown, lacking = gathered.unknown, list(gathered.lacking)
-    if levelled is not None:
-        lacking += distrust(levelled[1], reference.habits) if reference else []
-        unknown = levelled[1].shared()
+    if levelled is not None and reference is not None:
+        lacking += distrust(levelled[1], reference.habits)
+        if levelled[1].refused > MOST_REFUSED:
+            levelled = None
+        else:
+            unknown = levelled[1].shared()
     measured = measure(gridder, gathered.setup, unknown, reference, levelled)
     progress()
     return store.Epoch(
@@ -199,12 +204,15 @@ def _level(
 def stable_ground(site: Site, reference: Reference) -> Bools:
     """Return which cells (ny, nx) are stable: those inside the owner's polygons, or those found."""
     given = site.adjustment.stable
-    if given == "auto":
-        return reference.stable
-    stable = np.zeros(site.grid_cells.shape, bool)
-    for polygon in read_polygons(given, site.map.crs).values():
-        stable |= mask(polygon, site.grid_cells)
-    return stable
+    return polygons(given, site) if isinstance(given, Path) else reference.stable
+
+
+def polygons(file: Path, site: Site) -> Bools:
+    """Return the cells (ny, nx) inside any of the polygons of a file."""
+    inside = np.zeros(site.grid_cells.shape, bool)
+    for polygon in read_polygons(file, site.map.crs).values():
+        inside |= mask(polygon, site.grid_cells)
+    return inside
 
 
 def _same_as(series: Series, epoch: store.Epoch) -> store.Stored | None:
@@ -232,16 +240,34 @@ def build_reference(site: Site, arrivals: list[Arrival], version: str, progress:
     for _ in range(REFERENCE_PASSES):
         stack = Stack(series.grid)
         laid = [_lay_on(stack, site, arrival, surface, progress) for arrival in arrivals]
-        gathered = laid[0][0]
-        habits = surface.habits if surface else Habits()
-        if gathered.told is not None:
-            found = [(g.told.lines, f.estimate, f.covariance) for g, f in laid if g.told and f]
-            habits = learned(habits, gathered.told.of, found)
+        habits = _learned(surface.habits if surface else Habits(), laid)
         unknown = [one.unknown for one, _ in laid]
-        surface = master(stack, surface, unknown, gathered.setup, version, scan_ids, habits)
+        surface = master(stack, surface, unknown, laid[0][0].setup, version, scan_ids, habits)
     if surface is not None:
         write_reference(series, surface)
     return version
+
+
+def improve_reference(site: Site, arrivals: list[Arrival], version: str, progress: Progress) -> str:
+    """Store a version of the reference that knows stable ground and the station's habits from more scans."""
+    series = series_of(site)
+    base = reference_of(site)
+    if base is None:
+        raise StoreError(f"{series.folder}: no reference to improve")
+    stack = Stack(series.grid)
+    laid = [_lay_on(stack, site, arrival, base, progress) for arrival in arrivals]
+    habits = _learned(base.habits, laid)
+    write_reference(series, improved(base, stack, laid[0][0].setup, version, habits))
+    return version
+
+
+def _learned(habits: Habits, laid: list[tuple[Gathered, Adjustment | None]]) -> Habits:
+    """Return what adjusted scans show of the station's habits."""
+    found = [
+        (g.told.lines, a.estimate, a.covariance) for g, a in laid if g.told is not None and a is not None
+    ]
+    told = laid[0][0].told
+    return habits if told is None else learned(habits, told.of, found)
 
 
 def _lay_on(

@@ -18,6 +18,7 @@ from station.service.tasks import (
     Outcome,
     Progress,
     build_reference,
+    improve_reference,
     join_epochs,
     open_only,
     process,
@@ -28,6 +29,8 @@ from station.service.tasks import (
 
 log = logging.getLogger("station")
 T = TypeVar("T")
+IMPROVED_EVERY = 4  # a version is due at four times the scans of the one before
+IMPROVED_MOST = 32  # scans that are read for it
 
 
 class Worker:
@@ -126,26 +129,47 @@ class Worker:
         return any(days) or any(months)
 
     def _make_reference_when_due(self) -> None:
-        """Build the master surface once enough usable scans are stored, and have them measured from it."""
+        """Build the master surface once enough usable scans are stored; make a better one of ever more.
+
+        All epochs are measured from the first. Later versions change it on stable ground only, so that
+        epochs measured from an older one stay as they are.
+        """
         wanted = self._site.reference.scans
-        if isinstance(wanted, Path) or (self._site.station.data / "reference.nc").exists():
+        if isinstance(wanted, Path):
             return
         usable = [row for row in self._journal.rows(State.STORED) if row.verdict == "good"]
         usable.sort(key=lambda row: row.start_utc_s or 0.0)
-        if len(usable) < wanted:
+        version = self._versions() + 1
+        due = wanted * IMPROVED_EVERY ** (version - 1)
+        if len(usable) < due or (version > 1 and self._site.adjustment.method == "none"):
             return
-        arrivals = [self._arrival(row.name) for row in usable[:wanted]]
+        chosen = usable[:wanted]
+        if version > 1:
+            step = max(1, due // IMPROVED_MOST)
+            chosen = usable[:due][::step][:IMPROVED_MOST]
+        arrivals = [self._arrival(row.name) for row in chosen]
         missing = [arrival.name for arrival in arrivals if not arrival.path.is_file()]
-        if missing:
+        if missing and version == 1:
             log.warning("%s", logfmt(reference="waiting", reason=f"no longer there: {', '.join(missing)}"))
             return
+        arrivals = [arrival for arrival in arrivals if arrival.path.is_file()]
+        if len(arrivals) < wanted:
+            return
         try:
-            version = self._run(build_reference, arrivals, "1")
+            made = self._run(build_reference if version == 1 else improve_reference, arrivals, str(version))
         except (ScanError, NotReadyError) as error:
             log.warning("%s", logfmt(reference="failed", reason=error))
             return
-        log.info("%s", logfmt(reference=version, scans=wanted))
-        self._journal.again(row.name for row in self._journal.rows(State.STORED) if row.reference != version)
+        log.info("%s", logfmt(reference=made, scans=len(arrivals)))
+        if version == 1:
+            others = (row.name for row in self._journal.rows(State.STORED) if row.reference != made)
+            self._journal.again(others)
+
+    def _versions(self) -> int:
+        """Return the newest version of the reference, nought where there is none."""
+        found = self._site.station.data.glob("reference_*.nc")
+        numbers = (path.stem.removeprefix("reference_") for path in found)
+        return max((int(number) for number in numbers if number.isdigit()), default=0)
 
     def _arrival(self, name: str) -> Arrival:
         """Find a scan again: where it was taken from, or in the inbox."""

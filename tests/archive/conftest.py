@@ -40,7 +40,7 @@ def make_epoch(hour, *, value=None, grid=GRID, terms=False):
         measurement=Measurement(
             surface, 2 * sigma, sigma, seen.astype(np.uint8), {"sigma_geometry": sigma} if terms else {}
         ),
-        shared=Shared(names, ("rad", "rad", "m"), np.zeros(3), np.diag([1e-10, 2e-10, 1.6e-5])),
+        shared=Shared(names, ("rad", "rad", "m"), np.zeros(3), np.diag([1e-10, 2e-10, 1.6e-5]), np.zeros(3)),
         verdict="good",
         verdict_reason="",
         numbers={"platform_roll": 0.12, "air_temperature": -3.5, "point_total": 1234.0, "coverage": 0.5},

@@ -131,7 +131,7 @@ def test_progress_is_told_after_every_epoch(filled):
 def moved(epoch):
     """The same scan from a scanner that was moved: other azimuths, so other shared parameters."""
     shared = Shared(("tilt_north", "lean_090.0", "range_bias"), ("rad", "rad", "m"), np.arange(3.0),
-                    np.arange(9.0).reshape(3, 3) * 1e-6)  # fmt: skip
+                    np.arange(9.0).reshape(3, 3) * 1e-6, np.zeros(3))  # fmt: skip
     return dataclasses.replace(epoch, shared=shared)
 
 

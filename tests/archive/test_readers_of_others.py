@@ -38,7 +38,7 @@ def built(series, epoch):
     elevation = np.full(series.grid.shape, 2900.125)
     reference.write_reference(
         series,
-        Reference(series.grid, "1", elevation, *[np.zeros_like(elevation, np.float32)] * 2, None, ("a",)),
+        Reference.given(series.grid, "1", elevation),
     )
     return build_series(series)
 
@@ -78,8 +78,7 @@ def test_compliance_checker_finds_nothing_without_a_map(series, epoch, which, tm
     store.write_epoch(local, epoch(0))
     build_series(local)
     elevation = np.full(series.grid.shape, 2900.125)
-    flat = np.zeros_like(elevation, np.float32)
-    reference.write_reference(local, Reference(series.grid, "1", elevation, flat, flat, None, ("a",)))
+    reference.write_reference(local, Reference.given(series.grid, "1", elevation))
     with xr.open_dataset(series.folder / which) as told:
         assert "crs" not in told
     assert findings(series.folder / which, tmp_path / "report.json") == []

@@ -24,7 +24,7 @@ def gridded(points, reference=None, splits=()):
     for x_m, y_m, z_m in zip(*(np.split(axis, splits) for axis in points), strict=True):
         inside, column, row = gridder.cells(x_m, y_m)
         z_m = z_m[inside]  # noqa: PLW2901 - only what lies on the grid
-        gridder.add(gridder.flat(column, row), z_m - gridder.datum_m, np.full(len(z_m), 0.04))
+        gridder.add(gridder.flat(column, row), z_m - gridder.datum_m, np.full(len(z_m), 0.04), None)
     return gridder
 
 
@@ -68,13 +68,11 @@ def test_residuals_to_a_sloping_reference_lose_the_sampling_error():
     z_m = slope * x_m
     truth = slope * np.broadcast_to(grid.x_m, grid.shape)
     flat = Gridder(grid, None, 0.0)
-    with_reference = Gridder(
-        grid, Reference(grid, "1", truth, *[np.zeros(grid.shape, np.float32)] * 2, None, ()), 0.0
-    )
+    with_reference = Gridder(grid, Reference.given(grid, "1", truth), 0.0)
     for gridder in (flat, with_reference):
         _, column, row = gridder.cells(x_m, y_m)
         below = gridder.ground.under(column, row)[0] if gridder.ground else 0.0
-        gridder.add(gridder.flat(column, row), z_m - below, np.zeros(len(z_m)))
+        gridder.add(gridder.flat(column, row), z_m - below, np.zeros(len(z_m)), None)
     count = flat.count.reshape(grid.shape)
     single = count == 2
     plain = (flat.mean_residual() - truth)[single].std()

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from station.quantities import Grid
-from station.science import inclination, shared
+from station.quantities import Grid, Habits, Shared
+from station.science import inclination, prior, shared
 from station.science.air import EARTH_RADIUS_M
 
 EAST, NORTH = 0.3, -0.2  # gradient of the plane the cells lie on
@@ -64,13 +64,16 @@ def test_sensitivities_against_moved_points(parameter, unit):
 
 def dense(felt):
     """The whole matrix J, by asking for the effect on each cell alone."""
-    count = len(felt.knot)
-    return np.array([felt.total(np.eye(count)[i]) for i in range(count)])
+    return np.array([felt.total(row) for row in np.eye(len(felt))])
 
 
-def random_covariance(size, seed=1):
-    root = np.random.default_rng(seed).normal(size=(size, size)) * 1e-4
-    return root @ root.T
+def random_unknown(of, seed=1):
+    rng = np.random.default_rng(seed)
+    size = len(of.names)
+    root = rng.normal(size=(size, size)) * 1e-4
+    noise = np.zeros(size)
+    noise[9 : 9 + of.intervals] = rng.uniform(0, 1e-7, of.intervals)
+    return Shared(of.names, of.units, np.zeros(size), root @ root.T, noise)
 
 
 @pytest.mark.parametrize("position_m", [(0.0, 0.0, 0.0), (1500.0, 3000.0, 0.0)], ids=["sector", "all round"])
@@ -79,21 +82,37 @@ def test_variance_is_the_diagonal_of_jcjt(position_m):
     assert of.closed == (position_m[0] > 0)
     place_m = tuple(axis - origin for axis, origin in zip(cells(), position_m, strict=True))
     felt = shared.sensitivities(of, place_m, np.full(200, EAST), np.full(200, NORTH))
-    covariance = random_covariance(len(of.names))
+    unknown = random_unknown(of)
     matrix = dense(felt)
-    assert felt.variance(covariance) == pytest.approx(np.diag(matrix @ covariance @ matrix.T))
+    line = np.zeros((200, of.line_count))
+    line[np.arange(200), felt.line] = felt.lean
+    own = np.repeat(unknown.noise_variance[9 : 9 + of.intervals], shared.LINES_A_KNOT)
+    whole = matrix @ unknown.covariance @ matrix.T + (line * own) @ line.T
+    assert felt.variance(unknown) == pytest.approx(np.diag(whole))
     weights = np.random.default_rng(2).uniform(size=200)
-    wanted = weights @ (np.eye(200) * 0.01 + matrix @ covariance @ matrix.T) @ weights
-    told = shared.aggregate_variance(weights, np.full(200, 0.01), felt, covariance)
+    wanted = weights @ (np.eye(200) * 0.01 + whole) @ weights
+    told = shared.aggregate_variance(weights, np.full(200, 0.01), felt, unknown)
     assert told == pytest.approx(wanted)
 
 
 def test_knots_cover_the_sector():
     of = shared.basis(GRID, (0.0, 0.0, 0.0))
     corners = [math.atan2(e, n) for e in (500, 2500) for n in (2500, 4000)]
-    assert of.azimuth_rad[0] <= min(corners)
-    assert of.azimuth_rad[-1] >= max(corners)
-    assert len(of.names) == len(of.units) == 9 + 2 * of.count
+    assert of.refraction_azimuth_rad[0] <= min(corners)
+    assert of.refraction_azimuth_rad[-1] >= max(corners)
+    assert of.line_azimuth_rad[0] < of.refraction_azimuth_rad[1]
+    assert len(of.names) == len(of.units) == 9 + of.lean_count + of.refraction_count
+
+
+def test_a_line_of_a_leaning_head_has_one_azimuth():
+    """Turned about an axis 5° from the plumb line, the head's plane crosses many azimuths of the map."""
+    turn = Rotation.from_euler("xy", [5, 5], degrees=True).as_matrix()
+    of = shared.basis(GRID, (0.0, 0.0, 0.0), tuple(turn[:, 2]))
+    elevation = np.radians(np.linspace(-30, 20, 11))
+    line = np.stack([0.6 * np.cos(elevation), 0.8 * np.cos(elevation), np.sin(elevation)])
+    passed = of.knots_before(tuple(1000 * turn @ line))
+    assert passed == pytest.approx(passed[0], abs=1e-6)
+    assert np.ptp(np.degrees(np.arctan2(*(turn @ line)[:2]))) > 2
 
 
 def test_an_area_mean_does_not_average_its_shared_errors_away():
@@ -101,12 +120,13 @@ def test_an_area_mean_does_not_average_its_shared_errors_away():
     of = shared.basis(GRID, (0.0, 0.0, 0.0))
     place_m = cells(4000)
     felt = shared.sensitivities(of, place_m, np.full(4000, EAST), np.full(4000, NORTH))
-    unknown = shared.covariance_without_adjustment(
-        of, None, inclination.LEVEL, np.zeros(of.count), math.radians(0.13), weather_known=True
+    lines = prior.lines_of(of, np.eye(3), None)
+    unknown = prior.covariance_without_adjustment(
+        of, lines, None, inclination.LEVEL, Habits(), weather_known=True
     )
     weights = np.full(4000, 1 / 4000)
-    mean_m2 = shared.aggregate_variance(weights, np.full(4000, 0.01), felt, unknown.covariance)
-    alone_m2 = 0.01 + felt.variance(unknown.covariance).mean()
+    mean_m2 = shared.aggregate_variance(weights, np.full(4000, 0.01), felt, unknown)
+    alone_m2 = 0.01 + felt.variance(unknown).mean()
     assert math.sqrt(mean_m2) > 10 * math.sqrt(alone_m2 / 4000)
 
 
@@ -117,9 +137,9 @@ def test_what_the_log_cannot_know_is_a_covariance():
     log = inclination.InclinationLog(time_s, *noise)
     lean = inclination.relative_lean(log, None, inclination.LEVEL, math.radians(0.008))
     zero = inclination.Cycle((0, 7e-4, 0), (0, 0, 7e-4))
-    azimuth = np.linspace(0, 1, of.count)
+    lines = prior.lines_of(of, np.eye(3), None)
     with_log, without = (
-        shared.covariance_without_adjustment(of, told, zero, azimuth, math.radians(0.13), weather_known=True)
+        prior.covariance_without_adjustment(of, lines, told, zero, Habits(), weather_known=True)
         for told in (lean, None)
     )
     for unknown in (with_log, without):

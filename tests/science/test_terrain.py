@@ -39,7 +39,7 @@ def test_smooth_gradient_of_a_plane_with_holes():
 def test_ground_is_bilinear_between_centres_and_goes_on_to_the_edge():
     surface = plane(0.5, 0.25)
     surface[20:, 30:] = np.nan
-    ground = terrain.ground(Reference(GRID, "1", surface, *[np.zeros(GRID.shape, np.float32)] * 2, None, ()))
+    ground = terrain.ground(Reference.given(GRID, "1", surface))
     x_m, y_m = np.random.default_rng(0).uniform([[0.0], [0.01]], [[39.99], [50.0]], (2, 4000))
     known = ground.known[(50 - y_m).astype(int), x_m.astype(int)]
     height_m, east, north = ground.under(x_m[known], 50 - y_m[known])
