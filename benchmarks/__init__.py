@@ -1,0 +1,1 @@
+"""What the station reaches, measured: accuracy against simulated truth, and time as ratios."""
