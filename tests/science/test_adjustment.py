@@ -384,17 +384,18 @@ def test_stable_ground_that_disagrees_with_itself_is_distrusted():
 
 
 @pytest.mark.parametrize(
-    ("place", "size", "word"), [(0, 0.0006, "leans"), (2, 0.0003, "turned"), (5, 0.05, "shifted")]
+    ("place", "size", "word"), [(0, 0.0006, "leans"), (2, 0.00011, "turned"), (5, 0.013, "shifted")]
 )
 def test_a_scanner_that_was_moved_is_told(place, size, word):
     covariance, _ = prior_of(OF)
-    stable = ground(54, 400)
-    state = np.zeros(len(covariance))
-    state[place] = size
-    found = adjust(stable.patches(stable.matrix() @ state), STILL, covariance, None)
-    if not distrust(found, HABITS):  # the prior draws it in: say it by what it is
-        found = replace(found, estimate=state)
-    assert any(word in reason for reason in distrust(found, HABITS))
+    at_rest = adjust(ground(54, 400).patches(np.zeros(400)), STILL, covariance, None)
+    assert distrust(at_rest, HABITS) == []
+    for share, wanted in ((0.5, []), (1.0, [word])):
+        moved = np.zeros(len(covariance))
+        moved[place] = share * size
+        reasons = distrust(replace(at_rest, estimate=moved), HABITS)
+        assert [word for reason in reasons if word in reason] == wanted
+        assert len(reasons) == len(wanted)
 
 
 def test_withheld_and_unused_patches_are_not_looked_at():

@@ -1,7 +1,10 @@
 """What is known before a scan: when lines are passed, covariances, habits learned from simulated scans."""
 
+import ctypes
 import math
+from contextlib import suppress
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -14,6 +17,16 @@ from station.science.inclination import LEVEL, Cycle, Lean
 HABITS = Habits()
 OF = shared.Basis(math.radians(20), 30, closed=False)
 SPEED_RAD_S = math.radians(0.13)
+
+
+@pytest.fixture(autouse=True, scope="module")
+def one_thread():
+    """As in the service: on a busy machine matrices of this size take 20 times as long on several."""
+    maps = Path("/proc/self/maps").read_text(encoding="utf-8")
+    for library in {line.split()[-1] for line in maps.splitlines() if "openblas" in line}:
+        for name in ("scipy_openblas_set_num_threads", "scipy_openblas_set_num_threads64_"):
+            with suppress(AttributeError):
+                getattr(ctypes.CDLL(library), name)(1)
 
 
 def mount(heading_deg, leaning_deg, towards_deg=35.0):
@@ -224,7 +237,7 @@ def test_what_a_scan_leaves_unknown_counts_as_shown():
     lines = prior.lines_of(OF, np.eye(3), None)
     sigma = prior.globals_sigma(HABITS, weather_known=True)
     covariance = prior.by_line(OF, sigma, prior.motion(HABITS, lines), prior.bending(HABITS, OF))
-    blind = [(lines, np.zeros(len(covariance)), covariance)] * 200
+    blind = [(lines, np.zeros(len(covariance)), covariance)] * 80
     for name, value in vars(prior.learned(HABITS, OF, blind)).items():
         assert value == pytest.approx(getattr(HABITS, name), rel=0.01)
 
