@@ -267,7 +267,7 @@ class Calibration:
     def _withheld(self) -> dict[str, dict[str, float]]:
         """Spread of z of single cells: stable but kept out of the fit, fitted, and the rest."""
         result = self.result
-        kept_out = ground.withheld(result.site.grid_cells)
+        kept_out = ground.withheld(result.site.grid_cells.x_m, result.site.grid_cells.y_m[:, None])
         stable = (result.quality & Quality.STABLE_GROUND) > 0
         with np.errstate(invalid="ignore", divide="ignore"):
             z = result.error_m / result.sigma_m

@@ -38,6 +38,7 @@ from station.science.view import Points, View
 BAND_ROWS = 128  # the cells that are looked at together: what a store chunk is high
 MARGIN_ROWS = 4  # rows beyond a band that its smoothed gradient looks at
 FEW_POINTS = 3
+MOVING_MOST = 1_000_000  # cells of moving ground that an adjustment looks at
 FEW_STABLE = 20  # cells, that say nothing of a spread
 PROVISIONAL_CELLS = 1.0  # one sigma of the smoothing before residuals are taken
 UNCHANGED_SIGMAS = 3.0  # of a mean over many scans, on ground that stays
@@ -149,20 +150,26 @@ def level(gridder: Gridder, setup: Setup, told: Told, reference: Reference, stab
 
 
 def _cells(gridder: Gridder, setup: Setup, of: Basis, reference: Reference, stable: Bools) -> Iterator[Cells]:
-    """Give the cells of a scan that the reference knows, band by band."""
-    mean_m, kept_out, bright = gridder.mean_residual(), ground.withheld(setup.grid), gridder.intensity()
+    """Give the cells of a scan that the reference knows, band by band; of too many moving ones a part."""
+    grid, mean_m, bright = setup.grid, gridder.mean_residual(), gridder.intensity()
     model_m2 = gridder.random_variance()
-    count = gridder.count.reshape(setup.grid.shape)
-    for band in _bands(setup.grid):
+    count = gridder.count.reshape(grid.shape)
+    every = 1 + np.count_nonzero(count) // MOVING_MOST
+    for band in _bands(grid):
         seen = np.isfinite(mean_m[band]) & np.isfinite(reference.elevation_m[band])
+        seen &= stable[band] | (
+            np.add.outer(np.arange(*band.indices(grid.ny)), np.arange(grid.nx)) % every == 0
+        )
         if not seen.any():
             continue
         view = _view(setup, band, seen, reference.elevation_m)
         unlike = ground.looks_unlike(bright[band][seen], reference.intensity[band][seen])
+        row, column = np.nonzero(seen)
+        kept_out = ground.withheld(grid.x_m[column], grid.y_m[band][row])
         yield Cells(
             _felt(view, of),
             np.hypot(view.offset_m[0], view.offset_m[1]),
-            ground.kinds(stable[band][seen], kept_out[band][seen], view.tan_slope, unlike),
+            ground.kinds(stable[band][seen], kept_out, view.tan_slope, unlike),
             mean_m[band][seen],
             _random(model_m2, count, reference, band, seen) + reference.random_variance_m2[band][seen],
         )
@@ -231,7 +238,9 @@ def measure(
 def stable_figures(measured: Measurement) -> dict[str, float]:
     """Return how a scan does on stable ground it was not fitted to: number of cells, median, spread, z."""
     surface = measured.surface
-    chosen = ((measured.quality & Quality.STABLE_GROUND) > 0) & ground.withheld(surface.grid)
+    chosen = (measured.quality & Quality.STABLE_GROUND) > 0
+    row, column = np.nonzero(chosen)
+    chosen[row, column] = ground.withheld(surface.grid.x_m[column], surface.grid.y_m[row])
     change_m, sigma_m = surface.change_m[chosen], measured.uncertainty_m[chosen]
     figures = {"stable_count": float(len(change_m))}
     if len(change_m) >= FEW_STABLE:
@@ -333,7 +342,7 @@ class _Judge:
             terms = budget.terms(view, count, sampling_m2, felt, unknown, setup.scanner)
             terms |= budget.published(view, count, setup.scanner)
         before = self.reference.shared if self.reference is not None and self.levelled is None else None
-        return felt.variance(unknown if before is None else unknown + before), terms
+        return felt.variance(shared.against(unknown, before)), terms
 
     def _stable(self, band: slice, seen: Bools, view: View) -> Ints:
         """Flag the stable ground that looks as it did."""

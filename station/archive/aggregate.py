@@ -14,7 +14,7 @@ from station.archive.reference import read_reference
 from station.archive.store import Row, rows
 from station.errors import StoreError
 from station.quantities import Bools, Floats, Grid, Reference, Shared
-from station.science.shared import Sensitivities, aggregate_variance, basis, cell_sensitivities
+from station.science.shared import Sensitivities, against, aggregate_variance, basis, cell_sensitivities
 from station.science.terrain import smooth_gradient
 
 MARGIN_CELLS = 6  # that a smoothed gradient looks beyond a cell
@@ -70,7 +70,9 @@ class Aggregates:
         """
         cells = weights != 0
         held = [self._read(one, cells) for one in ([row] if other is None else [row, other])]
-        seen = np.logical_and.reduce([np.isfinite(one.random_m) for one in held])
+        seen = np.logical_and.reduce(
+            [np.isfinite(one.change_m) & np.isfinite(one.reference.elevation_m[cells]) for one in held]
+        )
         chosen = cells.copy()
         chosen[cells] = seen
         weights = weights[chosen]
@@ -84,8 +86,8 @@ class Aggregates:
             if unknown is None:
                 total += float(np.sum(weights**2 * random_m2))
                 continue
-            if other is None and not one.adjusted and one.reference.shared is not None:
-                unknown = unknown + one.reference.shared
+            if other is None and not one.adjusted:
+                unknown = against(unknown, one.reference.shared)
             total += aggregate_variance(weights, random_m2, self._felt(one, chosen), unknown)
         return total
 

@@ -17,7 +17,7 @@ from station.quantities import Bools, Floats, Habits, Shared
 from station.science.patches import CHI2_MEDIAN, Kind, Patches
 from station.science.shared import GLOBAL, Basis, Sensitivities, by_knots, lines_from_knots
 
-ROUNDS = 5
+ROUNDS = 7
 ROUNDS_TRUSTING = 2  # until the scatter is known: else whole lines are left out that moving ground pulls away
 TRUSTED = 0.1  # weight of a patch that has not been left out
 MOST_REFUSED = 0.3  # of the stable ground, before an adjustment is doubted
@@ -30,6 +30,13 @@ CHANGE_AZIMUTH_KNOTS = 4  # knots of the lean, between knots of the change
 CHANGE_STRETCHES = 3  # of range, between knots of the change
 CHANGE_STEPS_M = tuple(float(step) for step in np.geomspace(0.001, 0.5, 10))
 UNIFORM_CHANGE = 3.0  # one sigma of what all the moving ground changes by, in steps of a knot's
+ALIKE_CHANGES = (
+    0.0,
+    1.0,
+    3.0,
+    10.0,
+)  # the same of what is alike in knots so many apart in azimuth and range:
+ALIKE_AZIMUTH_KNOTS, ALIKE_STRETCHES = 10.0, 6.0
 
 
 @dataclass(frozen=True)
@@ -106,6 +113,8 @@ def prior_of_difference(of: Basis, prior: Floats, reference: Shared | None) -> F
     """Covariance of a scan's state against that of the reference, which is wrong itself."""
     if reference is None:
         return prior
+    if reference.names != of.names:  # the scanner has been moved: the reference is as unsure as a scan
+        return 2 * prior
     return prior + lines_from_knots(of, reference.covariance)
 
 
@@ -119,7 +128,7 @@ def adjust(patches: Patches, assumed_rad: Floats, prior: Floats, log: LineLog | 
     patches = patches.some(patches.kind <= Kind.STABLE)
     moving = patches.kind == Kind.MOVING
     wanted_m = patches.residual_m + turned(patches.felt, assumed_rad)
-    field, correlation = _change_field(patches, moving)
+    field, steps = _change_field(patches, moving)
     aside = _Aside(of, prior, log)
     columns = [_design(patches.felt), sparse.csr_array((len(patches), aside.faults)), field]
     whole = sparse.csr_array(sparse.hstack(columns))
@@ -130,7 +139,7 @@ def adjust(patches: Patches, assumed_rad: Floats, prior: Floats, log: LineLog | 
     for round_ in range(ROUNDS):
         weight = trust / (patches.variance_m2 + scatter_m2)
         sums = (whole.T @ sparse.csr_array(whole.multiply(weight[:, None]))).toarray()
-        solved = _solve(normal + sums, right + whole.T @ (weight * wanted_m), aside.size, correlation)
+        solved = _solve(normal + sums, right + whole.T @ (weight * wanted_m), aside.size, steps)
         left_m = wanted_m - whole @ solved.estimate
         scatter_m2 = _scatter(patches, left_m, moving)
         if round_ < ROUNDS_TRUSTING:
@@ -150,7 +159,7 @@ class _Aside:
         state = len(prior)
         self.size = state + self.faults
         self.normal = np.eye(self.size)
-        self.normal[:state, :state] = _inverse(prior)
+        self.normal[:state, :state] = _Factored(prior).inverse()
         self.right = np.zeros(self.size)
         if log is None:
             return
@@ -179,8 +188,8 @@ def _design(felt: Sensitivities) -> sparse.csr_array:
     return sparse.csr_array((values, (rows, columns)), shape=(count, last + of.refraction_count))
 
 
-def _change_field(patches: Patches, moving: Bools) -> tuple[sparse.csr_array, Floats]:
-    """Smooth change of the moving ground: matrix (n, knots) and correlation (knots, knots).
+def _change_field(patches: Patches, moving: Bools) -> tuple[sparse.csr_array, list[_Factored]]:
+    """Smooth change of the moving ground: matrix (n, knots), and covariances (knots, knots) of a step of one.
 
     Knots lie in azimuth and range, the change is bilinear between them.
     """
@@ -197,7 +206,35 @@ def _change_field(patches: Patches, moving: Bools) -> tuple[sparse.csr_array, Fl
     held = values > 0
     knots, columns = np.unique(columns[held], return_inverse=True)
     field = sparse.csr_array((values[held], (rows[held], columns)), shape=(len(u), len(knots)))
-    return field, np.eye(len(knots)) + UNIFORM_CHANGE**2
+    across, out = np.divmod(knots, along)
+    apart = np.abs(np.subtract.outer(across, across)) / ALIKE_AZIMUTH_KNOTS
+    apart += np.abs(np.subtract.outer(out, out)) / ALIKE_STRETCHES
+    own = np.eye(len(knots)) + UNIFORM_CHANGE**2
+    return field, [_Factored(own + alike**2 * np.exp(-apart)) for alike in ALIKE_CHANGES]
+
+
+class _Factored:
+    """A covariance or normal matrix (n, n), factored; its unknowns may have units of very different size."""
+
+    def __init__(self, matrix: Floats) -> None:
+        self._scale = 1 / np.sqrt(np.diag(matrix))
+        scaled = matrix * self._scale[:, None] * self._scale
+        self._root, _ = linalg.cho_factor(scaled, lower=True, overwrite_a=True, check_finite=False)
+
+    def solve(self, right: Floats) -> Floats:
+        """Solution for right sides (n,) or (n, k)."""
+        scale = self._scale if right.ndim == 1 else self._scale[:, None]
+        return np.asarray(linalg.cho_solve((self._root, True), right * scale, check_finite=False) * scale)
+
+    def inverse(self) -> Floats:
+        """Inverse (n, n)."""
+        half = np.tril(linalg.lapack.dpotri(self._root, lower=True)[0])
+        whole = half + np.tril(half, -1).T
+        return np.asarray(whole * self._scale[:, None] * self._scale)
+
+    def log_determinant(self) -> float:
+        """Logarithm of the determinant."""
+        return float(2 * (np.log(np.diag(self._root)).sum() - np.log(self._scale).sum()))
 
 
 @dataclass(frozen=True)
@@ -206,41 +243,36 @@ class _Solved:
 
     estimate: Floats
     step_m: float
-    inverse: Floats  # of the block of the state and the log's faults
+    state: _Factored  # the block of the state and the log's faults
     across: Floats  # what a unit of change does to these
-    change: Floats  # covariance of the change
+    change: _Factored
 
     def covariance(self) -> Floats:
         """Covariance of the state and the log's faults."""
-        return self.inverse + self.across @ self.change @ self.across.T
+        return self.state.inverse() + self.across @ self.change.solve(self.across.T)
 
 
-def _solve(normal: Floats, right: Floats, size: int, correlation: Floats) -> _Solved:
-    """Solve; how much the moving ground changed is chosen among steps by the likelihood."""
-    inverse = _inverse(normal[:size, :size])
-    across = -inverse @ normal[:size, size:]
+def _solve(normal: Floats, right: Floats, size: int, steps: list[_Factored]) -> _Solved:
+    """Solve; how much the moving ground changed, and how smoothly, is chosen by the likelihood.
+
+    `steps` are covariances (knots, knots) of a change of one.
+    """
+    state = _Factored(normal[:size, :size])
+    across = -state.solve(normal[:size, size:])
     reduced = normal[size:, size:] + normal[size:, :size] @ across
     told = right[size:] + across.T @ right[:size]
-    precision = _inverse(correlation)
-    knots = len(told)
     found = []
-    for step_m in CHANGE_STEPS_M:
-        root = linalg.cho_factor(reduced + precision / step_m**2, lower=True)
-        change_m = linalg.cho_solve(root, told)
-        spread = np.log(np.diag(root[0])).sum() + knots * np.log(step_m)
-        found.append((float(told @ change_m / 2 - spread), step_m, change_m, root))
-    _, step_m, change_m, root = max(found, key=lambda one: one[0])
-    state = inverse @ right[:size] + across @ change_m
-    return _Solved(
-        np.concatenate([state, change_m]), step_m, inverse, across, linalg.cho_solve(root, np.eye(knots))
-    )
-
-
-def _inverse(matrix: Floats) -> Floats:
-    """Inverse of a covariance or a normal matrix whose unknowns have units of very different size."""
-    scale = 1 / np.sqrt(np.diag(matrix))
-    root = linalg.cho_factor(matrix * np.outer(scale, scale), lower=True)
-    return np.asarray(linalg.cho_solve(root, np.eye(len(matrix))) * np.outer(scale, scale))
+    for step, alike in zip(steps, ALIKE_CHANGES, strict=True):
+        precision = step.inverse()
+        smooth = float(np.hypot(1.0, alike))
+        for step_m in CHANGE_STEPS_M:
+            change = _Factored(reduced + precision / step_m**2)
+            change_m = change.solve(told)
+            spread = (change.log_determinant() + step.log_determinant()) / 2 + len(told) * np.log(step_m)
+            found.append((float(told @ change_m / 2 - spread), step_m * smooth, change_m, change))
+    _, step_m, change_m, change = max(found, key=lambda one: one[0])
+    estimate = np.concatenate([state.solve(right[:size]) + across @ change_m, change_m])
+    return _Solved(estimate, step_m, state, across, change)
 
 
 def _scatter(patches: Patches, left_m: Floats, moving: Bools) -> Floats:
@@ -278,8 +310,10 @@ def _together(patches: Patches, ratio: Floats) -> float:
 
 def _correlation_length(table: Floats, furthest: int) -> float:
     """Sum of the correlation between rows of a table, to either side, until it has died away."""
-    power = np.nanmean(table**2)
+    power = float(np.nanmean(table**2))
     total = 1.0
+    if power == 0.0:
+        return total
     for lag in range(1, min(furthest, len(table) - 1) + 1):
         pairs = table[lag:] * table[:-lag]
         like = float(np.nanmean(pairs) / power) if np.isfinite(pairs).any() else 0.0

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from station.quantities import Bools, Floats, Floats32, Grid, Ints
+from station.quantities import Bools, Floats, Floats32, Ints
 from station.science.patches import Kind
 from station.science.terrain import smooth_gradient
 
@@ -18,14 +18,14 @@ CLASS_RANGE_M = 500.0
 CLASS_SLOPE = 0.25
 
 
-def withheld(grid: Grid) -> Bools:
-    """Tell which cells (ny, nx) are kept out of every fit if they are stable: a tenth, in blocks of 50 m.
+def withheld(x_m: Floats, y_m: Floats) -> Bools:
+    """Tell which places on the map are kept out of every fit if they are stable: a tenth, in blocks of 50 m.
 
-    The same cells always, wherever the grid begins.
+    The same places always, wherever the grid begins.
     """
-    east = np.floor(grid.x_m / BLOCK_M).astype(np.int64) * 73_856_093
-    north = np.floor(grid.y_m / BLOCK_M).astype(np.int64) * 19_349_663
-    mixed = east[None, :] ^ north[:, None]
+    east = np.floor(x_m / BLOCK_M).astype(np.int64) * 73_856_093
+    north = np.floor(y_m / BLOCK_M).astype(np.int64) * 19_349_663
+    mixed = east ^ north
     return np.asarray((mixed ^ (mixed >> 13)) % WITHHELD_EVERY == 0)
 
 

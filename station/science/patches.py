@@ -90,6 +90,8 @@ def collect(of: Basis, bands: Iterable[Cells], reach_m: float) -> Patches:
         held.append(
             (key.astype(np.int32), cells.residual_m[used].astype(np.float32), weight.astype(np.float32))
         )
+    if not held:
+        held.append((np.empty(0, np.int32), np.empty(0, np.float32), np.empty(0, np.float32)))
     key, residual_m, weight = (np.concatenate(parts) for parts in zip(*held, strict=True))
     there = np.flatnonzero(sums[-1])
     mean_m, variance_m2, count = (values[there] for values in _robust_means(key, residual_m, weight, size))
@@ -110,8 +112,8 @@ def _robust_means(key: Ints, residual_m: Floats, weight: Floats, size: int) -> t
         centre_m = np.bincount(key, trusted * residual_m, size) / np.maximum(mass, 1e-100)
         apart = (residual_m - centre_m[key]) ** 2 * weight
         if len(apart):
-            scale2 = max(float(np.median(apart)) / CHI2_MEDIAN, 1e-12)
+            scale2 = max(float(np.median(apart)) / CHI2_MEDIAN, 1.0)
         trusted = weight / (1 + apart / (CAUCHY**2 * scale2))
     mass = np.maximum(np.bincount(key, trusted, size), 1e-100)
-    variance_m2 = max(scale2, 1.0) * np.bincount(key, trusted**2 / weight, size) / mass**2
+    variance_m2 = scale2 * np.bincount(key, trusted**2 / weight, size) / mass**2
     return centre_m, variance_m2, np.bincount(key, minlength=size).astype(np.float64)

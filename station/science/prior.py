@@ -21,6 +21,7 @@ SLOW_MOTION_S = 300.0
 FAST_MOTION_S = 3.0
 SENSOR_BIAS_RAD = math.radians(0.0015)
 SCANS_WORTH = 8  # what start values weigh against scans
+MOTION_STEPS = 10
 MOTIONS = ("slow_motion_rad", "fast_motion_rad", "line_motion_rad")
 SHOWN = {  # habits by the global parameters that show them
     "tilt_rad": slice(2),
@@ -64,11 +65,10 @@ def lines_of(of: Basis, to_local: Floats, track: HeadTrack | None) -> Lines:
     azimuth_rad = middle + (azimuth_rad - middle + math.pi) % (2 * math.pi) - math.pi
     onwards = np.argsort(track.azimuth_rad)
     passed_rad, passed_s = track.azimuth_rad[onwards], track.time_s[onwards]
-    beyond = np.polynomial.Polynomial.fit(passed_rad, passed_s, 1)
-    inside = (azimuth_rad >= passed_rad[0]) & (azimuth_rad <= passed_rad[-1])
-    return Lines(
-        azimuth_rad, np.where(inside, np.interp(azimuth_rad, passed_rad, passed_s), beyond(azimuth_rad))
-    )
+    speed_s = float(np.ptp(passed_s) / np.ptp(passed_rad)) * (1 if passed_s[-1] > passed_s[0] else -1)
+    time_s = np.interp(azimuth_rad, passed_rad, passed_s)
+    beyond_rad = azimuth_rad - np.clip(azimuth_rad, passed_rad[0], passed_rad[-1])
+    return Lines(azimuth_rad, time_s + beyond_rad * speed_s)
 
 
 def turn_of(tilt: Tilt, to_local: Floats, time_s: Floats) -> Floats:
@@ -199,8 +199,8 @@ def learned(start: Habits, of: Basis, scans: list[tuple[Lines, Floats, Floats]])
     """Return the habits that estimates (u,) and covariances (u, u) of several scans speak for.
 
     Each variance is what the scans show (estimate squared plus what is unknown of it), drawn to its start
-    value as if that came from `SCANS_WORTH` scans. Motions are told apart by their correlation in time, by a
-    step of the expectation-maximisation of variance components.
+    value as if that came from `SCANS_WORTH` scans. Motions are told apart by their correlation in time, by
+    steps of the expectation-maximisation of variance components.
     """
     if len(scans) < 2:
         return start
@@ -214,12 +214,13 @@ def learned(start: Habits, of: Basis, scans: list[tuple[Lines, Floats, Floats]])
     seen = {name: float(shown[place].mean()) for name, place in SHOWN.items()}
     seen["refraction_by_azimuth"] = float(shown[last:].mean())
     lean = slice(first, last)
-    for name, component in zip(MOTIONS, range(3), strict=True):
-        ratios = []
-        for lines, estimate, covariance in scans:
-            weight = np.linalg.inv(motion(start, lines))
-            kernel = motions(lines)[component]
-            moved = np.outer(estimate[lean], estimate[lean]) + covariance[lean, lean]
-            ratios.append(np.sum((weight @ kernel @ weight) * moved) / np.sum(weight * kernel))
-        seen[name] = getattr(start, name) ** 2 * float(np.mean(ratios))
+    moved = np.mean([np.outer(e[lean], e[lean]) + c[lean, lean] for _, e, c in scans], axis=0)
+    kernels = motions(scans[0][0])
+    now = start
+    for _ in range(MOTION_STEPS):
+        weight = np.linalg.inv(motion(now, scans[0][0]))
+        shown_by = weight @ moved @ weight
+        for name, kernel in zip(MOTIONS, kernels, strict=True):
+            seen[name] = getattr(now, name) ** 2 * float(np.sum(shown_by * kernel) / np.sum(weight * kernel))
+        now = replace(now, **{name: math.sqrt(seen[name]) for name in MOTIONS})
     return replace(start, **{name: drawn(name, variance) for name, variance in seen.items()})

@@ -194,8 +194,10 @@ class Sensitivities:
         return np.concatenate(parts)
 
     def by_line(self, weights: Floats) -> Floats:
-        """Effect of each line's own lean (line_count,) on the weighted sum of heights."""
-        return np.asarray(np.bincount(self.line, self.lean * weights, self.of.line_count), dtype=np.float64)
+        """Effect of each line's lean (line_count,) on the weighted sum of heights."""
+        felt: Floats = np.zeros(self.of.line_count)
+        np.add.at(felt, self.line, self.lean * weights)
+        return felt
 
     def variance(self, unknown: Shared) -> Floats:
         """Variance of each cell's height (n,) [m²]: the diagonal of J C Jᵀ, and what its line adds."""
@@ -205,7 +207,7 @@ class Sensitivities:
         _, _, bend_share = self.refraction_knot()
         order = np.argsort(before.astype(np.int16), kind="stable")
         bounds = np.searchsorted(before[order], np.arange(of.intervals + 1))
-        lines = line_variances(of, unknown)
+        own = _between(of).left ** 2 @ line_variances(of, unknown)
         for knot in np.flatnonzero(np.diff(bounds)):
             cells = order[bounds[knot] : bounds[knot + 1]]
             bend = knot // LEAN_PER_REFRACTION
@@ -227,8 +229,8 @@ class Sensitivities:
                 ]
             )
             root = _root(unknown.covariance[np.ix_(felt, felt)])
-            variance_m2[cells] = np.sum((root @ columns) ** 2, axis=0) + along**2 * lines[knot]
-        return variance_m2
+            variance_m2[cells] = np.sum((root @ columns) ** 2, axis=0)
+        return variance_m2 + self.lean**2 * own[self.line]
 
 
 def _root(covariance: Floats) -> Floats:
@@ -238,8 +240,9 @@ def _root(covariance: Floats) -> Floats:
 
 
 def line_variances(of: Basis, unknown: Shared) -> Floats:
-    """Variance of a line's own lean (intervals,) [rad²], by interval between knots."""
-    return unknown.noise_variance[len(GLOBAL) : len(GLOBAL) + of.intervals]
+    """Variance of what makes up each line's own lean (line_count,) [rad²], independent from line to line."""
+    by_interval = unknown.noise_variance[len(GLOBAL) : len(GLOBAL) + of.intervals]
+    return np.repeat(by_interval, LINES_A_KNOT)
 
 
 def sensitivities(
@@ -303,40 +306,59 @@ def aggregate_variance(
     For a difference of two epochs add both; what a reference shares with both cancels.
     Source: EQUATIONS 6.2; Hartzell et al. (2015), Eq. 14 and 21, lack the second term.
     """
-    g, lines = felt.total(weights), felt.by_line(weights)
-    own = np.repeat(line_variances(felt.of, unknown), LINES_A_KNOT)
-    return float(np.sum(weights**2 * random_variance_m2) + g @ unknown.covariance @ g + lines**2 @ own)
+    g, lines = felt.total(weights), felt.by_line(weights) @ _between(felt.of).left
+    own = lines**2 @ line_variances(felt.of, unknown)
+    return float(np.sum(weights**2 * random_variance_m2) + g @ unknown.covariance @ g + own)
+
+
+@dataclass(frozen=True)
+class _Between:
+    """Matrices between the leans of lines and those at knots."""
+
+    knots: Floats  # (lines, knots) interpolates
+    fit: Floats  # (knots, lines)
+    left: Floats  # (lines, lines) what the fit leaves
 
 
 @lru_cache(maxsize=4)
-def _knots_from_lines(of: Basis) -> tuple[Floats, Floats]:
-    """Matrices between leans of lines and at knots: (lines, knots) to interpolate, (knots, lines) to fit."""
+def _between(of: Basis) -> _Between:
     before = np.arange(of.line_count) // LINES_A_KNOT
     share = (np.arange(of.line_count) % LINES_A_KNOT + 0.5) / LINES_A_KNOT
-    between = np.zeros((of.line_count, of.lean_count))
-    between[np.arange(of.line_count), before] = 1 - share
-    between[np.arange(of.line_count), (before + 1) % of.lean_count] += share
-    return between, np.asarray(np.linalg.pinv(between), dtype=np.float64)
+    knots = np.zeros((of.line_count, of.lean_count))
+    knots[np.arange(of.line_count), before] = 1 - share
+    knots[np.arange(of.line_count), (before + 1) % of.lean_count] += share
+    fit = np.asarray(np.linalg.pinv(knots), dtype=np.float64)
+    return _Between(knots, fit, np.eye(of.line_count) - knots @ fit)
+
+
+def against(unknown: Shared, common: Shared | None) -> Shared:
+    """Return what a scan leaves unknown against a reference that does not know `common` itself.
+
+    A scanner that has been moved feels other parameters; then the reference counts as unsure as the scan.
+    """
+    if common is None:
+        return unknown
+    return unknown + (common if common.names == unknown.names else unknown)
 
 
 def lines_from_knots(of: Basis, unknown: Floats) -> Floats:
     """Covariance by line (9 + lines + refraction knots) of one by knot (p, p)."""
-    between = _knots_from_lines(of)[0]
-    wide = _beside(between, len(GLOBAL), of.refraction_count)
+    wide = _beside(_between(of).knots, len(GLOBAL), of.refraction_count)
     return np.asarray(wide @ unknown @ wide.T)
 
 
 def by_knots(of: Basis, estimate: Floats, covariance: Floats) -> Shared:
     """Return what is known by line (9 + lines + refraction knots), condensed to knots.
 
-    What the knots cannot hold of a line's lean is kept as its own variance; taking it as independent from
-    line to line loses less than 5 % of the sigma of cells, boxes and areas.
+    What the knots cannot hold of a line's lean is kept as the variance of independent leans from which the
+    knots have taken their part; that loses less than 5 % of the sigma of boxes and areas.
     """
-    between, fit = _knots_from_lines(of)
-    narrow = _beside(fit, len(GLOBAL), of.refraction_count)
+    between = _between(of)
+    narrow = _beside(between.fit, len(GLOBAL), of.refraction_count)
     lines = slice(len(GLOBAL), len(GLOBAL) + of.line_count)
-    left = np.eye(of.line_count) - between @ fit
+    left = between.left
     own = np.maximum(np.einsum("ij,ij->i", left @ covariance[lines, lines], left), 0.0)
+    own /= np.diag(left)  # a projection: the square of each row sums up to its diagonal
     noise = np.zeros(len(narrow))
     noise[len(GLOBAL) : len(GLOBAL) + of.intervals] = own.reshape(of.intervals, LINES_A_KNOT).mean(axis=1)
     return Shared(of.names, of.units, narrow @ estimate, np.asarray(narrow @ covariance @ narrow.T), noise)

@@ -331,11 +331,6 @@ def test_smooth_snow_on_the_glacier_leaks_little_where_stable_ground_is_spread()
         assert np.sqrt(np.mean((error_m / sigma_m) ** 2)) < 2.0
 
 
-@pytest.mark.xfail(
-    strict=True,
-    reason="BUG: knots of the change are independent but for a uniform change, so that a gradient of snow"
-    " is taken for lean and the stated sigma is 3 to 4 times too small",
-)
 @pytest.mark.parametrize(
     ("stable", "log"),
     [(ground(42, 60, within_deg=(0, 10)), False), (ground(43, 1, within_deg=(0, 10)), True)],

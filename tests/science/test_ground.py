@@ -11,7 +11,7 @@ GRID = Grid(632_000.0, 5_186_000.0, 10.0, 400, 350)
 
 
 def test_a_tenth_is_withheld_everywhere_in_blocks_of_fifty_metres():
-    kept_out = ground.withheld(GRID)
+    kept_out = ground.withheld(GRID.x_m, GRID.y_m[:, None])
     assert kept_out.mean() == pytest.approx(0.1, abs=0.01)
     blocks = kept_out.reshape(70, 5, 80, 5)
     assert (blocks.all(axis=(1, 3)) == blocks.any(axis=(1, 3))).all()
@@ -28,10 +28,10 @@ def test_a_tenth_is_withheld_everywhere_in_blocks_of_fifty_metres():
 def test_the_same_ground_is_withheld_wherever_the_grid_begins(cell_m):
     """Of a grid moved by 730 m and 290 m, and of one with other cells."""
     moved = Grid(632_730.0, 5_185_710.0, cell_m, int(1000 / cell_m), int(1000 / cell_m))
-    told = ground.withheld(moved)
+    told = ground.withheld(moved.x_m, moved.y_m[:, None])
     column = np.floor((moved.x_m - GRID.west_m) / GRID.cell_m).astype(int)
     row = np.floor((GRID.north_m - moved.y_m) / GRID.cell_m).astype(int)
-    assert np.array_equal(told, ground.withheld(GRID)[np.ix_(row, column)])
+    assert np.array_equal(told, ground.withheld(GRID.x_m, GRID.y_m[:, None])[np.ix_(row, column)])
     assert 0.05 < told.mean() < 0.15
 
 
@@ -62,13 +62,15 @@ def test_a_plane_is_steep_beyond_forty_degrees():
         assert (ground.steep(plane, 5.0) == wanted).all()
 
 
-def test_cells_look_unlike_alike_both_ways_and_not_where_unknown():
+def test_cells_look_unlike_under_snow_or_without_it_but_not_wet_nor_where_unknown():
     rng = np.random.default_rng(1)
     now, then = rng.uniform(0.05, 1, (2, 500)).astype(np.float32)
     told = ground.looks_unlike(now, then)
-    assert np.array_equal(told, ground.looks_unlike(then, now))
-    assert np.array_equal(told, np.maximum(now / then, then / now) > 1.5)
+    assert np.array_equal(told, (now / then > 1.25) | (now / then < 0.5))
     assert 50 < told.sum() < 450
+    rock = np.full(3, 0.25, np.float32)
+    told = ground.looks_unlike(np.array([0.25 * 2.4, 0.25 * 0.65, 0.25 * 1.08], np.float32), rock)
+    assert told.tolist() == [True, False, False]  # snow, wet rock, another gain
     nan = np.full(500, np.nan, np.float32)
     assert not ground.looks_unlike(now, nan).any()
     assert not ground.looks_unlike(nan, then).any()

@@ -87,11 +87,6 @@ def test_stated_variance_is_that_of_the_means(each):
     assert np.sqrt(patches.variance_m2.mean() / least_m2.mean()) < 1.15  # little is lost to being robust
 
 
-@pytest.mark.xfail(
-    strict=True,
-    reason="BUG: where most cells are alone in their patch the median distance from the mean is nought, and"
-    " Cauchy's weights of that scale pick one cell of each of the others",
-)
 def test_patches_of_four_use_all_their_cells_also_where_most_have_one():
     each = np.where(np.arange(400) % 8 == 0, 4, 1)
     cells, _ = in_patches(each)
@@ -151,10 +146,5 @@ def test_nothing_used_gives_no_patch():
     assert len(collect(OF, [none], REACH_M)) == 0
 
 
-@pytest.mark.xfail(
-    strict=True,
-    raises=ValueError,
-    reason="BUG: a scan beside all that the reference knows gives no band, and then zip(*held) nothing",
-)
 def test_no_band_gives_no_patch():
     assert len(collect(OF, [], REACH_M)) == 0

@@ -67,6 +67,15 @@ def dense(felt):
     return np.array([felt.total(row) for row in np.eye(len(felt))])
 
 
+def hats(of, line):
+    """What each knot gives to a group of lines, five of which lie evenly between two knots."""
+    weights = np.zeros(of.lean_count)
+    before, within = divmod(line, 5)
+    weights[before] += 0.9 - 0.2 * within
+    weights[(before + 1) % of.lean_count] += 0.1 + 0.2 * within
+    return weights
+
+
 def random_unknown(of, seed=1):
     rng = np.random.default_rng(seed)
     size = len(of.names)
@@ -87,6 +96,8 @@ def test_variance_is_the_diagonal_of_jcjt(position_m):
     line = np.zeros((200, of.line_count))
     line[np.arange(200), felt.line] = felt.lean
     own = np.repeat(unknown.noise_variance[9 : 9 + of.intervals], shared.LINES_A_KNOT)
+    knots = np.array([hats(of, place) for place in range(of.line_count)])
+    line = line - line @ knots @ np.linalg.lstsq(knots, np.eye(of.line_count), rcond=None)[0]
     whole = matrix @ unknown.covariance @ matrix.T + (line * own) @ line.T
     assert felt.variance(unknown) == pytest.approx(np.diag(whole))
     weights = np.random.default_rng(2).uniform(size=200)
