@@ -300,6 +300,12 @@ class Site(SiteFile):
         )
 
     @property
+    def adjusts(self) -> bool:
+        """Whether scans are adjusted to the reference: asked for, and the scanner's place is known."""
+        placed = self.scans.frame == "scanner" or self.map.origin is not None
+        return self.adjustment.method == "joint" and placed
+
+    @property
     def science_hash(self) -> str:
         """Identify every setting that changes a number in the store (16 hex digits).
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,7 +14,6 @@ from station.quantities import (
     Floats,
     Floats32,
     Grid,
-    Habits,
     Ints,
     Measurement,
     Quality,
@@ -28,11 +27,11 @@ from station.quantities import (
 from station.science import budget, change, ground, prior, shared, uncertainty
 from station.science.adjustment import Adjustment, LineLog, adjust, prior_of_difference, turned
 from station.science.air import AirCorrection, refraction_rise
-from station.science.grid import Gridder, Stack, slope_sampling_variance
+from station.science.grid import Gridder, slope_sampling_variance
 from station.science.patches import Cells, collect
 from station.science.pose import Frame, lean
 from station.science.shared import Basis, Sensitivities
-from station.science.terrain import cell_means, smooth, smooth_gradient
+from station.science.terrain import cell_means, smooth_gradient
 from station.science.view import Points, View
 
 BAND_ROWS = 128  # the cells that are looked at together: what a store chunk is high
@@ -40,9 +39,6 @@ MARGIN_ROWS = 4  # rows beyond a band that its smoothed gradient looks at
 FEW_POINTS = 3
 MOVING_MOST = 1_000_000  # cells of moving ground that an adjustment looks at
 FEW_STABLE = 20  # cells, that say nothing of a spread
-PROVISIONAL_CELLS = 1.0  # one sigma of the smoothing before residuals are taken
-UNCHANGED_SIGMAS = 3.0  # of a mean over many scans, on ground that stays
-STEADY = 3.0  # times its modelled variance from scan to scan, which ground found stable may show
 HIGH_INCIDENCE_COS = float(np.cos(np.radians(80.0)))
 
 
@@ -375,89 +371,3 @@ def _view(
     height_m = around[band.start - first :][: seen.shape[0]][seen] + setup.position_m[2]
     points = setup.grid.x_m[column], setup.grid.y_m[band][row], height_m
     return View.of(points, setup.position_m, east, north)
-
-
-def master(
-    stack: Stack,
-    base: Reference | None,
-    unknown: list[Shared | None],
-    setup: Setup,
-    version: str,
-    scan_ids: tuple[str, ...],
-    habits: Habits,
-) -> Reference:
-    """Return the surface that change is measured from, from scans laid on `base`.
-
-    Without a base, their plain means are smoothed: such a mean stands for where its points happen to lie on
-    the slope (EQUATIONS 4.10), which residuals cannot mend from cell to cell; what smoothing takes from the
-    terrain they can. What a scan's points share is taken as independent from scan to scan, so that the mean
-    of n scans has an nth of their mean covariance.
-    """
-    mean_m = stack.mean_residual()
-    if base is None:
-        datum_m = float(np.round(setup.position_m[2])) if setup.position_m else 0.0
-        elevation_m = np.where(np.isfinite(mean_m), smooth(mean_m, PROVISIONAL_CELLS), np.nan) + datum_m
-    else:
-        elevation_m = base.elevation_m + mean_m
-    told = [one for one in unknown if one is not None]
-    common = None
-    if told:
-        total = told[0]
-        for one in told[1:]:
-            total = total + one
-        common = replace(
-            total,
-            estimate=np.zeros(len(total.names)),
-            covariance=total.covariance / len(told) ** 2,
-            noise_variance=total.noise_variance / len(told) ** 2,
-        )
-    factor, stable = np.ones(setup.grid.shape, np.float32), np.zeros(setup.grid.shape, bool)
-    if setup.position_m is not None:
-        factor, stable = _as_scans_show(stack, setup, elevation_m)
-    return Reference(
-        grid=stack.grid,
-        version=version,
-        elevation_m=elevation_m,
-        random_variance_m2=stack.random_variance() * factor,
-        roughness_m2=stack.roughness().astype(np.float32),
-        shared=common,
-        scan_ids=scan_ids,
-        intensity=stack.intensity(),
-        variance_factor=factor,
-        stable=stable,
-        habits=habits,
-    )
-
-
-def improved(base: Reference, stack: Stack, setup: Setup, version: str, habits: Habits) -> Reference:
-    """Return a reference whose stable ground is the mean of more scans, laid on it and adjusted to it.
-
-    Elsewhere it stays as it is: it is what change counts from. What scans show of cells is learned anew.
-    """
-    mean_m, mean_m2 = stack.mean_residual(), stack.random_variance()
-    factor, steady = _as_scans_show(stack, setup, base.elevation_m)
-    mean_m2 *= factor
-    still = np.abs(mean_m) < UNCHANGED_SIGMAS * np.sqrt(mean_m2 + base.random_variance_m2)
-    stable = steady & still
-    elevation_m = base.elevation_m + np.where(stable, mean_m, 0.0)
-    return replace(
-        base,
-        version=version,
-        elevation_m=elevation_m,
-        random_variance_m2=np.where(stable, mean_m2, base.random_variance_m2).astype(np.float32),
-        variance_factor=factor,
-        stable=stable,
-        habits=habits,
-    )
-
-
-def _as_scans_show(stack: Stack, setup: Setup, elevation_m: Floats) -> tuple[Floats32, Bools]:
-    """How much more cells vary from scan to scan than modelled, and which are stable (ny, nx)."""
-    assert setup.position_m is not None  # noqa: S101 - the caller's case
-    east, north = smooth_gradient(elevation_m - setup.position_m[2], setup.grid.cell_m)
-    tan_slope = np.hypot(east, north)
-    away_m = np.hypot(
-        setup.grid.x_m[None, :] - setup.position_m[0], setup.grid.y_m[:, None] - setup.position_m[1]
-    )
-    factor = stack.variance_factor(ground.classes(away_m, tan_slope))
-    return factor, np.isfinite(elevation_m) & (tan_slope > ground.STABLE_FLATTEST) & (factor < STEADY)

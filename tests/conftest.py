@@ -7,6 +7,8 @@ from pathlib import Path
 
 import pytest
 
+# As in the service's children: on a busy machine matrices take many times as long on several threads.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 PROJECT = Path(__file__).resolve().parents[1]
 
 

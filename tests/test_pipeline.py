@@ -5,11 +5,12 @@ import math
 import numpy as np
 import pytest
 
-from station.pipeline import Pose, Setup, gridder_for, master, measure, survey
+from station.pipeline import Pose, Setup, gridder_for, measure, survey
 from station.quantities import Air, Grid, Habits, Quality, Reference, Scanner, Shots, Tilt
 from station.science.air import air_correction
 from station.science.grid import Stack
 from station.science.inclination import LEVEL
+from station.science.master import master
 from station.science.pose import frame_by_origin, frame_in_local_map
 from station.science.prior import covariance_without_adjustment, lines_of
 from station.science.shared import basis
@@ -96,7 +97,7 @@ def test_a_master_from_scans_finds_the_truth_and_its_own_error():
         for shots in scans:
             _, gridder, setup = scanned(shots, made)
             stack.add(gridder)
-        made = master(stack, made, [None], setup, "1", ("a",), Habits())
+        made = master(stack, made, [None], setup.position_m, "1", ("a",), Habits())
     error = made.elevation_m - height(x_m, y_m)
     assert np.nanmedian(error) == pytest.approx(0.0, abs=1e-3)
     assert 1.4826 * np.nanmedian(np.abs(error)) < 0.03

@@ -31,9 +31,7 @@ from station.pipeline import (
     Told,
     corrections,
     gridder_for,
-    improved,
     level,
-    master,
     measure,
     stable_figures,
     survey,
@@ -45,6 +43,7 @@ from station.readers.scan import ScanReader, open_scan, utc_interval
 from station.science import ground
 from station.science.adjustment import Adjustment, distrust
 from station.science.grid import Gridder, Stack
+from station.science.master import improved, master
 from station.science.prior import learned
 from station.science.terrain import nodes_for
 from station.service.gather import Gathered, gather
@@ -195,7 +194,7 @@ def _level(
     site: Site, gridder: Gridder, gathered: Gathered, reference: Reference | None
 ) -> tuple[Told, Adjustment, Bools] | None:
     """Adjust a scan to the reference, where the site asks for it and there is one to adjust to."""
-    if site.adjustment.method == "none" or gathered.told is None or reference is None:
+    if not site.adjusts or gathered.told is None or reference is None:
         return None
     stable = stable_ground(site, reference)
     return gathered.told, level(gridder, gathered.setup, gathered.told, reference, stable), stable
@@ -242,7 +241,7 @@ def build_reference(site: Site, arrivals: list[Arrival], version: str, progress:
         laid = [_lay_on(stack, site, arrival, surface, progress) for arrival in arrivals]
         habits = _learned(surface.habits if surface else Habits(), laid)
         unknown = [one.unknown for one, _ in laid]
-        surface = master(stack, surface, unknown, laid[0][0].setup, version, scan_ids, habits)
+        surface = master(stack, surface, unknown, laid[0][0].setup.position_m, version, scan_ids, habits)
     if surface is not None:
         write_reference(series, surface)
     return version
@@ -257,7 +256,10 @@ def improve_reference(site: Site, arrivals: list[Arrival], version: str, progres
     stack = Stack(series.grid)
     laid = [_lay_on(stack, site, arrival, base, progress) for arrival in arrivals]
     habits = _learned(base.habits, laid)
-    write_reference(series, improved(base, stack, laid[0][0].setup, version, habits))
+    position_m = laid[0][0].setup.position_m
+    if position_m is None:
+        raise StoreError(f"{series.folder}: a reference without the scanner's place cannot be improved")
+    write_reference(series, improved(base, stack, position_m, version, habits))
     return version
 
 

@@ -141,7 +141,7 @@ class Worker:
         usable.sort(key=lambda row: row.start_utc_s or 0.0)
         version = self._versions() + 1
         due = wanted * IMPROVED_EVERY ** (version - 1)
-        if len(usable) < due or (version > 1 and self._site.adjustment.method == "none"):
+        if len(usable) < due or (version > 1 and not self._site.adjusts):
             return
         chosen = usable[:wanted]
         if version > 1:

@@ -1,11 +1,8 @@
 """Variances of boxes, areas, volumes and differences, from what the store holds, against dense algebra."""
 
-import ctypes
-from contextlib import suppress
 from dataclasses import replace
 from datetime import UTC, datetime
 from functools import cache
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -37,16 +34,6 @@ POSITION_M = tuple(list(SCANNER.values())[:3])
 AXIS = (0.04, -0.02, np.sqrt(1 - 0.04**2 - 0.02**2))
 EAST, NORTH = 0.25, -0.125  # slope of the reference, kept to the last digit by the store
 BESIDE = shared.basis(GRID, POSITION_M, AXIS)
-
-
-@pytest.fixture(autouse=True, scope="module")
-def one_thread():
-    """As in the service: on a busy machine matrices of this size take 20 times as long on several."""
-    maps = Path("/proc/self/maps").read_text(encoding="utf-8")
-    for library in {line.split()[-1] for line in maps.splitlines() if "openblas" in line}:
-        for name in ("scipy_openblas_set_num_threads", "scipy_openblas_set_num_threads64_"):
-            with suppress(AttributeError):
-                getattr(ctypes.CDLL(library), name)(1)
 
 
 def drawn(seed, size):

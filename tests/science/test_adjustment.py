@@ -1,11 +1,8 @@
 """The joint estimate against dense algebra and against simulated scans whose truth is known."""
 
-import ctypes
 import math
-from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cache
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -23,16 +20,6 @@ ROUND = replace(OF, closed=True)  # as if 40° were all the way round: the last 
 STILL = np.zeros((3, OF.line_count))
 STRETCHES = range(6, 38)  # 480 to 3,040 m away
 GLOBALS = 9
-
-
-@pytest.fixture(autouse=True, scope="module")
-def one_thread():
-    """As in the service: on a busy machine matrices of this size take 20 times as long on several."""
-    maps = Path("/proc/self/maps").read_text(encoding="utf-8")
-    for library in {line.split()[-1] for line in maps.splitlines() if "openblas" in line}:
-        for name in ("scipy_openblas_set_num_threads", "scipy_openblas_set_num_threads64_"):
-            with suppress(AttributeError):
-                getattr(ctypes.CDLL(library), name)(1)
 
 
 @cache

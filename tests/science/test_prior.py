@@ -1,10 +1,7 @@
 """What is known before a scan: when lines are passed, covariances, habits learned from simulated scans."""
 
-import ctypes
 import math
-from contextlib import suppress
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -17,16 +14,6 @@ from station.science.inclination import LEVEL, Cycle, Lean
 HABITS = Habits()
 OF = shared.Basis(math.radians(20), 30, closed=False)
 SPEED_RAD_S = math.radians(0.13)
-
-
-@pytest.fixture(autouse=True, scope="module")
-def one_thread():
-    """As in the service: on a busy machine matrices of this size take 20 times as long on several."""
-    maps = Path("/proc/self/maps").read_text(encoding="utf-8")
-    for library in {line.split()[-1] for line in maps.splitlines() if "openblas" in line}:
-        for name in ("scipy_openblas_set_num_threads", "scipy_openblas_set_num_threads64_"):
-            with suppress(AttributeError):
-                getattr(ctypes.CDLL(library), name)(1)
 
 
 def mount(heading_deg, leaning_deg, towards_deg=35.0):
