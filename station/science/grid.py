@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 # Sums are of multiples of 2^-20 m (and m²), so that adding float64 is exact up to 2^33 and the order in
 # which points come cannot matter.
 QUANTUM = 2.0**20
-STEP_MOST = 4.0  # sigmas: beyond, something happened
+STEP_MOST = 6.0  # sigmas: beyond, something happened
 CLASS_STEPS = 10.0  # what the class of a cell weighs against the steps from scan to scan of its own
 ROUGHNESS_CELLS = 1.0  # one sigma of the neighbourhood that tells how rough a cell is
 

@@ -410,3 +410,41 @@ def test_also_of_cells_where_rock_stands_here_and_there():
 def test_also_of_boxes_where_rock_stands_here_and_there(size_m):
     stored_m, whole_m = sigmas("rock here and there", size_m)
     assert stored_m == pytest.approx(whole_m, rel=0.05)
+
+
+def test_coarsened_cells_are_means_of_their_points(filled):
+    """Against a plain loop; a shared part of the variance does not shrink with the points."""
+    cells = 7
+    told = station.coarsened(filled.folder, JOINT, cells)
+    with station.open(filled.folder) as ds:
+        change, sigma, random, count = (
+            ds[name][JOINT].values.astype(float)
+            for name in (
+                "elevation_change",
+                "elevation_change_uncertainty",
+                "elevation_change_random_uncertainty",
+                "point_count",
+            )
+        )
+        assert told.x.values[0] == pytest.approx(ds.x.values[:cells].mean())
+        assert told.y.values[1] == pytest.approx(ds.y.values[cells : 2 * cells].mean())
+    assert told.elevation_change.shape == tuple(size // cells for size in change.shape)
+    looked_at = 0
+    for row, column in np.ndindex(told.elevation_change.shape):
+        block = np.s_[row * cells : (row + 1) * cells, column * cells : (column + 1) * cells]
+        seen = np.isfinite(change[block])
+        if not seen.any():
+            assert np.isnan(told.elevation_change[row, column])
+            continue
+        n = count[block][seen]
+        wanted = np.sum(n * change[block][seen]) / n.sum()
+        own = np.sum((n * random[block][seen]) ** 2) / n.sum() ** 2
+        common = np.sum(n * (sigma[block][seen] ** 2 - random[block][seen] ** 2)) / n.sum()
+        assert told.elevation_change[row, column] == pytest.approx(wanted, rel=1e-5)
+        assert told.elevation_change_uncertainty[row, column] == pytest.approx(
+            np.sqrt(own + common), rel=1e-5
+        )
+        looked_at += 1
+    assert looked_at > 5
+    with pytest.raises(ValueError, match="do not fit"):
+        station.coarsened(filled.folder, JOINT, 10_000)
