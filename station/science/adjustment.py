@@ -8,7 +8,7 @@ Source: EQUATIONS 6.3, ADJUSTMENT.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy import linalg, sparse
@@ -17,7 +17,8 @@ from station.quantities import Bools, Floats, Habits, Shared
 from station.science.patches import CHI2_MEDIAN, Kind, Patches
 from station.science.shared import GLOBAL, Basis, Sensitivities, by_knots, lines_from_knots
 
-ROUNDS = 7
+ROUNDS = 8
+SETTLED_M = 0.0001  # a round that moves the patches by less is the last
 ROUNDS_TRUSTING = 2  # until the scatter is known: else whole lines are left out that moving ground pulls away
 TRUSTED = 0.1  # weight of a patch that has not been left out
 MOST_REFUSED = 0.3  # of the stable ground, before an adjustment is doubted
@@ -128,7 +129,7 @@ def adjust(patches: Patches, assumed_rad: Floats, prior: Floats, log: LineLog | 
     patches = patches.some(patches.kind <= Kind.STABLE)
     moving = patches.kind == Kind.MOVING
     wanted_m = patches.residual_m + turned(patches.felt, assumed_rad)
-    field, steps = _change_field(patches, moving)
+    field, changes = _change_field(patches, moving)
     aside = _Aside(of, prior, log)
     columns = [_design(patches.felt), sparse.csr_array((len(patches), aside.faults)), field]
     whole = sparse.csr_array(sparse.hstack(columns))
@@ -136,16 +137,23 @@ def adjust(patches: Patches, assumed_rad: Floats, prior: Floats, log: LineLog | 
     normal[: aside.size, : aside.size], right[: aside.size] = aside.normal, aside.right
     scatter_m2 = np.full(len(patches), SCATTER_M[0] ** 2)
     trust = np.ones(len(patches))
+    solved: _Solved | None = None
     for round_ in range(ROUNDS):
+        before = solved
         weight = trust / (patches.variance_m2 + scatter_m2)
         sums = (whole.T @ sparse.csr_array(whole.multiply(weight[:, None]))).toarray()
-        solved = _solve(normal + sums, right + whole.T @ (weight * wanted_m), aside.size, steps)
+        near = changes if before is None else changes.near(before.place)
+        solved = _solve(normal + sums, right + whole.T @ (weight * wanted_m), aside.size, near)
         left_m = wanted_m - whole @ solved.estimate
         scatter_m2 = _scatter(patches, left_m, moving)
-        if round_ < ROUNDS_TRUSTING:
-            continue
-        ratio = left_m / np.sqrt(patches.variance_m2 + scatter_m2) / TUKEY
-        trust = np.where(np.abs(ratio) < 1, (1 - ratio**2) ** 2, 0.0)
+        if round_ >= ROUNDS_TRUSTING:
+            ratio = left_m / np.sqrt(patches.variance_m2 + scatter_m2) / TUKEY
+            trust = np.where(np.abs(ratio) < 1, (1 - ratio**2) ** 2, 0.0)
+            if before is not None and before.place == solved.place and round_ > ROUNDS_TRUSTING + 1:
+                moved_m = whole @ (solved.estimate - before.estimate)
+                if np.linalg.norm(moved_m) <= SETTLED_M * np.sqrt(len(moved_m)):
+                    break
+    assert solved is not None  # noqa: S101 - there is a first round
     states = slice(len(prior))
     covariance = solved.covariance()[states, states]
     return Adjustment(of, solved.estimate[states], covariance, solved.step_m, trust[~moving])
@@ -188,8 +196,22 @@ def _design(felt: Sensitivities) -> sparse.csr_array:
     return sparse.csr_array((values, (rows, columns)), shape=(count, last + of.refraction_count))
 
 
-def _change_field(patches: Patches, moving: Bools) -> tuple[sparse.csr_array, list[_Factored]]:
-    """Smooth change of the moving ground: matrix (n, knots), and covariances (knots, knots) of a step of one.
+@dataclass(frozen=True)
+class _Changes:
+    """Priors of the change at its knots, for a step of one, by how alike neighbours are; which are tried."""
+
+    precision: list[Floats]  # (knots, knots)
+    log_determinant: list[float]  # of the covariance
+    tried: list[tuple[int, int]]  # places among ALIKE_CHANGES and CHANGE_STEPS_M
+
+    def near(self, place: tuple[int, int]) -> _Changes:
+        """Return the same with only those tried that lie next to a place."""
+        around = [p for p in self.tried if max(abs(p[0] - place[0]), abs(p[1] - place[1])) <= 1]
+        return replace(self, tried=around)
+
+
+def _change_field(patches: Patches, moving: Bools) -> tuple[sparse.csr_array, _Changes]:
+    """Smooth change of the moving ground: matrix (n, knots), and what is thought of it beforehand.
 
     Knots lie in azimuth and range, the change is bilinear between them.
     """
@@ -210,7 +232,11 @@ def _change_field(patches: Patches, moving: Bools) -> tuple[sparse.csr_array, li
     apart = np.abs(np.subtract.outer(across, across)) / ALIKE_AZIMUTH_KNOTS
     apart += np.abs(np.subtract.outer(out, out)) / ALIKE_STRETCHES
     own = np.eye(len(knots)) + UNIFORM_CHANGE**2
-    return field, [_Factored(own + alike**2 * np.exp(-apart)) for alike in ALIKE_CHANGES]
+    covariances = [_Factored(own + alike**2 * np.exp(-apart)) for alike in ALIKE_CHANGES]
+    tried = [(alike, step) for alike in range(len(ALIKE_CHANGES)) for step in range(len(CHANGE_STEPS_M))]
+    return field, _Changes(
+        [one.inverse() for one in covariances], [one.log_determinant() for one in covariances], tried
+    )
 
 
 class _Factored:
@@ -228,6 +254,8 @@ class _Factored:
 
     def inverse(self) -> Floats:
         """Inverse (n, n)."""
+        if not len(self._scale):
+            return np.empty((0, 0))
         half = np.tril(linalg.lapack.dpotri(self._root, lower=True)[0])
         whole = half + np.tril(half, -1).T
         return np.asarray(whole * self._scale[:, None] * self._scale)
@@ -242,6 +270,7 @@ class _Solved:
     """Solution of normal equations whose last unknowns have the prior that makes the data most likely."""
 
     estimate: Floats
+    place: tuple[int, int]  # of the change's prior
     step_m: float
     state: _Factored  # the block of the state and the log's faults
     across: Floats  # what a unit of change does to these
@@ -252,27 +281,23 @@ class _Solved:
         return self.state.inverse() + self.across @ self.change.solve(self.across.T)
 
 
-def _solve(normal: Floats, right: Floats, size: int, steps: list[_Factored]) -> _Solved:
-    """Solve; how much the moving ground changed, and how smoothly, is chosen by the likelihood.
-
-    `steps` are covariances (knots, knots) of a change of one.
-    """
+def _solve(normal: Floats, right: Floats, size: int, changes: _Changes) -> _Solved:
+    """Solve; how much the moving ground changed, and how smoothly, is chosen by the likelihood."""
     state = _Factored(normal[:size, :size])
     across = -state.solve(normal[:size, size:])
     reduced = normal[size:, size:] + normal[size:, :size] @ across
     told = right[size:] + across.T @ right[:size]
     found = []
-    for step, alike in zip(steps, ALIKE_CHANGES, strict=True):
-        precision = step.inverse()
-        smooth = float(np.hypot(1.0, alike))
-        for step_m in CHANGE_STEPS_M:
-            change = _Factored(reduced + precision / step_m**2)
-            change_m = change.solve(told)
-            spread = (change.log_determinant() + step.log_determinant()) / 2 + len(told) * np.log(step_m)
-            found.append((float(told @ change_m / 2 - spread), step_m * smooth, change_m, change))
-    _, step_m, change_m, change = max(found, key=lambda one: one[0])
+    for alike, step in changes.tried:
+        step_m = CHANGE_STEPS_M[step]
+        change = _Factored(reduced + changes.precision[alike] / step_m**2)
+        change_m = change.solve(told)
+        spread = (change.log_determinant() + changes.log_determinant[alike]) / 2 + len(told) * np.log(step_m)
+        found.append((float(told @ change_m / 2 - spread), (alike, step), change_m, change))
+    _, place, change_m, change = max(found, key=lambda one: one[0])
     estimate = np.concatenate([state.solve(right[:size]) + across @ change_m, change_m])
-    return _Solved(estimate, step_m, state, across, change)
+    step_m = CHANGE_STEPS_M[place[1]] * float(np.hypot(1.0, ALIKE_CHANGES[place[0]]))
+    return _Solved(estimate, place, step_m, state, across, change)
 
 
 def _scatter(patches: Patches, left_m: Floats, moving: Bools) -> Floats:
