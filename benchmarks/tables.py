@@ -20,16 +20,15 @@ PUBLISHED = (  # box error in m: Voordendag et al. (2023), and the prototype on 
     ("prototype, joint: rock all round / ridge and hut", "0.020 / 0.078 rms"),
     ("prototype, joint, surface carried: ridge and hut", "0.025 rms"),
 )
-# What the prototype reached, ADJUSTMENT: as must its plain joint fit, as aim with the surface carried on.
-BOX_MUST_M = {  # rms of 100 m boxes
-    ("calm", "joint_good"): ("0.020", "0.020"),
-    ("calm", "joint_poor"): ("0.078", "0.025"),
-    ("snow", "joint_good"): ("", "0.030"),
-    ("snow", "joint_poor"): ("", "0.044"),
+BOX_MUST_M = {  # rms / 95 % / max of 100 m boxes
+    ("calm", "joint_good"): ("0.03 / 0.06 / 0.10", "0.015 / 0.03 / 0.06"),
+    ("calm", "joint_poor"): ("0.04 / 0.08 / 0.15", "0.025 / 0.05 / 0.10"),
+    ("snow", "joint_good"): ("0.05", "0.03"),
+    ("snow", "joint_poor"): ("0.08", "0.045"),
 }
 EVENTS = {  # what each figure of an event is, and what it must and should be
-    "melt_retained": ("melt retained", "0.98", "1.00"),
-    "melt_last_ratio": ("melt at the end, measured / true", "0.98", "1.00"),
+    "melt_retained": ("melt retained", "0.95-1.05", "1.00"),
+    "melt_last_ratio": ("melt at the end, measured / true", "0.95-1.05", "1.00"),
     "melt_scatter_m": ("scatter of the melting area's mean [m]", "", ""),
     "melt_true_end_m": ("its true change at the end [m]", "", ""),
     "deposit_ratio": ("deposit, measured / true", "", "1.00"),
@@ -37,10 +36,10 @@ EVENTS = {  # what each figure of an event is, and what it must and should be
     "deposit_cells": ("cells of the deposit", "", ""),
     "away_step_most_m": ("largest step of a box away from it [m]", "", ""),
     "away_step_rms_m": ("rms step of boxes away from it [m]", "", ""),
-    "leak_most_m": ("largest box error due to it alone [m]", "≤ 0.005", ""),
+    "leak_most_m": ("largest box error due to it alone [m]", "≤ 0.01", ""),
     "leak_rms_m": ("rms box error due to it alone [m]", "", ""),
-    "thin_few_points": ("10 cm of change found, 1-2 points a cell", "0.92", "0.96"),
-    "thin_few_points_far": ("the same beyond 2.5 km", "0.92", "0.96"),
+    "thin_few_points": ("10 cm of change found, 1-2 points a cell", "≥ 0.92", "0.98"),
+    "thin_few_points_far": ("the same beyond 2.5 km", "≥ 0.92", "0.98"),
     "thin_more_points": ("10 cm of change found, more points", "", ""),
     "thin_cells": ("cells with 1-2 points looked at", "", ""),
 }

@@ -241,7 +241,7 @@ class AreasSection(Section):
 class ServiceSection(Section):
     """The running service."""
 
-    memory_gb: Annotated[float, Field(ge=0.5, le=1024)] = 4.0
+    memory_gb: Annotated[float, Field(ge=0.5, le=1024)] = 5.0
 
 
 class SiteFile(Section):

@@ -110,11 +110,11 @@ class Stack:
     def __init__(self, grid: Grid) -> None:
         self.grid = grid
         self.count = np.zeros(grid.shape)
-        self._residual, self._variance, self._within, self._freedom, self._bright, self._lit = (
-            np.zeros(grid.shape) for _ in range(6)
+        self._residual, self._variance, self._within, self._freedom = (np.zeros(grid.shape) for _ in range(4))
+        self._bright, self._lit, self._steps, self._pairs = (
+            np.zeros(grid.shape, np.float32) for _ in range(4)
         )
-        self._steps, self._pairs = (np.zeros(grid.shape, np.float32) for _ in range(2))
-        self._last: tuple[Floats, Floats] | None = None
+        self._last: tuple[Floats32, Floats32] | None = None
 
     def add(
         self, gridder: Gridder, correction_m: Floats32 | None = None, roughness_m2: Floats32 | None = None
@@ -131,15 +131,18 @@ class Stack:
             mean_m -= correction_m
         self._residual[seen] += mean_m[seen] * count[seen]
         bright = gridder.intensity()
-        self._bright += np.nan_to_num(bright) * count
-        self._lit += np.where(np.isfinite(bright), count, 0)
+        lit = np.where(np.isfinite(bright), count, 0).astype(np.float32)
+        self._bright += np.nan_to_num(bright) * lit
+        self._lit += lit
         if roughness_m2 is not None:
-            self._compare(mean_m, gridder.random_variance() + roughness_m2 / np.maximum(count, 1))
+            variance_m2 = gridder.random_variance()
+            variance_m2 += (roughness_m2 / np.maximum(count, 1)).astype(np.float32)
+            self._compare(mean_m.astype(np.float32), variance_m2)
         self._variance[seen] += gridder.random_variance()[seen] * count[seen] ** 2
         self._within += np.nan_to_num(gridder.spread()).astype(np.float64) ** 2 * np.maximum(count - 1, 0)
         self._freedom += np.maximum(count - 1, 0)
 
-    def _compare(self, mean_m: Floats, variance_m2: Floats) -> None:
+    def _compare(self, mean_m: Floats32, variance_m2: Floats32) -> None:
         """Take the step from the scan before, in units of what it should be."""
         if self._last is not None:
             before_m, before_m2 = self._last
