@@ -28,7 +28,7 @@ import numpy as np
 from benchmarks.disturbed import CASES, disturbed
 from benchmarks.events import event_figures, null_boxes
 from benchmarks.measures import Calibration, Result, box_figures, twenty_boxes
-from benchmarks.speed import adjustment_seconds
+from benchmarks.speed import AMIDST_M, RIDGE_M, adjustment_seconds
 from benchmarks.tables import show
 
 WORKERS = 2
@@ -51,7 +51,10 @@ def main() -> None:
             jobs = {case: pool.submit(disturbed, folder, asked.seed, case) for case in CASES}
             told["disturbed"] = {case: job.result() for case, job in jobs.items()}
         if "speed" in asked.only:
-            told["speed"] = pool.submit(adjustment_seconds).result()
+            told["speed"] = {
+                name: pool.submit(adjustment_seconds, place).result()
+                for name, place in (("from a ridge", RIDGE_M), ("all round", AMIDST_M))
+            }
     show(told)
     if asked.json:
         asked.json.write_text(json.dumps(told, indent=1))

@@ -16,7 +16,8 @@ from station.science.adjustment import LineLog
 from station.science.grid import Gridder
 
 GRID = Grid(west_m=0.0, north_m=5000.0, cell_m=1.0, nx=4000, ny=5000)
-POSITION_M = (3900.0, 300.0, 700.0)
+RIDGE_M = (2000.0, -50.0, 700.0)  # beside the grid: the head looks over half a turn, as at Hintereisferner
+AMIDST_M = (3900.0, 300.0, 700.0)  # on the grid: a whole turn
 SCANNER = Scanner("riegl-vz-6000", 1.064, 0.12e-3, 0.015, 0.015, 9e-6, 1.4e-4, 6000.0)
 VALID = 0.31  # share of the grid's cells that a scan sees: Voordendag et al. (2023)
 STABLE = 0.3  # of these
@@ -25,14 +26,16 @@ NOISE_M = 0.03
 ROUNDS = 3
 
 
-def adjustment_seconds(seed: int = 1, grid: Grid = GRID) -> dict[str, float]:
+def adjustment_seconds(
+    position_m: tuple[float, float, float], seed: int = 1, grid: Grid = GRID
+) -> dict[str, float]:
     """Return CPU seconds of estimating, of applying, and of measuring without either; the best of three."""
     random = np.random.default_rng(seed)
     seen, stable = _patchy(random, grid, VALID), _patchy(random, grid, STABLE)
     reference = _reference(grid, seen)
-    setup = Setup(SCANNER, grid, POSITION_M)
+    setup = Setup(SCANNER, grid, position_m)
     gridder = _filled(random, gridder_for(setup, reference), seen)
-    told = _told(random, grid)
+    told = _told(random, grid, position_m)
     found = level(gridder, setup, told, reference, stable)
     levelled_s = _best(lambda: level(gridder, setup, told, reference, stable))
     unknown = found.shared()
@@ -86,9 +89,9 @@ def _filled(random: np.random.Generator, gridder: Gridder, seen: Bools) -> Gridd
     return gridder
 
 
-def _told(random: np.random.Generator, grid: Grid) -> Told:
+def _told(random: np.random.Generator, grid: Grid, position_m: tuple[float, float, float]) -> Told:
     """What a log with noise and the usual faults tells."""
-    of = shared.basis(grid, POSITION_M)
+    of = shared.basis(grid, position_m)
     lines = prior.lines_of(of, np.eye(3), None)
     lean_rad: Floats = np.radians(random.normal(0, 0.004, of.line_count))
     azimuth_rad = of.line_azimuth_rad

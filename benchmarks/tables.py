@@ -55,7 +55,8 @@ def show(told: Figures) -> None:
     if "disturbed" in told:
         console.print(_disturbed(told["disturbed"]))
     if "speed" in told:
-        console.print(_speed(told["speed"]))
+        for name, figures in told["speed"].items():
+            console.print(_speed(name, figures))
 
 
 def _show_accuracy(console: Console, told: Figures) -> None:
@@ -125,11 +126,13 @@ def _counted(told: dict[str, int]) -> str:
     return "\n".join(f"{count} × {what}" for what, count in told.items())
 
 
-def _speed(told: Figures) -> Table:
+def _speed(name: str, told: Figures) -> Table:
     rows = [(name, _number(value), "", "") for name, value in told.items() if name != "adjustment_s"]
     last = ("adjustment_s", _number(told["adjustment_s"]), f"≤ {SPEED_MUST_S:g}", f"{SPEED_AIM_S:g}")
     return _table(
-        "CPU of the adjustment, 20 M cells, one core", ("what", "measured", "must", "aim"), [*rows, last]
+        f"CPU of the adjustment, 20 M cells, one core, {name}",
+        ("what", "measured", "must", "aim"),
+        [*rows, last],
     )
 
 

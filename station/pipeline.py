@@ -37,7 +37,7 @@ from station.science.view import Points, View
 BAND_ROWS = 128  # the cells that are looked at together: what a store chunk is high
 MARGIN_ROWS = 4  # rows beyond a band that its smoothed gradient looks at
 FEW_POINTS = 3
-MOVING_MOST = 1_000_000  # cells of moving ground that an adjustment looks at
+MOVING_MOST = 400_000  # cells of moving ground that an adjustment looks at
 FEW_STABLE = 20  # cells, that say nothing of a spread
 HIGH_INCIDENCE_COS = float(np.cos(np.radians(80.0)))
 
@@ -147,27 +147,27 @@ def level(gridder: Gridder, setup: Setup, told: Told, reference: Reference, stab
 
 def _cells(gridder: Gridder, setup: Setup, of: Basis, reference: Reference, stable: Bools) -> Iterator[Cells]:
     """Give the cells of a scan that the reference knows, band by band; of too many moving ones a part."""
-    grid, mean_m, bright = setup.grid, gridder.mean_residual(), gridder.intensity()
-    model_m2 = gridder.random_variance()
+    grid = setup.grid
     count = gridder.count.reshape(grid.shape)
     every = 1 + np.count_nonzero(count) // MOVING_MOST
     for band in _bands(grid):
-        seen = np.isfinite(mean_m[band]) & np.isfinite(reference.elevation_m[band])
+        seen = (count[band] > 0) & np.isfinite(reference.elevation_m[band])
         seen &= stable[band] | (
             np.add.outer(np.arange(*band.indices(grid.ny)), np.arange(grid.nx)) % every == 0
         )
         if not seen.any():
             continue
         view = _view(setup, band, seen, reference.elevation_m)
-        unlike = ground.looks_unlike(bright[band][seen], reference.intensity[band][seen])
+        unlike = ground.looks_unlike(gridder.intensity(band)[seen], reference.intensity[band][seen])
         row, column = np.nonzero(seen)
         kept_out = ground.withheld(grid.x_m[column], grid.y_m[band][row])
         yield Cells(
             _felt(view, of),
             np.hypot(view.offset_m[0], view.offset_m[1]),
             ground.kinds(stable[band][seen], kept_out, view.tan_slope, unlike),
-            mean_m[band][seen],
-            _random(model_m2, count, reference, band, seen) + reference.random_variance_m2[band][seen],
+            gridder.mean_residual(band)[seen],
+            _random(gridder.random_variance(band)[seen], count[band][seen], reference, band, seen)
+            + reference.random_variance_m2[band][seen],
         )
 
 
@@ -255,10 +255,8 @@ def _random(
     model_m2: Floats32, count: NDArray[np.int32], reference: Reference, band: slice, seen: Bools
 ) -> Floats:
     """Random variance of a scan's own cells (n,) [m²]: shots and roughness, as scans have shown it."""
-    rough_m2 = reference.roughness_m2[band][seen] / count[band][seen]
-    return np.asarray(
-        (model_m2[band][seen] + rough_m2) * reference.variance_factor[band][seen], dtype=np.float64
-    )
+    rough_m2 = reference.roughness_m2[band][seen] / count
+    return np.asarray((model_m2 + rough_m2) * reference.variance_factor[band][seen], dtype=np.float64)
 
 
 def _felt(view: View, of: Basis) -> Sensitivities:
@@ -303,7 +301,8 @@ class _Judge:
             shared_m2, terms = self._shared_and_terms(band, seen, view, count, sampling_m2)
             flags |= self._stable(band, seen, view)
         if reference is not None and not setup.published_budget:
-            own_m2 = _random(surface.random_variance_m2, surface.count, reference, band, seen)
+            model_m2 = surface.random_variance_m2[band][seen]
+            own_m2 = _random(model_m2, surface.count[band][seen], reference, band, seen)
             before_m2 = reference.random_variance_m2[band][seen]
             random_m2 = np.where(measured, own_m2 + before_m2, random_m2)
         sigma_m = np.sqrt(random_m2 + shared_m2)

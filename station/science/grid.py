@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy import ndimage
 
 from station.science.terrain import Ground, ground
@@ -17,6 +18,8 @@ if TYPE_CHECKING:
 QUANTUM = 2.0**20
 STEP_MOST = 6.0  # sigmas: beyond, something happened
 CLASS_STEPS = 10.0  # what the class of a cell weighs against the steps from scan to scan of its own
+ALL = slice(None)
+T = TypeVar("T", bound=np.generic)
 ROUGHNESS_CELLS = 1.0  # one sigma of the neighbourhood that tells how rough a cell is
 
 
@@ -69,20 +72,22 @@ class Gridder:
         if intensity is not None:
             np.add.at(self._brightness, cell, np.rint(intensity * QUANTUM) / QUANTUM)
 
-    def mean_residual(self) -> Floats:
-        """Mean height above reference or datum (ny, nx) [m], NaN in empty cells.
+    def mean_residual(self, rows: slice = ALL) -> Floats:
+        """Mean height above reference or datum (ny, nx) [m], NaN in empty cells; of some rows or all.
 
         Source: Hartzell et al. (2015), Eq. 11, of residuals (EQUATIONS 6.5).
         """
-        mean_m = np.full(len(self.count), np.nan)
-        np.divide(self._residual, self.count, out=mean_m, where=self.count > 0)
-        return mean_m.reshape(self.grid.shape)
+        count, residual = self._rows(self.count, rows), self._rows(self._residual, rows)
+        mean_m = np.full(count.shape, np.nan)
+        np.divide(residual, count, out=mean_m, where=count > 0)
+        return mean_m
 
-    def intensity(self) -> Floats32:
+    def intensity(self, rows: slice = ALL) -> Floats32:
         """Mean brightness of each cell (ny, nx), 0-1, NaN in empty cells and in scans that do not tell."""
-        bright = np.full(len(self.count), np.nan, np.float32)
-        np.divide(self._brightness, self.count, out=bright, where=self._brightness > 0)
-        return bright.reshape(self.grid.shape)
+        count, brightness = self._rows(self.count, rows), self._rows(self._brightness, rows)
+        bright = np.full(count.shape, np.nan, np.float32)
+        np.divide(brightness, count, out=bright, where=brightness > 0)
+        return bright
 
     def spread(self) -> Floats32:
         """Standard deviation of the points in each cell (ny, nx) [m], NaN for fewer than two."""
@@ -93,15 +98,19 @@ class Gridder:
         spread_m[several] = np.sqrt(np.maximum(centred, 0.0) / (count - 1))
         return spread_m.reshape(self.grid.shape)
 
-    def random_variance(self) -> Floats32:
-        """Random variance of each cell's mean (ny, nx) [m²], NaN in empty cells.
+    def random_variance(self, rows: slice = ALL) -> Floats32:
+        """Random variance of each cell's mean (ny, nx) [m²], NaN in empty cells; of some rows or all.
 
         Source: Hartzell et al. (2015), Eq. 12.
         """
-        variance_m2 = np.full(len(self.count), np.nan, np.float32)
-        seen = np.flatnonzero(self.count)
-        variance_m2[seen] = self._variance[seen] / self.count[seen].astype(np.float64) ** 2
-        return variance_m2.reshape(self.grid.shape)
+        count, variance = self._rows(self.count, rows), self._rows(self._variance, rows)
+        variance_m2 = np.full(count.shape, np.nan, np.float32)
+        seen = count > 0
+        variance_m2[seen] = variance[seen] / count[seen].astype(np.float64) ** 2
+        return variance_m2
+
+    def _rows(self, values: NDArray[T], rows: slice) -> NDArray[T]:
+        return values.reshape(self.grid.shape)[rows]
 
 
 class Stack:
