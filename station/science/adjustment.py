@@ -29,7 +29,7 @@ SCATTER_MOST_M = 1.0  # the same of moving ones
 TOGETHER_MOST = 40.0  # patches of moving ground that are wrong as one
 CHANGE_AZIMUTH_KNOTS = 4  # knots of the lean, between knots of the change
 CHANGE_STRETCHES = 3  # of range, between knots of the change
-CHANGE_STEPS_M = tuple(float(step) for step in np.geomspace(0.001, 0.5, 10))
+CHANGE_STEPS_M = tuple(float(step) for step in np.geomspace(0.0005, 0.5, 11))
 UNIFORM_CHANGE = 3.0  # one sigma of what all the moving ground changes by, in steps of a knot's
 ALIKE_CHANGES = (
     0.0,
