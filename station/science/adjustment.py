@@ -31,13 +31,9 @@ CHANGE_AZIMUTH_KNOTS = 4  # knots of the lean, between knots of the change
 CHANGE_STRETCHES = 3  # of range, between knots of the change
 CHANGE_STEPS_M = tuple(float(step) for step in np.geomspace(0.0005, 0.5, 11))
 UNIFORM_CHANGE = 3.0  # one sigma of what all the moving ground changes by, in steps of a knot's
-ALIKE_CHANGES = (
-    0.0,
-    1.0,
-    3.0,
-    10.0,
-)  # the same of what is alike in knots so many apart in azimuth and range:
-ALIKE_AZIMUTH_KNOTS, ALIKE_STRETCHES = 10.0, 6.0
+# The same of what neighbours change by alike, and after how many knots in azimuth and range it no longer is.
+ALIKE_CHANGES = (0.0, 1.0, 3.0, 10.0)
+ALIKE_AZIMUTH_KNOTS, ALIKE_RANGE_KNOTS = 10.0, 6.0
 
 
 @dataclass(frozen=True)
@@ -230,7 +226,7 @@ def _change_field(patches: Patches, moving: Bools) -> tuple[sparse.csr_array, _C
     field = sparse.csr_array((values[held], (rows[held], columns)), shape=(len(u), len(knots)))
     across, out = np.divmod(knots, along)
     apart = np.abs(np.subtract.outer(across, across)) / ALIKE_AZIMUTH_KNOTS
-    apart += np.abs(np.subtract.outer(out, out)) / ALIKE_STRETCHES
+    apart += np.abs(np.subtract.outer(out, out)) / ALIKE_RANGE_KNOTS
     own = np.eye(len(knots)) + UNIFORM_CHANGE**2
     covariances = [_Factored(own + alike**2 * np.exp(-apart)) for alike in ALIKE_CHANGES]
     tried = [(alike, step) for alike in range(len(ALIKE_CHANGES)) for step in range(len(CHANGE_STEPS_M))]

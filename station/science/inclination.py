@@ -72,11 +72,6 @@ def head_azimuth(track: HeadTrack, time_s: Floats) -> Floats:
     return np.interp(time_s, track.time_s, track.azimuth_rad)
 
 
-def head_speed(track: HeadTrack) -> float:
-    """Mean speed of the scanner's head [rad/s]."""
-    return float(abs(np.ptp(track.azimuth_rad)) / np.ptp(track.time_s))
-
-
 def fit_cycle(log: InclinationLog, track: HeadTrack, sigma_rad: float) -> Cycle:
     """Fit the wave over one turn to the part of a clean log that lies within the scan.
 
