@@ -30,9 +30,12 @@ TOGETHER_MOST = 40.0  # patches of moving ground that are wrong as one
 CHANGE_AZIMUTH_KNOTS = 4  # knots of the lean, between knots of the change
 CHANGE_STRETCHES = 3  # of range, between knots of the change
 CHANGE_STEPS_M = tuple(float(step) for step in np.geomspace(0.0005, 0.5, 11))
-UNIFORM_CHANGE = 3.0  # one sigma of what all the moving ground changes by, in steps of a knot's
+UNIFORM_CHANGE = 1.0  # one sigma of what all the moving ground changes by, in steps of a knot's
 # The same of what neighbours change by alike, and after how many knots in azimuth and range it no longer is.
 ALIKE_CHANGES = (0.0, 1.0, 3.0, 10.0)
+# Log odds against the same: smooth errors of the air look like it too, but speak for it with tens at most, a
+# smooth snowfall with hundreds.
+ALIKE_ODDS = (0.0, 0.0, 12.0, 24.0)
 ALIKE_AZIMUTH_KNOTS, ALIKE_RANGE_KNOTS = 10.0, 6.0
 
 
@@ -289,7 +292,8 @@ def _solve(normal: Floats, right: Floats, size: int, changes: _Changes) -> _Solv
         change = _Factored(reduced + changes.precision[alike] / step_m**2)
         change_m = change.solve(told)
         spread = (change.log_determinant() + changes.log_determinant[alike]) / 2 + len(told) * np.log(step_m)
-        found.append((float(told @ change_m / 2 - spread), (alike, step), change_m, change))
+        odds = float(told @ change_m / 2 - spread) - ALIKE_ODDS[alike]
+        found.append((odds, (alike, step), change_m, change))
     _, place, change_m, change = max(found, key=lambda one: one[0])
     estimate = np.concatenate([state.solve(right[:size]) + across @ change_m, change_m])
     step_m = CHANGE_STEPS_M[place[1]] * float(np.hypot(1.0, ALIKE_CHANGES[place[0]]))
