@@ -82,7 +82,7 @@ def test_refraction_coefficients():
 
 def test_p7_68_percent_ellipse():
     """Of draws from the distribution 68.3 % lie within, against 39.35 % for the unscaled ellipse."""
-    circle = beam.horizontal_error(np.diag([1.0, 1.0, 4.0])[None])[0]
+    circle = beam.error_ellipse(np.diag([1.0, 1.0, 4.0])[None])[0][0]
     assert circle**2 == pytest.approx(2.2977, abs=2e-3)
     draws = np.random.default_rng(7).normal(size=(200_000, 2))
     assert np.mean(np.hypot(*draws.T) < circle) == pytest.approx(0.683, abs=0.004)
@@ -100,7 +100,7 @@ def test_p8_errors_of_a_vz4000_at_500_m(elevation_deg, with_beam, horizontal_mm,
     jacobian = beam.polar_jacobian(array(500), np.radians(array(elevation_deg)), array(0.3))
     covariance = beam.point_covariance(jacobian, array(0.010, angle, angle)[None])
     if horizontal_mm:
-        assert beam.horizontal_error(covariance)[0] * 1e3 == pytest.approx(horizontal_mm, abs=0.15)
+        assert beam.error_ellipse(covariance)[0][0] * 1e3 == pytest.approx(horizontal_mm, abs=0.15)
     assert math.sqrt(covariance[0, 2, 2]) * 1e3 == pytest.approx(vertical_mm, abs=0.15)
 
 
