@@ -96,8 +96,8 @@ def point_covariance(site: str | Path, points_m: npt.ArrayLike, epoch: Epoch) ->
     """Covariance (n, 3, 3) of points (n, 3) on the map, as the scan of an epoch measures them [m²].
 
     Of the shot: range, beam, encoder. Of all shots alike: pose, lean, ranges and air as the adjustment of the
-    epoch leaves them, against the reference. `station.science.beam.error_ellipse` draws it. Takes a site file,
-    for the scanner; raises StoreError where there is no series.
+    epoch leaves them, against the reference. `station.science.beam.error_ellipse` draws it. It is a site file
+    that is wanted, for the scanner; raises StoreError where there is no series.
     Source: Hartzell et al. (2015), Eq. 9; EQUATIONS 6.2.
     """
     import numpy as np  # noqa: PLC0415

@@ -19,7 +19,7 @@ def shot_covariance(offset_m: Floats, axis: Floats, scanner: Scanner) -> Floats:
 
     `offset_m` (n, 3) is from the scanner, `axis` (3,) what its head turns about, both on the map. The beam's
     width counts once, as an angle (EQUATIONS 3.4).
-    Source: Hartzell et al. (2015), Eq. 9 and 7, about the head's axis.
+    Source: EQUATIONS 3.1 and 3.3, about the head's axis.
     """
     upright = _about(axis)
     jacobian = upright @ polar_jacobian(*polar(offset_m @ upright))
@@ -43,7 +43,7 @@ def registered_covariance(
     `offset_m` (n, 3) is from the scanner. The lean is unsure by the same in both directions, so that it does
     not matter which way the scanner looks. Each is right for a point alone; points share the last two, which
     this form does not tell: see `volume.variance` and `shared_covariance`.
-    Source: Hartzell et al. (2015), Eq. 5 propagated as in Eq. 9 (EQUATIONS 3.1).
+    Source: EQUATIONS 3.1: Hartzell et al. (2015), Eq. 5, propagated.
     """
     jacobian = pose_jacobian(offset_m)
     pose = registration.copy()

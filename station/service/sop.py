@@ -273,7 +273,7 @@ def describe_solution(told: Solution) -> str:
     lines = [
         describe_chain(told.chain),
         f"  one sigma about {_numbers(told.turn_sigma_deg, 4)} °, along {_numbers(told.shift_sigma_m, 4)} m",
-        f"  reference variance    {told.reference_variance:.3g}: the features' sigmas were scaled by its root",
+        f"  reference variance {told.reference_variance:.3g}: the features' sigmas are scaled by its root",
         "",
         "feature                 left [m]   sigmas",
     ]
