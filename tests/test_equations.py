@@ -110,7 +110,7 @@ def test_p8_errors_of_a_vz4000_at_500_m(elevation_deg, with_beam, horizontal_mm,
     [(0.5, (700, 800), (22.2, 12.3), 4.743), (0.25, (80, 112), (2.6, 1.6), 0.0182)],
 )
 def test_p9_net_volume_of_hartzells_sites(cell_m, cells, sigma_mm, net_m3):
-    """H Table 2, raster: Montezuma, 140 000 m², Mammoth, 560 m², from the cells' sigma with and without snow."""
+    """H Table 2, raster: Montezuma, 140 000 m², Mammoth, 560 m², from cells' sigma with and without snow."""
     grid = Grid(0.0, cells[0] * cell_m, cell_m, cells[1], cells[0])
     east, north = (axis.ravel() for axis in np.meshgrid(grid.x_m, grid.y_m))
     level = terrain.ground(Reference.given(grid, "level", np.zeros(grid.shape)))

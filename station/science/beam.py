@@ -8,9 +8,7 @@ import numpy as np
 
 from station.quantities import Floats
 
-ELLIPSE = -2 * math.log(
-    1 - math.erf(1 / math.sqrt(2))
-)  # χ² of two dimensions within which 68.3 % lie: 2.2977
+ELLIPSE = -2 * math.log(1 - 0.683)  # 2.2977, the χ² of two dimensions within which 68.3 % lie
 
 
 def cartesian(range_m: Floats, elevation_rad: Floats, azimuth_rad: Floats) -> Floats:
