@@ -77,19 +77,13 @@ def volume(
     variance. Only cells with a change count. Raises StoreError where there is no series, no reference or no
     change.
     """
-    import numpy as np  # noqa: PLC0415
-    import shapely  # noqa: PLC0415
-
     from station.archive.store import series_in  # noqa: PLC0415
-    from station.archive.volume import Volumes  # noqa: PLC0415
-    from station.readers.polygons import mask  # noqa: PLC0415
+    from station.archive.volume import Volumes, cells_of  # noqa: PLC0415
 
     series = series_in(site_or_folder)
-    cells = mask(area, series.grid) if isinstance(area, shapely.Geometry) else np.asarray(area, np.bool_)
-    if cells.shape != series.grid.shape:
-        raise ValueError(f"an area of {cells.shape} cells on a grid of {series.grid.shape}")
     found = Volumes(series)
-    return found.change(cells, found.row(epoch), None if epoch2 is None else found.row(epoch2))
+    other = None if epoch2 is None else found.row(epoch2)
+    return found.change(cells_of(area, series.grid), found.row(epoch), other)
 
 
 def point_covariance(site: str | Path, points_m: npt.ArrayLike, epoch: Epoch) -> npt.NDArray[np.float64]:

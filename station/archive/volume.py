@@ -4,15 +4,28 @@ from __future__ import annotations
 
 import netCDF4
 import numpy as np
+import numpy.typing as npt
+import shapely
 import xarray as xr
 
 from station.archive.aggregate import CHANGE, Aggregates
 from station.archive.store import Row
 from station.errors import StoreError
-from station.quantities import Bools, Floats, Scanner
+from station.quantities import Bools, Floats, Grid, Scanner
 from station.science.points import shared_covariance, shot_covariance
 from station.science.shared import against, basis
 from station.science.volume import contributions
+
+
+def cells_of(area: npt.ArrayLike | shapely.Geometry, grid: Grid) -> Bools:
+    """Cells (ny, nx) of an area: given as such, or those with their centre in a polygon on the map."""
+    if isinstance(area, shapely.Geometry):
+        shapely.prepare(area)
+        return np.asarray(shapely.contains_xy(area, grid.x_m[None, :], grid.y_m[:, None]))
+    cells = np.asarray(area, np.bool_)
+    if cells.shape != grid.shape:
+        raise ValueError(f"an area of {cells.shape} cells on a grid of {grid.shape}")
+    return cells
 
 
 class Volumes(Aggregates):
