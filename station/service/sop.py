@@ -82,8 +82,11 @@ def solve_sop(table: Path, out: Path, start: Path | None, crs: str | None) -> So
     """
     features = read_features(table)
     begin = None if start is None else read_matrix(start)
-    found = solve(features, begin) if crs is None else _solve_on_map(features, begin, crs)
     covariance_file = out.with_name(f"{out.stem}-covariance.csv")
+    for path in (out, covariance_file):
+        if path.exists():
+            raise ConfigError(f"{path}: is there already; nothing is overwritten")
+    found = solve(features, begin) if crs is None else _solve_on_map(features, begin, crs)
     _write_new(out, _as_text(found, table, crs))
     _write_new(covariance_file, _as_csv(found.covariance))
     sigma = np.sqrt(np.diag(found.covariance))
@@ -167,10 +170,7 @@ def _known(crs: str) -> CRS:
 
 def _write_new(path: Path, text: str) -> None:
     try:
-        with path.open("x", encoding="utf-8") as file:
-            file.write(text)
-    except FileExistsError as error:
-        raise ConfigError(f"{path}: is there already; nothing is overwritten") from error
+        path.write_text(text, encoding="utf-8")
     except OSError as error:
         raise StoreError(f"{path}: cannot be written: {error.strerror}") from error
 
@@ -270,10 +270,11 @@ def describe_chain(told: Chain) -> str:
 
 def describe_solution(told: Solution) -> str:
     """Say how good a solved SOP is, feature by feature."""
+    times = math.sqrt(told.reference_variance)
     lines = [
         describe_chain(told.chain),
         f"  one sigma about {_numbers(told.turn_sigma_deg, 4)} °, along {_numbers(told.shift_sigma_m, 4)} m",
-        f"  reference variance {told.reference_variance:.3g}: the features' sigmas are scaled by its root",
+        f"  reference variance {told.reference_variance:.3g}: the features are off by {times:.2g} sigmas",
         "",
         "feature                 left [m]   sigmas",
     ]

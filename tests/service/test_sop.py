@@ -7,12 +7,13 @@ import sys
 
 import numpy as np
 import pytest
-from pyproj import Transformer
+from pyproj import Proj, Transformer
 from scipy.spatial.transform import Rotation
 
 from station.errors import ConfigError
 from station.readers.sop import read_matrix
 from station.science import pose
+from station.science.registration import Features, solve
 from station.service.sop import describe_chain, describe_solution, show_sop, solve_sop
 
 CRS = "EPSG:32632"
@@ -22,7 +23,7 @@ HEAD = ["name", "x", "y", "z", "ref_x", "ref_y", "ref_z", "normal_x", "normal_y"
 
 
 def surveyed(tmp_path, *, noise_m=0.0, planes=4):
-    """Features up to 3 km away, their references on the map by PROJ alone."""
+    """Features up to 3 km away, their references on the map by PROJ alone; and in the level frame."""
     rng = np.random.default_rng(2)
     to_map = Transformer.from_pipeline(
         "+proj=pipeline +step +inv +proj=topocentric +ellps=WGS84"
@@ -44,7 +45,9 @@ def surveyed(tmp_path, *, noise_m=0.0, planes=4):
             plane = i >= 14 - planes
             on_map, across = (ends[1][i], ends[2][i] - ends[1][i]) if plane else (ends[0][i], ["", "", ""])
             rows.writerow([f"f{i}", *scan[i], *on_map, *across, 0.02])
-    return path, local
+    at = np.arange(14) >= 14 - planes
+    reference, normal = np.where(at[:, None], beside, local), normal * at[:, None]
+    return path, Features(("f",) * 14, scan, reference, normal, np.full(14, 0.02))
 
 
 LONGITUDE_DEG, LATITUDE_DEG, _ = Transformer.from_crs(CRS, "EPSG:4979", always_xy=True).transform(*PLACE_M)
@@ -52,7 +55,7 @@ LONGITUDE_DEG, LATITUDE_DEG, _ = Transformer.from_crs(CRS, "EPSG:4979", always_x
 
 def test_on_a_map(tmp_path):
     """It leads where the station's own way to the map leads, in curvature and scale too."""
-    table, local = surveyed(tmp_path)
+    table, _ = surveyed(tmp_path)
     found = solve_sop(table, tmp_path / "sop.dat", None, CRS)
     sop = read_matrix(tmp_path / "sop.dat")
     assert sop[:3, 3] == pytest.approx(PLACE_M, abs=1e-4)
@@ -62,7 +65,6 @@ def test_on_a_map(tmp_path):
     assert found.observations == 10 * 3 + 4
     assert max(one.residual_m for one in found.features) < 2e-3
     assert "f13" in describe_solution(found)
-    assert len(local) == 14
 
 
 def test_a_map_is_no_rigid_frame(tmp_path):
@@ -73,13 +75,18 @@ def test_a_map_is_no_rigid_frame(tmp_path):
 
 
 def test_covariance_is_written_beside(tmp_path):
-    table, _ = surveyed(tmp_path, noise_m=0.02)
+    table, level = surveyed(tmp_path, noise_m=0.02)
     found = solve_sop(table, tmp_path / "sop.dat", None, CRS)
     lines = (tmp_path / "sop-covariance.csv").read_text().splitlines()
     rows = list(csv.reader(line for line in lines if not line.startswith("#")))
     names, values = rows[0][1:], np.array([row[1:] for row in rows[1:]], dtype=float)
     assert names == ["turn_east", "turn_north", "turn_up", "shift_east", "shift_north", "shift_up"]
-    assert values == pytest.approx(values.T)
+    # As in the level frame, whose axes are turned by the map's convergence.
+    convergence_deg = Proj(CRS).get_factors(LONGITUDE_DEG, LATITUDE_DEG).meridian_convergence
+    turn = np.kron(np.eye(2), Rotation.from_euler("z", -convergence_deg, degrees=True).as_matrix())
+    assert abs(convergence_deg) > 1
+    assert values == pytest.approx(turn.T @ solve(level).covariance @ turn, rel=1e-5, abs=1e-14)
+    assert values != pytest.approx(solve(level).covariance, rel=1e-2, abs=1e-14)
     assert np.sqrt(np.diag(values)[3:]) == pytest.approx(found.shift_sigma_m, rel=1e-6)
     assert np.degrees(np.sqrt(np.diag(values)[:3])) == pytest.approx(found.turn_sigma_deg, rel=1e-6)
     assert found.reference_variance == pytest.approx(1.0, abs=0.6)
