@@ -187,6 +187,10 @@ def solve(
         typer.Option(metavar="SOP", help="Start from this; needed without three points.", **Given),
     ] = None,
     crs: Crs = None,
+    scanner: Annotated[
+        str | None,
+        typer.Option(metavar="MODEL", help="Add the noise of this scanner, such as riegl-vz-6000."),
+    ] = None,
     *,
     json_: Json = False,
 ) -> None:
@@ -197,9 +201,9 @@ def solve(
     """
     from dataclasses import asdict
 
-    from station.service.sop import describe_solution, solve_sop
+    from station.service.sop import describe_solution, known_scanner, solve_sop
 
-    found = solve_sop(features, out, start, crs)
+    found = solve_sop(features, out, start, crs, None if scanner is None else known_scanner(scanner))
     print(json.dumps(asdict(found), indent=2) if json_ else describe_solution(found))
 
 

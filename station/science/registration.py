@@ -13,6 +13,7 @@ from station.science.shared import GLOBAL, Basis
 
 UNKNOWN = ("turn_east", "turn_north", "turn_up", "shift_east", "shift_north", "shift_up")
 ROUNDS = 100
+UNSEEN = 1e-9  # redundancy of an observation that nothing checks
 STILL_M = 1e-7  # what a step moves the features when the estimate stands
 SINGULAR = 1e-8  # of the normal matrix: the weakest motion is held 10,000 times less than the strongest
 
@@ -23,7 +24,7 @@ class Features:
 
     A row is a point in the scan and the point it is; or, with a `normal` (not nought), a point in the scan
     that lies on the plane through `reference_m` across that normal. `sigma_m` is of a coordinate, or across
-    the plane.
+    the plane; `scan_covariance_m2` what the scan's points add to that, where it is known of each.
     """
 
     names: tuple[str, ...]
@@ -31,6 +32,7 @@ class Features:
     reference_m: Floats  # (n, 3)
     normal: Floats  # (n, 3) unit length, or nought for a point
     sigma_m: Floats  # (n,)
+    scan_covariance_m2: Floats | None = None  # (n, 3, 3) scanner's frame
 
     @property
     def is_plane(self) -> np.ndarray[tuple[int], np.dtype[np.bool_]]:
@@ -44,23 +46,24 @@ class Registration:
 
     `covariance` (6, 6) is of `UNKNOWN`: small turns about east, north and up at the scanner [rad,
     counter-clockwise], and shifts [m]. It is scaled by `reference_variance`, which is 1 where the features
-    fit as well as their sigmas say. Each observation (m,) belongs to the feature `row`; `residual_m` is what
-    is left of it, `standardised` that over its own sigma: beyond 3.3 the feature is suspect.
+    fit as well as their sigmas say. `left_m` (n,) is how far each feature stays from its place,
+    `standardised` (n,) the largest of its residuals over their own sigma: beyond 3.3 it is suspect.
     """
 
     sop: Floats  # (4, 4)
     covariance: Floats
     reference_variance: float
-    row: Ints
-    residual_m: Floats
+    observations: int
+    left_m: Floats
     standardised: Floats
 
 
 def solve(features: Features, start: Floats | None = None) -> Registration:
     """Register by least squares, from an SOP (4, 4) to start with, or from three points or more without.
 
-    The reference variance scales the inverse normal matrix, so that a second pass with sigmas scaled by its
-    root gives 1. It takes the features' errors as independent. Raises ConfigError where the features do not
+    Weights are the inverse of the features' covariance. The reference variance scales the inverse normal
+    matrix, so that a second pass with sigmas scaled by its root gives 1. It takes the features' errors as
+    independent. Raises ConfigError where the features do not
     say where the scanner stands, or nothing is left to tell how well.
     Source: Hartzell et al. (2015), section 2.2; EQUATIONS 2.11.
     """
@@ -72,11 +75,10 @@ def solve(features: Features, start: Floats | None = None) -> Registration:
         )
     sop = _from_points(features) if start is None else start.copy()
     for _ in range(ROUNDS):
-        row, design, misfit = _observe(features, sop)
-        weight = 1 / features.sigma_m[row]
+        _, design, misfit = _observe(features, sop)
         arm_m = _arms(features)
-        inverse = _inverse(design * weight[:, None], arm_m)
-        step = inverse @ (design.T @ (misfit * weight**2))
+        inverse = _inverse(design, arm_m)
+        step = inverse @ (design.T @ misfit)
         sop[:3, :3] = Rotation.from_rotvec(step[:3]).as_matrix() @ sop[:3, :3]
         sop[:3, 3] += step[3:]
         if np.all(np.abs(step) * arm_m < STILL_M):
@@ -84,25 +86,44 @@ def solve(features: Features, start: Floats | None = None) -> Registration:
     else:
         raise ConfigError("the registration does not settle: start from an SOP that is nearer")
     row, design, misfit = _observe(features, sop)
-    variance = reference_variance(misfit * weight, len(UNKNOWN))
-    own_m2 = 1 / weight**2 - np.einsum("ij,jk,ik->i", design, inverse, design)
-    sigma_m = np.sqrt(np.maximum(variance * own_m2, 0.0))
-    with np.errstate(divide="ignore", invalid="ignore"):
-        standardised = np.where(sigma_m > 1e-6 * features.sigma_m[row], misfit / sigma_m, 0.0)
-    return Registration(sop, variance * inverse, variance, row, misfit, standardised)
+    variance = reference_variance(misfit, len(UNKNOWN))
+    free = 1 - np.einsum("ij,jk,ik->i", design, inverse, design)  # redundancy: what a blunder leaves to see
+    told = np.where(free > UNSEEN, np.abs(misfit) / np.sqrt(variance * np.maximum(free, UNSEEN)), 0.0)
+    standardised = np.zeros(len(features.names))
+    np.maximum.at(standardised, row, told)
+    apart_m = _apart(features, sop)
+    across_m = np.abs(np.einsum("ni,ni->n", features.normal, apart_m))
+    left_m = np.where(features.is_plane, across_m, np.linalg.norm(apart_m, axis=1))
+    return Registration(sop, variance * inverse, variance, len(row), left_m, standardised)
+
+
+def _apart(features: Features, sop: Floats) -> Floats:
+    """What lacks from the scan's points to their references (n, 3) [m]."""
+    return np.asarray(features.reference_m - sop[:3, 3] - features.scan_m @ sop[:3, :3].T)
 
 
 def _observe(features: Features, sop: Floats) -> tuple[Ints, Floats, Floats]:
-    """Which feature each observation is of (m,), its derivative by the unknowns (m, 6), its misfit [m]."""
-    offset_m = features.scan_m @ sop[:3, :3].T
-    apart_m = features.reference_m - sop[:3, 3] - offset_m
-    jacobian = pose_jacobian(offset_m)
+    """Which feature each observation is of (m,), its derivative by the unknowns (m, 6), its misfit (m,).
+
+    Both in sigmas, the three of a point freed of their correlation.
+    """
+    jacobian = pose_jacobian(features.scan_m @ sop[:3, :3].T)
+    apart_m = _apart(features, sop)
+    covariance_m2 = features.sigma_m[:, None, None] ** 2 * np.eye(3)
+    if features.scan_covariance_m2 is not None:
+        covariance_m2 = covariance_m2 + sop[:3, :3] @ features.scan_covariance_m2 @ sop[:3, :3].T
     point, plane = np.flatnonzero(~features.is_plane), np.flatnonzero(features.is_plane)
+    freed = np.linalg.inv(np.linalg.cholesky(covariance_m2[point]))
     across = features.normal[plane]
+    across /= np.sqrt(np.einsum("ni,nij,nj->n", across, covariance_m2[plane], across))[:, None]
     return (
         np.concatenate([np.repeat(point, 3), plane]),
-        np.concatenate([jacobian[point].reshape(-1, 6), np.einsum("ni,nij->nj", across, jacobian[plane])]),
-        np.concatenate([apart_m[point].ravel(), np.einsum("ni,ni->n", across, apart_m[plane])]),
+        np.concatenate(
+            [(freed @ jacobian[point]).reshape(-1, 6), np.einsum("ni,nij->nj", across, jacobian[plane])]
+        ),
+        np.concatenate(
+            [np.einsum("nij,nj->ni", freed, apart_m[point]).ravel(), np.sum(across * apart_m[plane], axis=1)]
+        ),
     )
 
 

@@ -13,11 +13,14 @@ from pyproj import CRS, Transformer
 from pyproj.exceptions import CRSError
 from scipy.spatial.transform import Rotation
 
+from station.config import ScannerSection
 from station.errors import ConfigError, StoreError
-from station.quantities import Floats
+from station.quantities import Floats, Scanner
 from station.readers.features import read_features
 from station.readers.sop import read_matrix
+from station.scanners import SCANNERS
 from station.science import pose
+from station.science.points import shot_covariance
 from station.science.registration import UNKNOWN, Features, Registration, solve
 
 SUSPECT = 3.3  # sigmas: one residual of a thousand is larger by chance
@@ -74,13 +77,26 @@ class Solution:
     features: list[Left]
 
 
-def solve_sop(table: Path, out: Path, start: Path | None, crs: str | None) -> Solution:
+def known_scanner(model: str) -> Scanner:
+    """Return a scanner by its model; ConfigError where it is not known."""
+    if model not in SCANNERS:
+        raise ConfigError(f"--scanner {model}: not known; take one of {', '.join(SCANNERS)}")
+    return ScannerSection.model_validate({"model": model}).instrument
+
+
+def solve_sop(
+    table: Path, out: Path, start: Path | None, crs: str | None, scanner: Scanner | None = None
+) -> Solution:
     """Solve an SOP from a table of features; write it to `out` and its covariance beside it.
 
     With a `crs` the references are on that map, with ellipsoidal heights, and so is the SOP; without, they
-    are in a frame without curvature, as under a POP. Raises ConfigError where the features do not tell.
+    are in a frame without curvature, as under a POP. With a `scanner` its noise is added to each sigma, as it
+    grows with range. Raises ConfigError where the features do not tell.
     """
     features = read_features(table)
+    if scanner is not None:
+        noise_m2 = shot_covariance(features.scan_m, np.array([0.0, 0.0, 1.0]), scanner)
+        features = replace(features, scan_covariance_m2=noise_m2)
     begin = None if start is None else read_matrix(start)
     covariance_file = out.with_name(f"{out.stem}-covariance.csv")
     for path in (out, covariance_file):
@@ -91,17 +107,13 @@ def solve_sop(table: Path, out: Path, start: Path | None, crs: str | None) -> So
     _write_new(covariance_file, _as_csv(found.covariance))
     sigma = np.sqrt(np.diag(found.covariance))
     left = [
-        Left(
-            name,
-            float(np.linalg.norm(found.residual_m[found.row == row])),
-            float(np.abs(found.standardised[found.row == row]).max()),
-        )
-        for row, name in enumerate(features.names)
+        Left(name, float(left_m), float(standardised))
+        for name, left_m, standardised in zip(features.names, found.left_m, found.standardised, strict=True)
     ]
     return Solution(
         _chain(str(out), found.sop, None, crs),
         str(covariance_file),
-        len(found.row),
+        found.observations,
         found.reference_variance,
         np.degrees(sigma[:3]).tolist(),
         sigma[3:].tolist(),
@@ -177,7 +189,7 @@ def _write_new(path: Path, text: str) -> None:
 
 def _as_text(found: Registration, table: Path, crs: str | None) -> str:
     head = (
-        f"# SOP solved from {table.name}: {len(found.row)} observations, reference variance"
+        f"# SOP solved from {table.name}: {found.observations} observations, reference variance"
         f" {found.reference_variance:.3g}; leads to {crs or 'the frame of its references'}\n"
     )
     return head + "\n".join(" ".join(f"{value:.12f}" for value in row) for row in found.sop) + "\n"

@@ -4,6 +4,7 @@ import csv
 import json
 import subprocess
 import sys
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -14,7 +15,7 @@ from station.errors import ConfigError
 from station.readers.sop import read_matrix
 from station.science import pose
 from station.science.registration import Features, solve
-from station.service.sop import describe_chain, describe_solution, show_sop, solve_sop
+from station.service.sop import describe_chain, describe_solution, known_scanner, show_sop, solve_sop
 
 CRS = "EPSG:32632"
 PLACE_M = np.array([635_000.0, 5_185_000.0, 3_000.0])
@@ -92,6 +93,22 @@ def test_covariance_is_written_beside(tmp_path):
     assert found.reference_variance == pytest.approx(1.0, abs=0.6)
     with pytest.raises(ConfigError, match=r"sop\.dat: is there already; nothing is overwritten"):
         solve_sop(table, tmp_path / "sop.dat", None, CRS)
+
+
+def test_noise_of_the_scanner_is_added(tmp_path):
+    """Of a VZ-6000: 10 mm along the beam, 0.12 mrad / 4 and 0.0008° across; by its range and beam."""
+    table, level = surveyed(tmp_path, noise_m=0.02)
+    found = solve_sop(table, tmp_path / "sop.dat", None, CRS, known_scanner("riegl-vz-6000"))
+    range_m = np.linalg.norm(level.scan_m, axis=1, keepdims=True)
+    beam = level.scan_m / range_m
+    across_m2 = (range_m[:, :, None] * np.hypot(0.12e-3 / 4, np.radians(0.0008))) ** 2
+    outer = beam[:, :, None] * beam[:, None, :]
+    noise_m2 = 0.01**2 * outer + across_m2 * (np.eye(3) - outer)
+    wanted = solve(replace(level, scan_covariance_m2=noise_m2))
+    assert found.reference_variance == pytest.approx(wanted.reference_variance, rel=0.05)
+    assert found.shift_sigma_m == pytest.approx(np.sqrt(np.diag(wanted.covariance))[3:], rel=0.03)
+    with pytest.raises(ConfigError, match="--scanner vz: not known; take one of riegl-vz-6000"):
+        known_scanner("vz")
 
 
 @pytest.mark.parametrize("crs", ["EPSG:4326", "nonsense"])
