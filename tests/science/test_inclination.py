@@ -12,6 +12,7 @@ from station.science.inclination import LEVEL, Cycle
 
 STEP = math.radians(0.001)
 NOISE = math.radians(0.008)
+RANGE = math.radians(10.0)
 TRACK = HeadTrack(np.linspace(0.0, 920.0, 200), np.radians(np.linspace(10.0, 130.0, 200)))
 WAVE = Cycle((0.001, math.radians(0.04), 0.0), (-0.002, 0.0, math.radians(0.03)))
 
@@ -29,14 +30,14 @@ def test_cleaning_drops_what_no_sensor_meant():
     time_s = np.arange(100.0)
     time_s[50] = 49.0  # a duplicate
     time_s[60] = 10.0  # back in time
-    kept, dropped = inclination.clean(log_of(roll, np.zeros(100), time_s))
+    kept, dropped = inclination.clean(log_of(roll, np.zeros(100), time_s), RANGE)
     assert dropped == 5
     assert np.all(np.diff(kept.time_s) > 0)
     assert np.all(kept.roll_rad == 0.01)
 
 
 def test_cleaning_survives_an_empty_log():
-    kept, dropped = inclination.clean(log_of(np.array([math.nan]), np.zeros(1)))
+    kept, dropped = inclination.clean(log_of(np.array([math.nan]), np.zeros(1)), RANGE)
     assert (len(kept.time_s), dropped) == (0, 1)
 
 
@@ -131,7 +132,7 @@ def test_drift_comes_through_and_noise_does_not():
 def test_real_log(shared_data):
     table = np.loadtxt(shared_data / "riegl" / "140123_202748-incl.txt", delimiter=",", skiprows=1)
     log = InclinationLog(table[:, 0], *np.radians(table[:, 1:].T))
-    kept, dropped = inclination.clean(log)
+    kept, dropped = inclination.clean(log, RANGE)
     assert dropped == 0
     lean = inclination.relative_lean(kept, None, LEVEL, NOISE)
     assert math.degrees(lean.mean_roll_rad) == pytest.approx(-0.2868, abs=0.001)
