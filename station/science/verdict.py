@@ -105,7 +105,10 @@ def hidden(view: View) -> list[str]:
 def _sectors(chosen: Bools, edges_deg: Floats) -> str:
     """Name runs of sectors by their edges: `105-120, 200-240`."""
     steps = np.diff(np.concatenate([[0], chosen.astype(np.int64), [0]]))
-    runs = zip(np.flatnonzero(steps > 0), np.flatnonzero(steps < 0), strict=True)
+    runs = list(zip(np.flatnonzero(steps > 0), np.flatnonzero(steps < 0), strict=True))
+    round_ = edges_deg[-1] - edges_deg[0] > 359 and not chosen.all()
+    if round_ and chosen[0] and chosen[-1]:
+        runs = [*runs[1:-1], (runs[-1][0], runs[0][1])]
     return ", ".join(f"{edges_deg[a] % 360:.0f}-{edges_deg[b] % 360:.0f}" for a, b in runs)
 
 

@@ -33,8 +33,6 @@ def moved(site: Site) -> str:
     series cannot be read.
     """
     series = series_of(site)
-    if not site.adjusts or not series.path.is_file():
-        return ""
     start_s, pose = _poses(series)
     found = steps(start_s, pose, usual(read_habits(series)))
     return _words(found[-1], start_s) if found else ""
