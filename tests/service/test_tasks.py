@@ -5,6 +5,7 @@ import re
 import shutil
 from dataclasses import replace
 
+import laspy
 import netCDF4
 import numpy as np
 import pytest
@@ -153,6 +154,31 @@ def test_no_weather_and_waiting_for_it(folder):
     for path in (folder / "inbox").iterdir():
         os.utime(path, (1.7e9, 1.7e9))  # it came long ago
     assert processed(folder, patient=True)[0].verdict == "degraded"
+
+
+@pytest.mark.parametrize(
+    ("keep", "verdict", "says"),
+    [
+        (lambda away_m, _: away_m < 400, "degraded", "nothing beyond 400 m: fog"),
+        (lambda away_m, _: away_m < np.quantile(away_m, 0.01), "unusable", "of what scans usually see"),
+        (lambda _, share: share < 0.6, "degraded", "partial sweep: nothing seen at azimuth"),
+    ],
+    ids=["fog", "dense fog", "partial sweep"],
+)
+def test_a_scan_that_sees_less_than_the_reference_did(folder, keep, verdict, says):
+    site = read_site(folder / "site.toml")
+    first, path = sorted(site.scans.inbox.glob("*.laz"))
+    tasks.build_reference(site, [arrival_of(site, first)], "1", lambda: None)
+    full, _ = processed(folder)
+    assert (full.verdict, full.reason) == ("good", "")
+    scan = laspy.read(path)
+    share = (np.asarray(scan.gps_time) - scan.gps_time.min()) / np.ptp(scan.gps_time)
+    scan.points = scan.points[keep(np.hypot(scan.x, scan.y), share)]
+    scan.write(path)
+    outcome, _ = processed(folder)
+    assert outcome.verdict == verdict
+    assert says in outcome.reason
+    assert outcome.epoch  # whatever the verdict, what is there is stored
 
 
 def test_points_without_time_get_the_mean_lean(folder):
