@@ -86,7 +86,7 @@ def hidden(view: View) -> list[str]:
     of_sector = view.usual.sum(axis=1)
     empty = view.seen.sum(axis=1) < GONE * of_sector
     through = view.seen[~empty].sum(axis=0) / np.maximum(view.usual[~empty].sum(axis=0), FEWEST_CELLS)
-    clear = (through > 0) & (through > THROUGH * through.max())
+    clear = through > THROUGH * max(through.max(), CLEAR)
     missing = empty & (view.usual @ clear >= FEWEST_CELLS)
     reasons = []
     if missing.any():

@@ -207,10 +207,11 @@ def _log(site: Site, path: Path | None, track: HeadTrack | None, lacking: list[s
     rows = len(log.time_s)
     pegged = inclination.pegged(told, range_rad)
     if pegged > PEGGED_MOST:
-        lacking.append(
-            f"lean out of the inclination sensor's range of {math.degrees(range_rad):g} degree in"
-            f" {pegged:.0%} of its log, which is not used"
-        )
+        if site.inclination.required:
+            lacking.append(
+                f"lean out of the inclination sensor's range of {math.degrees(range_rad):g} degree in"
+                f" {pegged:.0%} of its log, which is not used"
+            )
         return None
     if rows < FEWEST_ROWS:
         lacking.append(f"inclination log has {rows} good rows")
