@@ -84,6 +84,13 @@ def test_who_comes_back_after_two_scans_was_not_moved():
     assert steps(times(pose), pose, HABIT) == []
 
 
+@pytest.mark.parametrize("wrong", [(27, 28, 29), (29, 31, 33), (23, 24, 27, 29), (24, 26, 28, 29)])
+def test_wrong_scans_close_together_are_no_step(wrong):
+    pose = restless(9, 60, wrong=0.0)
+    pose[list(wrong), 0] -= 2 * STEP
+    assert steps(times(pose), pose, HABIT) == []
+
+
 def test_gaps_in_the_series_let_it_drift_farther():
     """The same difference is a step from hour to hour, and drift within five days without scans."""
     pose = restless(10, 60, wrong=0.0)
