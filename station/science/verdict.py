@@ -63,7 +63,7 @@ def view(seen: Bools, reference: Reference, position_m: Position, axis: Position
     rows = np.arange(0, grid.ny, every)
     for band in np.array_split(rows, len(rows) // BAND_ROWS + 1):
         expected = reference.seen[band]
-        row, column = np.nonzero(expected > 0)
+        row, column = np.nonzero((expected > 0) & np.isfinite(reference.elevation_m[band]))
         offset_m = (
             grid.x_m[column] - position_m[0],
             grid.y_m[band][row] - position_m[1],

@@ -83,6 +83,14 @@ def test_a_part_of_a_vast_grid_tells_the_same(monkeypatch):
     assert part.usual.sum() == pytest.approx(whole.usual.sum(), rel=0.02)
 
 
+def test_cells_that_later_scans_saw_but_the_surface_lacks_do_not_count():
+    known = reference()
+    known.elevation_m[AWAY > 2000] = np.nan
+    found = verdict.view(chance(0.9) & (AWAY < 2000), known, HERE)
+    assert found.usual.sum() == pytest.approx(0.9 * np.count_nonzero(AWAY <= 2000))
+    assert verdict.hidden(found) == []
+
+
 def measured(change_m, sigma_m, seen=None):
     seen = chance(0.9) if seen is None else seen
     change_m = np.where(seen, change_m, np.nan).astype(np.float32)
