@@ -15,7 +15,9 @@ from station.readers.scan import suffixes
 from station.readers.weather import air_at, read_weather
 from station.service import child
 from station.service.gather import frame_of
-from station.service.once import arrival_of
+from station.service.integrity import prove
+from station.service.journal import Journal
+from station.service.places import arrival_of
 from station.service.tasks import areas_of, polygons, rehearse, series_of
 
 Finding = dict[str, str]  # level (ok, warning, fault), what, says
@@ -35,6 +37,18 @@ def check(site_path: Path) -> list[Finding]:
         *_weather(site),
         *_newest_scan(site),
     ]
+
+
+def check_store(site_path: Path) -> list[Finding]:
+    """Prove the store against the journal and the checksums, also beside a running service.
+
+    Raises ConfigError where the site file cannot be read, StoreError where the journal cannot.
+    """
+    site = read_site(site_path)
+    with Journal(site.station.data / "journal.sqlite", read_only=True) as journal:
+        entries, known = journal.rows(), journal.files()
+    found = child.run(prove, site, entries, known, memory_gb=site.service.memory_gb, timeout_s=math.inf)
+    return [_finding(level, what, says) for level, what, says in found]
 
 
 def _finding(level: str, what: str, says: str) -> Finding:

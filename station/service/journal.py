@@ -32,6 +32,7 @@ CREATE TABLE IF NOT EXISTS scan (
     waits_for TEXT NOT NULL DEFAULT '',
     reason TEXT NOT NULL DEFAULT '',
     sha256 TEXT,
+    log_sha256 TEXT NOT NULL DEFAULT '',
     outcome TEXT CHECK (outcome IN ('stored', 'set_aside')),
     verdict TEXT,
     epoch TEXT,
@@ -45,7 +46,12 @@ CREATE TABLE IF NOT EXISTS scan (
     changed_utc_s REAL NOT NULL
 ) STRICT;
 CREATE INDEX IF NOT EXISTS scan_by_sha256 ON scan (sha256);
+CREATE TABLE IF NOT EXISTS file (
+    path TEXT PRIMARY KEY,
+    sha256 TEXT NOT NULL
+) STRICT;
 """
+_LATER_COLUMNS = {"log_sha256": "TEXT NOT NULL DEFAULT ''"}  # which older journals lack
 
 
 class State(StrEnum):
@@ -61,9 +67,9 @@ class State(StrEnum):
 class Entry:
     """One row of the journal.
 
-    `waits_for` says why it is not done yet. `sha256`, `outcome` and `reason` are of the content that was
-    last judged; `epoch` (relative to the data folder), `start_utc_s`, `revision`, `reference` and `figures`
-    of the content that was last stored: they stay when a worse file comes under the same name.
+    `waits_for` says why it is not done yet. `sha256`, `log_sha256`, `outcome` and `reason` are of the content
+    that was last judged; `epoch` (relative to the data folder), `start_utc_s`, `revision`, `reference` and
+    `figures` of the content that was last stored: they stay when a worse file comes under the same name.
     """
 
     name: str
@@ -73,6 +79,7 @@ class Entry:
     waits_for: str
     reason: str
     sha256: str | None
+    log_sha256: str
     outcome: State | None
     verdict: str | None
     epoch: str | None
@@ -176,14 +183,22 @@ class Journal:
         reference: str | None = None,
         reason: str = "",
         figures: Mapping[str, float | str] | None = None,
+        log_sha256: str = "",
+        epoch_sha256: str = "",
     ) -> None:
-        """Note that a scan is in the store; `figures` are what `station status` shows of it."""
+        """Note that a scan is in the store, and the checksum of its epoch.
+
+        `figures` are what `station status` shows of it.
+        """
         with self._commit():
+            if epoch_sha256:
+                self._note_file(epoch, epoch_sha256)
             self._change(
                 name,
                 state=State.STORED,
                 outcome=State.STORED,
                 sha256=sha256,
+                log_sha256=log_sha256,
                 verdict=verdict,
                 waits_for="",
                 reason=reason,
@@ -197,7 +212,7 @@ class Journal:
             )
         self._note(name).unlink(missing_ok=True)
 
-    def set_aside(self, name: str, reason: str, *, sha256: str | None = None) -> None:
+    def set_aside(self, name: str, reason: str, *, sha256: str | None = None, log_sha256: str = "") -> None:
         """Note that a scan cannot be used, and why, here and in `set_aside/<name>.txt`."""
         try:
             self._notes.mkdir(exist_ok=True)
@@ -210,6 +225,7 @@ class Journal:
                 state=State.SET_ASIDE,
                 outcome=State.SET_ASIDE,
                 sha256=sha256,
+                log_sha256=log_sha256,
                 waits_for="",
                 reason=reason,
                 attempts=0,
@@ -250,15 +266,53 @@ class Journal:
                 [(now_s, name) for name in names],
             )
 
+    def adopt(self, entries: Iterable[Entry]) -> None:
+        """Take in rows that were made of epochs the journal did not know; those it has stay."""
+        marks = ", ".join("?" for _ in fields(Entry))
+        with self._commit():
+            self._rows.executemany(
+                f"INSERT OR IGNORE INTO scan ({_COLUMNS}) VALUES ({marks})",  # noqa: S608 - own words
+                [
+                    [
+                        json.dumps(value) if field.name == "figures" else value
+                        for field in fields(Entry)
+                        for value in [getattr(entry, field.name)]
+                    ]
+                    for entry in entries
+                ],
+            )
+
+    # ---- checksums of the store's files, by their place in the data folder
+
+    def note_files(self, checksums: Mapping[str, str]) -> None:
+        """Note the SHA-256 of files that never change from now on."""
+        with self._commit():
+            for path, sha256 in checksums.items():
+                self._note_file(path, sha256)
+
+    def forget_files(self, paths: Iterable[str]) -> None:
+        """Forget files that were deleted or put out of the way."""
+        with self._commit():
+            self._rows.executemany("DELETE FROM file WHERE path = ?", [(path,) for path in paths])
+
+    def files(self) -> dict[str, str]:
+        """Return the SHA-256 of every file by its place."""
+        with self._faults():
+            return dict(self._rows.execute("SELECT path, sha256 FROM file ORDER BY path").fetchall())
+
+    def _note_file(self, path: str, sha256: str) -> None:
+        self._rows.execute("INSERT OR REPLACE INTO file (path, sha256) VALUES (?, ?)", (path, sha256))
+
     # ---- what everyone may ask
 
     def entry(self, name: str) -> Entry | None:
         """Return the row of one name."""
         return next(iter(self._select("WHERE name = ?", name)), None)
 
-    def stored_as(self, sha256: str) -> Entry | None:
-        """Return the stored row with this content, whatever its name."""
-        return next(iter(self._select("WHERE sha256 = ? AND state = 'stored' LIMIT 1", sha256)), None)
+    def others_stored(self, name: str, size: int) -> dict[str, str]:
+        """Return the names of other scans that are stored and of this size, by their SHA-256."""
+        found = self._select("WHERE size = ? AND outcome = 'stored' AND name != ?", size, name)
+        return {row.sha256: row.name for row in found if row.sha256}
 
     def glimpses(self) -> dict[str, Glimpse]:
         """Return a glimpse of every row by its name; years of hourly scans take a tenth of a second."""
@@ -339,6 +393,10 @@ def _open_to_write(path: Path) -> sqlite3.Connection:
         rows.execute("PRAGMA journal_mode = WAL")
         rows.execute("PRAGMA synchronous = FULL")
         rows.executescript(_SCHEMA)
+        known = {column[1] for column in rows.execute("PRAGMA table_info(scan)")}
+        for column, kind in _LATER_COLUMNS.items():
+            if column not in known:
+                rows.execute(f"ALTER TABLE scan ADD COLUMN {column} {kind}")
     except sqlite3.Error:
         rows.close()
         raise

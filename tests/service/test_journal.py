@@ -47,8 +47,9 @@ def test_a_new_scan_waits_and_ends_stored(journal):
     assert entry.waits_for == ""
     assert journal.counts() == {"waiting": 0, "stored": 1, "set_aside": 0, "later": 0}
     assert journal.last_stored() == entry
-    assert journal.stored_as("aa") == entry
-    assert journal.stored_as("bb") is None
+    assert journal.others_stored("another.laz", 10) == {"aa": NAME}
+    assert journal.others_stored(NAME, 10) == {}
+    assert journal.others_stored("another.laz", 11) == {}
 
 
 def test_the_same_sight_again_changes_nothing(journal):

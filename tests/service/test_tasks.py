@@ -11,7 +11,7 @@ import pytest
 from station.config import read_site
 from station.errors import ConfigError, NotReadyError, ScanError
 from station.service import tasks
-from station.service.once import arrival_of
+from station.service.places import arrival_of
 from station.simulation.station import simulate, tiny
 
 
