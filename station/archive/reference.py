@@ -70,6 +70,7 @@ class Lineage:
 
     base: str
     science_hash: str = ""
+    replaces: tuple[str, ...] = ()  # versions of that base that nothing is to be measured from any more
     made_from: tuple[dict[str, str], ...] = ()  # of each of its scans, what an epoch tells of its origin
 
 
@@ -84,6 +85,23 @@ def versions(series: Series) -> list[str]:
     return sorted((version for version in found if version.isdigit()), key=int)
 
 
+def current(series: Series) -> dict[str, Lineage]:
+    """Return the versions made by the station that epochs may be measured from, oldest first.
+
+    They share the moving ground of the newest, so that change counts from the same surface.
+    """
+    told = {version: read_lineage(series, version) for version in versions(series)}
+    if not told:
+        return {}
+    base = list(told.values())[-1].base
+    replaced = {version for lineage in told.values() for version in lineage.replaces}
+    return {
+        version: lineage
+        for version, lineage in told.items()
+        if lineage.base == base and version not in replaced
+    }
+
+
 def read_lineage(series: Series, version: str) -> Lineage:
     """Return what a version was made from; raise StoreError where it cannot be read."""
     path = path_of(series, version)
@@ -93,6 +111,7 @@ def read_lineage(series: Series, version: str) -> Lineage:
             return Lineage(
                 base=str(file.base) if "base" in known else version,
                 science_hash=str(file.science_hash) if "science_hash" in known else "",
+                replaces=tuple(str(file.replaces).split()) if "replaces" in known else (),
                 made_from=tuple(json.loads(str(file.made_from))) if "made_from" in known else (),
             )
     except (OSError, RuntimeError, ValueError) as error:
@@ -112,6 +131,7 @@ def write_reference(series: Series, reference: Reference, lineage: Lineage | Non
         lay_out(file, series, f"Reference surface of {series.name or series.station_id}", None, parameters)
         file.setncatts({"reference_version": reference.version, "scan_ids": " ".join(reference.scan_ids)})
         file.setncatts({"base": lineage.base, "science_hash": lineage.science_hash})
+        file.setncatts({"replaces": " ".join(lineage.replaces)})
         file.setncatts({"made_from": json.dumps(lineage.made_from)})
         file.setncatts({f"{HABIT}{name}": value for name, value in asdict(reference.habits).items()})
         values = {

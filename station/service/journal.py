@@ -51,6 +51,7 @@ CREATE TABLE IF NOT EXISTS file (
     sha256 TEXT NOT NULL
 ) STRICT;
 """
+_OF_EPOCH = ("sha256", "log_sha256", "verdict", "reason", "epoch", "start_utc_s", "revision", "reference")
 _LATER_COLUMNS = {"log_sha256": "TEXT NOT NULL DEFAULT ''"}  # which older journals lack
 
 
@@ -267,19 +268,19 @@ class Journal:
             )
 
     def adopt(self, entries: Iterable[Entry]) -> None:
-        """Take in rows that were made of epochs the journal did not know; those it has stay."""
+        """Take in rows made of epochs that the journal did not know; older ones are brought up to them."""
         marks = ", ".join("?" for _ in fields(Entry))
+        brought = ", ".join(f"{column} = excluded.{column}" for column in _OF_EPOCH)
+        listed = [
+            [json.dumps(value) if key == "figures" else value for key, value in vars(entry).items()]
+            for entry in entries
+        ]
         with self._commit():
             self._rows.executemany(
-                f"INSERT OR IGNORE INTO scan ({_COLUMNS}) VALUES ({marks})",  # noqa: S608 - own words
-                [
-                    [
-                        json.dumps(value) if field.name == "figures" else value
-                        for field in fields(Entry)
-                        for value in [getattr(entry, field.name)]
-                    ]
-                    for entry in entries
-                ],
+                f"INSERT INTO scan ({_COLUMNS}) VALUES ({marks})"  # noqa: S608 - own words
+                f" ON CONFLICT (name) DO UPDATE SET {brought}"
+                " WHERE epoch IS NULL OR excluded.revision > revision",
+                listed,
             )
 
     # ---- checksums of the store's files, by their place in the data folder

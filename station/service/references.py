@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from station.archive.layout import Series, kept_of
-from station.archive.reference import Lineage, read_lineage, versions, write_reference
+from station.archive.reference import Lineage, read_lineage, read_reference, versions, write_reference
 from station.config import Site
 from station.errors import StoreError
 from station.pipeline import corrections, gridder_for, survey
@@ -27,7 +27,6 @@ from station.service.tasks import (
     levelled_to,
     numbers_of_air,
     opened,
-    reference_of,
     series_of,
     sha256_of_log,
 )
@@ -82,14 +81,19 @@ def build_reference(site: Site, arrivals: list[Arrival], version: str, progress:
         surface = master(stack, surface, unknown, position_m, version, scan_ids, habits)
         made_from = tuple(one.made.told() for one in laid)
     if surface is not None:
-        write_reference(series, surface, Lineage(version, site.science_hash, made_from))
+        write_reference(series, surface, Lineage(version, site.science_hash, made_from=made_from))
     return version
 
 
-def improve_reference(site: Site, arrivals: list[Arrival], version: str, progress: Progress) -> str:
-    """Store a version of the reference that knows stable ground and the station's habits from more scans."""
+def improve_reference(
+    site: Site, arrivals: list[Arrival], version: str, on: str, replaces: tuple[str, ...], progress: Progress
+) -> str:
+    """Store a version of the reference that knows stable ground and the station's habits from more scans.
+
+    It is laid on the version `on`, and takes the place of those it `replaces`.
+    """
     series = series_of(site)
-    base = reference_of(site)
+    base = read_reference(series, on)
     if base is None:
         raise StoreError(f"{series.folder}: no reference to improve")
     stack = Stack(series.grid)
@@ -99,7 +103,10 @@ def improve_reference(site: Site, arrivals: list[Arrival], version: str, progres
     if position_m is None:
         raise StoreError(f"{series.folder}: a reference without the scanner's place cannot be improved")
     lineage = Lineage(
-        read_lineage(series, base.version).base, site.science_hash, tuple(one.made.told() for one in laid)
+        base=read_lineage(series, on).base,
+        science_hash=site.science_hash,
+        replaces=replaces,
+        made_from=tuple(one.made.told() for one in laid),
     )
     write_reference(series, improved(base, stack, position_m, version, habits), lineage)
     return version

@@ -20,6 +20,7 @@ from typing import Protocol
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
+from station.archive.reference import current
 from station.config import Site
 from station.errors import NotReadyError, ScanError
 from station.readers.scan import utc_interval
@@ -33,7 +34,7 @@ from station.service.integrity import lost, verify
 from station.service.journal import Journal
 from station.service.lock import only_writer
 from station.service.places import find_scan
-from station.service.references import build_reference, next_version
+from station.service.references import build_reference, improve_reference, next_version, scans_due
 from station.service.stale import Plan, Task, plan, usable
 from station.service.tasks import Outcome, Past, Refused, opened, redo, reference_of, series_of
 from station.service.tasks import Progress as Tick
@@ -169,30 +170,36 @@ class _Redoing:
         wanted = self._site.reference.scans
         if isinstance(wanted, Path):
             self._worker.run(_take_reference)
-        if not found.reference or isinstance(wanted, Path):
+        if not found.references or isinstance(wanted, Path):
             return found
-        arrivals = self._scans_of_reference(wanted)
+        sound = [version for version in current(self._series) if version not in found.references]
         version = next_version(self._series)
         with self._console.status(f"making version {version} of the reference …"):
-            self._worker.run(build_reference, arrivals, version)
+            if sound:
+                arrivals = self._scans_for(len(sound), at_least=wanted)
+                self._worker.run(improve_reference, arrivals, version, sound[-1], found.references)
+            else:
+                arrivals = self._scans_for(0, at_least=wanted)
+                self._worker.run(build_reference, arrivals, version)
         self._worker.seal()
-        self._tell(f"reference {version} made of {len(arrivals)} scans")
+        self._tell(
+            f"reference {version} made of {len(arrivals)} scans, instead of {' '.join(found.references)}"
+        )
         return self._plan(between_s)
 
-    def _scans_of_reference(self, wanted: int) -> list[Arrival]:
-        """Return the first usable scans; raise NotReadyError where one of them is gone."""
-        names = self._worker.run(usable, self._journal.rows())[:wanted]
-        rows = [row for row in self._journal.rows() if row.name in names]
-        found = {row.name: find_scan(self._site, row.name, row.start_utc_s) for row in rows}
-        there = [found[name] for name in names]
-        arrivals = [arrival for arrival in there if arrival is not None]
-        if len(arrivals) < wanted:
+    def _scans_for(self, made: int, at_least: int) -> list[Arrival]:
+        """Return the usable scans for a version after `made` others; raise NotReadyError if too few."""
+        names = scans_due(self._site, self._worker.run(usable, self._journal.rows()), made)
+        rows = {row.name: row for row in self._journal.rows()}
+        found = {name: find_scan(self._site, name, rows[name].start_utc_s) for name in names}
+        arrivals = [arrival for arrival in found.values() if arrival is not None]
+        if len(arrivals) < at_least:
             gone = [name for name in names if found[name] is None]
             why = f"there are {len(names)}"
             if gone:
                 why = f"these are gone: {', '.join(gone)}: put them back"
             raise NotReadyError(
-                f"the reference has to be made anew, of {wanted} usable scans, but {why},"
+                f"the reference has to be made anew, of {at_least} usable scans, but {why},"
                 " or restore the settings"
             )
         return arrivals
@@ -229,14 +236,14 @@ class _Redoing:
         with self._progress() as bar:
             shown = bar.add_task(f"redoing on {hands.count}", total=len(todo))
             while True:
-                while len(running) < 2 * hands.count and not self._stop.is_set():
+                while len(running) < hands.count + 1 and not self._stop.is_set():
                     task = next(waiting, None)
                     if task is None:
                         break
                     need_room(self._site)
                     assert task.arrival is not None  # noqa: S101 - by the caller
                     running[hands.start(self._site, task.arrival, _past(task))] = task
-                if not running or self._stop.is_set():
+                if not running:
                     return failed
                 done, _ = wait(running, timeout=0.5, return_when=FIRST_COMPLETED)
                 for future in done:
@@ -248,7 +255,8 @@ class _Redoing:
         try:
             outcome = future.result()
         except NotReadyError as error:
-            self._tell(f"  {task.name}: not now: {error}")
+            if not self._stop.is_set():
+                self._tell(f"  {task.name}: not now: {error}")
             return 1
         except ScanError as error:
             outcome = Refused(str(error), "", "")

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from station.archive.layout import Series, kept_of, strings
-from station.archive.reference import Lineage, path_of, read_lineage, versions
+from station.archive.reference import current
 from station.archive.series import read_source, runs
 from station.archive.store import AIR, Row, rows
 from station.archive.variables import FILL, VERDICTS
@@ -91,10 +91,10 @@ class Task:
 
 @dataclass(frozen=True)
 class Plan:
-    """What is to be done again; `reference` tells whether that has to be made anew first."""
+    """What is to be done again, and the versions of the reference that have to be made anew first."""
 
     tasks: tuple[Task, ...]
-    reference: bool
+    references: tuple[str, ...]
 
     def why(self) -> dict[str, int]:
         """Return how many epochs each reason holds for."""
@@ -222,8 +222,9 @@ def plan(
     series = series_of(site)
     today = Today(site)
     by_epoch = {Path(entry.epoch).name: entry for entry in entries if entry.epoch}
-    reference = reference_is_stale(site, series, today, entries)
-    base = current_base(site, series)
+    stale = stale_versions(site, series, today, entries)
+    sound = _current(site, series)
+    sound = None if sound is None else sound - set(stale)
     tasks = [_lost(site, entry) for entry in entries if entry.name in lost]
     for one in held(series):
         progress()
@@ -234,7 +235,7 @@ def plan(
         reasons = [
             *(["waits to be done again"] if entry.outcome is None else []),
             *(["other settings"] if one.science_hash != site.science_hash else []),
-            *([REFERENCE] if reference or not _is_of_base(series, one.reference, base) else []),
+            *([REFERENCE] if sound is not None and one.reference not in sound else []),
             *today.settings(one.made),
             *today.inputs(one.made, arrival, entry),
         ]
@@ -242,7 +243,7 @@ def plan(
             revision = max(one.row.revision, entry.revision or 0)
             tasks.append(Task(entry.name, one.made.start_s, tuple(reasons), arrival, one.reference, revision))
     inside = [task for task in tasks if between_s[0] <= task.start_utc_s < between_s[1]]
-    return Plan(tuple(sorted(inside, key=lambda task: (task.start_utc_s, task.name))), reference)
+    return Plan(tuple(sorted(inside, key=lambda task: (task.start_utc_s, task.name))), stale)
 
 
 def _lost(site: Site, entry: Entry) -> Task:
@@ -284,51 +285,34 @@ def count_by_settings(site: Site) -> int:
     series, today = series_of(site), Today(site)
     if not series.path.is_file():
         return 0
-    base = current_base(site, series)
+    sound = _current(site, series)
     return sum(
         one.science_hash != site.science_hash
         or bool(today.settings(one.made))
-        or not _is_of_base(series, one.reference, base)
+        or (sound is not None and one.reference not in sound)
         for one in held(series)
     )
 
 
-def current_base(site: Site, series: Series) -> str | None:
-    """Return the version whose moving ground change counts from now; None where there is none yet."""
+def _current(site: Site, series: Series) -> set[str] | None:
+    """Return the versions that epochs may be measured from; None where there is none yet."""
     if isinstance(site.reference.scans, Path):
-        return version_of_given(site.reference.scans)
-    made = versions(series)
-    return read_lineage(series, made[-1]).base if made else None
+        return {version_of_given(site.reference.scans)}
+    return set(current(series)) or None
 
 
-def _is_of_base(series: Series, version: str, base: str | None) -> bool:
-    return base is None or _base_of(series, version) == base
-
-
-@cache
-def _base_of(series: Series, version: str) -> str | None:
-    if not version:
-        return None
-    return read_lineage(series, version).base if path_of(series, version).is_file() else version
-
-
-def lineage_of(series: Series) -> list[Lineage]:
-    """Return what the versions that change counts from now were made from, oldest first."""
-    told = [read_lineage(series, version) for version in versions(series)]
-    return [one for one in told if one.base == told[-1].base]
-
-
-def reference_is_stale(site: Site, series: Series, today: Today, entries: Iterable[Entry]) -> bool:
-    """Tell whether the station's own reference was made with other settings, or of other inputs."""
+def stale_versions(site: Site, series: Series, today: Today, entries: Iterable[Entry]) -> tuple[str, ...]:
+    """Return the versions made with other settings or of other inputs, and those laid on them."""
     if isinstance(site.reference.scans, Path):
-        return False
+        return ()
     by_stem = {Path(entry.name).stem: entry for entry in entries}
-    for lineage in lineage_of(series):
-        if lineage.science_hash not in {"", site.science_hash}:
-            return True
-        for made in map(Made.of_told, lineage.made_from):
-            entry = by_stem.get(made.scan_id)
-            arrival = find_scan(site, entry.name, made.start_s) if entry else None
-            if today.settings(made) or today.inputs(made, arrival, entry):
-                return True
-    return False
+    made = current(series)
+    for at, lineage in enumerate(made.values()):
+        is_stale = lineage.science_hash not in {"", site.science_hash}
+        for one in map(Made.of_told, lineage.made_from):
+            entry = by_stem.get(one.scan_id)
+            arrival = find_scan(site, entry.name, one.start_s) if entry else None
+            is_stale = is_stale or bool(today.settings(one) or today.inputs(one, arrival, entry))
+        if is_stale:
+            return tuple(made)[at:]
+    return ()

@@ -18,7 +18,7 @@ import numpy as np
 from station import __version__
 from station.archive import store
 from station.archive.layout import Series, kept_of
-from station.archive.reference import path_of, read_lineage, read_reference, write_reference
+from station.archive.reference import current, read_reference, write_reference
 from station.config import Site
 from station.errors import ScanError
 from station.pipeline import (
@@ -300,22 +300,17 @@ def flag_of(site: Site, start_utc_s: float, end_utc_s: float) -> str:
 
 
 def reference_of(site: Site, version: str | None = None) -> Reference | None:
-    """Return the master surface: a version where its moving ground is that of the newest, else the newest.
+    """Return the master surface: a version where epochs may still be measured from it, else the newest.
 
     One given as a file is taken into the store at first use.
     """
     series = series_of(site)
-    held = read_reference(series)
     given = site.reference.scans
     if not isinstance(given, Path):
-        if (
-            held is not None
-            and version
-            and version != held.version
-            and _is_of_one_base(series, version, held.version)
-        ):
-            return read_reference(series, version) or held
-        return held
+        made = current(series)
+        newest = list(made)[-1] if made else None
+        return read_reference(series, version if version in made else newest)
+    held = read_reference(series)
     version = version_of_given(given)
     if held is None or held.version != version:
         elevation_m = nodes_for(read_geotiff(given, series.grid, series.crs))
@@ -323,12 +318,6 @@ def reference_of(site: Site, version: str | None = None) -> Reference | None:
         write_reference(series, Reference.given(series.grid, version, elevation_m, steep))
         held = read_reference(series)
     return held
-
-
-def _is_of_one_base(series: Series, version: str, newest: str) -> bool:
-    return path_of(series, version).is_file() and (
-        read_lineage(series, version).base == read_lineage(series, newest).base
-    )
 
 
 def version_of_given(file: Path) -> str:

@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import TypeVar
 
+from station.archive.reference import current
 from station.config import Site
 from station.errors import NotReadyError, ScanError, StoreError
 from station.service import child
@@ -34,7 +35,7 @@ from station.service.references import (
     scans_due,
 )
 from station.service.retention import due_to_go, retire
-from station.service.stale import count_by_settings, late, lineage_of
+from station.service.stale import count_by_settings, late
 from station.service.tasks import Outcome, Past, Progress, Refused, Same, attend, open_only, redo, series_of
 from station.service.upkeep import join_epochs, publish, sweep_store
 
@@ -225,7 +226,7 @@ class Worker:
             log.info("%s", logfmt(scan=name, retention=done))
 
     def _kept_for_reference(self) -> set[str]:
-        return set(scans_due(self._site, self._usable(), len(lineage_of(self._series))))
+        return set(scans_due(self._site, self._usable(), len(current(self._series))))
 
     def _usable(self) -> list[str]:
         """Return the scans that a reference may be made of, by their time."""
@@ -235,27 +236,29 @@ class Worker:
     def _make_reference_when_due(self) -> None:
         """Build the master surface once enough usable scans are stored; make a better one of ever more."""
         wanted, usable = self._site.reference.scans, self._usable()
-        made = len(lineage_of(self._series))
-        chosen = scans_due(self._site, usable, made)
-        if isinstance(wanted, Path) or not chosen or len(usable) < number_due(self._site, made):
+        made = current(self._series)
+        chosen = scans_due(self._site, usable, len(made))
+        if isinstance(wanted, Path) or not chosen or len(usable) < number_due(self._site, len(made)):
             return
         arrivals = [self._arrival(name) for name in chosen]
         there = [arrival for arrival in arrivals if arrival is not None]
-        if len(there) < (len(chosen) if made == 0 else wanted):
+        if len(there) < (wanted if made else len(chosen)):
             gone = [name for name, arrival in zip(chosen, arrivals, strict=True) if arrival is None]
-            if made == 0:
+            if not made:
                 log.warning("%s", logfmt(reference="waiting", reason=f"no longer there: {', '.join(gone)}"))
             return
         try:
-            version = self.run(
-                improve_reference if made else build_reference, there, next_version(self._series)
-            )
+            version = next_version(self._series)
+            if made:
+                self.run(improve_reference, there, version, list(made)[-1], ())
+            else:
+                self.run(build_reference, there, version)
         except (ScanError, NotReadyError) as error:
             log.warning("%s", logfmt(reference="failed", reason=error))
             return
         self.seal()
         log.info("%s", logfmt(reference=version, scans=len(there)))
-        if made == 0:
+        if not made:
             others = (row.name for row in self._journal.rows(State.STORED) if row.reference != version)
             self._journal.again(others)
 
