@@ -64,7 +64,7 @@ class Cluster:
 
     def _require_alike(self) -> None:
         """Raise ConfigError unless every worker computes with what we compute with."""
-        ours, theirs = versions(), self._client.run(versions)
+        ours, theirs = versions(), self._client.run(_versions_there)
         if not theirs:
             raise NotReadyError("the cluster has no workers yet")
         faults = [
@@ -122,6 +122,10 @@ def versions() -> dict[str, str]:
         "netCDF4": netCDF4.__version__,
         "h5py": h5py.__version__,
     }
+
+
+def _versions_there() -> dict[str, str]:
+    return versions()
 
 
 def _fault_there(mark: str, token: str, inbox: str) -> str:

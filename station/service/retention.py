@@ -12,7 +12,7 @@ from pathlib import Path
 from station.archive.layout import Series
 from station.archive.store import JOINED, joined, rows_in, stored
 from station.config import Site
-from station.errors import NotReadyError, ScanError, StoreError
+from station.errors import NotReadyError, ScanError
 from station.service.content import fingerprint, sha256_of
 from station.service.inbox import Arrival
 from station.service.journal import Entry
@@ -119,7 +119,7 @@ def _copy(path: Path, place: Path, sha256: str, progress: Progress) -> None:
         progress()
         _sync(beside)
         if sha256_of(beside) != sha256:
-            raise StoreError(f"{place}: reads otherwise than it was written: is the archive's disk failing?")
+            raise ScanError(f"{place}: reads otherwise than it was written: is the disk failing?")
         beside.replace(place)
         _sync(place.parent)
     finally:

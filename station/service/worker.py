@@ -220,10 +220,13 @@ class Worker:
             entry = self._journal.entry(name)
             try:
                 done = self.run(retire, entry, self._journal.files())
-            except (ScanError, NotReadyError) as error:
-                log.warning("%s", logfmt(scan=name, retention=self._site.retention.raw, reason=error))
+            except ScanError as error:
+                log.warning("%s", logfmt(scan=name, retention="kept", reason=error))
+            except NotReadyError as error:  # it would be so for the others too
+                log.warning("%s", logfmt(scan=name, retention="waits", reason=error))
                 return
-            log.info("%s", logfmt(scan=name, retention=done))
+            else:
+                log.info("%s", logfmt(scan=name, retention=done))
 
     def _kept_for_reference(self) -> set[str]:
         return set(scans_due(self._site, self._usable(), len(current(self._series))))

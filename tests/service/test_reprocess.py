@@ -321,6 +321,21 @@ def test_a_scan_that_is_gone_is_named_and_its_epoch_stays(folder):
     assert values(folder).identical(before)
 
 
+def test_a_scan_is_redone_from_the_archive(folder):
+    before = values(folder)
+    more = '[flags]\nfile = "flags.csv"\n[retention]\nraw = "move"\nkeep_days = 1\narchive = "old"\n'
+    (folder / "flags.csv").write_text("from,to,reason\n")
+    site = site_of(folder, more=more)
+    with Journal(site.station.data / "journal.sqlite") as journal:
+        Worker(site, journal, patient=True).sweep()
+    left = sorted(path.name for path in site.scans.inbox.iterdir())
+    assert left == [f"{SCANS[0]}-incl.txt", f"{SCANS[0]}.laz"]  # the scan of the SOP
+    damage(epoch_of(folder, LAST))
+    assert run(site)[0] == 0
+    assert redone(folder) == [LAST]
+    assert same(values(folder), before) == []
+
+
 def test_a_reference_whose_scans_are_gone_is_not_half_remade(folder):
     for path in (folder / "inbox").glob(f"{SCANS[0]}*"):
         path.unlink()
