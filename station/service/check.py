@@ -11,6 +11,7 @@ from pathlib import Path
 
 from station.config import Site, read_site
 from station.errors import NotReadyError, ScanError, StationError
+from station.readers.flags import read_flags
 from station.readers.scan import suffixes
 from station.readers.weather import air_at, read_weather
 from station.service import child
@@ -33,6 +34,7 @@ def check(site_path: Path) -> list[Finding]:
         *_pose(site),
         *_polygons(site),
         *_folders(site),
+        *_flags(site),
         *_clock(),
         *_weather(site),
         *_newest_scan(site),
@@ -105,6 +107,9 @@ def _folders(site: Site) -> Iterator[Finding]:
         yield _finding("fault", "inbox", f"{inbox}: may not be read")
     else:
         yield _finding("ok", "inbox", f"{inbox}: {len(_scans(site))} scans")
+    if site.retention.raw != "leave" and not os.access(inbox, os.W_OK):
+        says = f"{inbox}: may not be written, but retention.raw is {site.retention.raw!r}"
+        yield _finding("warning", "retention", says)
     place = next(parent for parent in (data, *data.parents) if parent.exists())
     if not os.access(place, os.W_OK | os.X_OK):
         yield _finding("fault", "data", f"{place}: may not be written")
@@ -115,6 +120,16 @@ def _folders(site: Site) -> Iterator[Finding]:
     )
     says = f"{data}: {free / 1e9:.1f} GB free; a day of hourly epochs takes up to {need / 1e9:.2f} GB"
     yield _finding("ok" if free > need else "warning", "data", says)
+
+
+def _flags(site: Site) -> Iterator[Finding]:
+    """Tell how many bad intervals a person has noted."""
+    if site.flags is None:
+        return
+    try:
+        yield _finding("ok", "flags", f"{site.flags.file}: {len(read_flags(site.flags.file))} intervals")
+    except StationError as error:
+        yield _finding("fault", "flags", str(error))
 
 
 def _clock() -> Iterator[Finding]:

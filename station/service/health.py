@@ -183,7 +183,7 @@ def describe(found: Status) -> str:
         lines.append(f"last     {last['scan']} of {last['start']}: {last['verdict']}{reason} {words}")
     if stale := found["stale"]:
         lines.append(
-            f"stale    {stale} epochs were made with another SOP, setting, flag or reference: station reprocess"
+            f"stale    {stale} epochs made with another SOP, setting, flag or reference: station reprocess"
         )
     free = found["disk_free_gb"]
     lines.append(f"disk     {f'{free:.2f} GB free' if free is not None else 'no data folder yet'}")

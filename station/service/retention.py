@@ -31,10 +31,12 @@ def due_to_go(site: Site, entries: Iterable[Entry], kept: set[str]) -> list[str]
     if given.raw == "leave":
         return []
     sops = {sop.scan for sop in site.sop}  # whose log is looked for in the inbox
-    before_s = time.time() - given.keep_days * 86_400
+    listed = list(entries)
+    newest_s = max((entry.start_utc_s or 0.0 for entry in listed), default=0.0)
+    before_s = min(time.time(), newest_s) - given.keep_days * 86_400  # a clock far ahead lets nothing go
     found = [
         (entry.start_utc_s, entry.name)
-        for entry in entries
+        for entry in listed
         if entry.start_utc_s is not None
         and entry.start_utc_s < before_s
         and entry.outcome is not None

@@ -10,8 +10,9 @@ from pathlib import Path
 from typing import TypeVar
 
 from station.archive.reference import current
+from station.archive.store import series_in
 from station.config import Site
-from station.errors import NotReadyError, ScanError, StoreError
+from station.errors import ConfigError, NotReadyError, ScanError, StoreError
 from station.service import child
 from station.service.inbox import Arrival
 from station.service.integrity import (
@@ -56,7 +57,11 @@ class Worker:
         should_stop: Callable[[], bool] = lambda: False,
         patient: bool = False,
     ) -> None:
-        """`patient`: as in the service, scans may wait for their weather, and are told by their bytes."""
+        """`patient`: as in the service, scans may wait for their weather, and are told by their bytes.
+
+        Raises ConfigError where the store is of another grid.
+        """
+        _require_same_grid(site)
         self._site = site
         self._series = series_of(site)
         self._journal = journal
@@ -314,6 +319,21 @@ def remember(journal: Journal, name: str, outcome: Outcome) -> None:
         log_sha256=outcome.log_sha256,
         epoch_sha256=outcome.epoch_sha256,
     )
+
+
+def _require_same_grid(site: Site) -> None:
+    """Raise ConfigError where what is stored lies on another grid: a series has one."""
+    try:
+        held = series_in(site.station.data).grid
+    except StoreError:  # nothing yet, or to be made anew
+        return
+    given = site.grid_cells
+    off_m = max(abs(held.west_m - given.west_m), abs(held.north_m - given.north_m))
+    if held.shape != given.shape or off_m > 1e-3 * given.cell_m:
+        raise ConfigError(
+            f"[grid] is not that of {site.station.data}, {held.nx} x {held.ny} cells of {held.cell_m:.6g} m from"
+            f" west {held.west_m:.10g}, north {held.north_m:.10g}: restore it, or give station.data a new folder"
+        )
 
 
 def _count_stale(site: Site, progress: Progress) -> int:

@@ -183,6 +183,7 @@ def test_a_corrected_sop_redoes_its_epochs_only(folder):
     rows[place] = " ".join([*numbers[:3], str(float(numbers[3]) + 0.02)])
     (folder / "sop_2.dat").write_text("\n".join(rows) + "\n")
     site = site_of(folder, ("[map]", '[[sop]]\nfrom = 2025-07-15T03:30:00Z\nfile = "sop_2.dat"\n\n[map]'))
+    assert count_by_settings(site) == 1
     status, said = run(site)
     assert (status, said.splitlines()[1:]) == (0, ["  1 × other SOP"])
     after = values(folder)
@@ -303,6 +304,12 @@ def test_a_lost_journal_is_made_anew_from_the_epochs(folder):
         assert len(journal.rows()) == len(SCANS)
     assert sorted((folder / "data" / "epochs").rglob("*.nc")) == files
     assert run(site)[1] == "0 epochs to be done again"
+
+
+def test_a_store_of_another_grid_is_left_alone(folder):
+    site = site_of(folder, ("cell_m = 5.0", "cell_m = 10.0"))
+    with pytest.raises(ConfigError, match="192 x 92 cells of 5 m .* new folder"):
+        run(site)
 
 
 def test_a_running_service_has_to_be_stopped_first(folder):

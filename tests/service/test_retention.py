@@ -126,6 +126,8 @@ def test_an_inbox_that_may_not_be_written_says_what_to_do(station, monkeypatch):
 
 def test_when_a_scan_is_due_to_go(station, write_site, monkeypatch):
     site, journal = station
+    store = {"sha256": "bb", "verdict": "good", "epoch": "epochs/b.nc", "revision": 1}
+    journal.stored("b.laz", start_utc_s=START_S + 3.5 * 86_400, **store)
     stored = journal.rows(State.STORED)
     monkeypatch.setattr("time.time", lambda: START_S + 3 * 86_400 - 1)
     assert due_to_go(site, stored, set()) == []
@@ -136,6 +138,12 @@ def test_when_a_scan_is_due_to_go(station, write_site, monkeypatch):
     assert due_to_go(delete, stored, set()) == [NAME]
     assert due_to_go(read_site(write_site()), stored, set()) == []
     journal.again([NAME])
+    assert due_to_go(site, journal.rows(), set()) == []
+
+
+def test_a_clock_far_ahead_lets_nothing_go(station, monkeypatch):
+    site, journal = station
+    monkeypatch.setattr("time.time", lambda: START_S + 1e9)
     assert due_to_go(site, journal.rows(), set()) == []
 
 
