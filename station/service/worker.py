@@ -328,11 +328,19 @@ def _require_same_grid(site: Site) -> None:
     except StoreError:  # nothing yet, or to be made anew
         return
     given = site.grid_cells
-    off_m = max(abs(held.west_m - given.west_m), abs(held.north_m - given.north_m))
+    off_m = max(
+        abs(one - other)
+        for one, other in (
+            (held.west_m, given.west_m),
+            (held.north_m, given.north_m),
+            (held.cell_m * held.nx, given.cell_m * given.nx),
+        )
+    )
     if held.shape != given.shape or off_m > 1e-3 * given.cell_m:
         raise ConfigError(
-            f"[grid] is not that of {site.station.data}, {held.nx} x {held.ny} cells of {held.cell_m:.6g} m from"
-            f" west {held.west_m:.10g}, north {held.north_m:.10g}: restore it, or give station.data a new folder"
+            f"[grid] is not that of {site.station.data}: {held.nx} x {held.ny} cells of {held.cell_m:.6g} m"
+            f" from west {held.west_m:.10g}, north {held.north_m:.10g}: restore it, or give station.data a new"
+            " folder"
         )
 
 

@@ -308,7 +308,7 @@ def test_a_lost_journal_is_made_anew_from_the_epochs(folder):
 
 def test_a_store_of_another_grid_is_left_alone(folder):
     site = site_of(folder, ("cell_m = 5.0", "cell_m = 10.0"))
-    with pytest.raises(ConfigError, match="192 x 92 cells of 5 m .* new folder"):
+    with pytest.raises(ConfigError, match=r"192 x 92 cells of 5 m .* new folder"):
         run(site)
 
 
