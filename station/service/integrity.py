@@ -50,13 +50,14 @@ def store_files(series: Series) -> list[Path]:
     ]
 
 
-def _is_reference(path: Path) -> bool:
-    return path.name.startswith("reference_")
+def is_reference(path: Path | str) -> bool:
+    """Tell a version of the reference from a file that holds epochs."""
+    return Path(path).name.startswith("reference_")
 
 
 def holds_epochs(series: Series) -> bool:
     """Tell whether anything is stored."""
-    return any(not _is_reference(path) for path in store_files(series))
+    return any(not is_reference(path) for path in store_files(series))
 
 
 def verify(site: Site, known: Mapping[str, str], progress: Progress, *, deep: bool = True) -> Found:
@@ -91,7 +92,7 @@ def unopened(site: Site, progress: Progress) -> tuple[str, ...]:
     for path in store_files(series):
         progress()
         try:
-            if not _is_reference(path):
+            if not is_reference(path):
                 rows_in(path)
         except StoreError:
             found.append(str(path.relative_to(series.folder)))
@@ -188,7 +189,7 @@ def prove(
 def _sound(series: Series, damaged: Iterable[str]) -> list[Path]:
     """Return the files that hold epochs, without the damaged ones."""
     out = {series.folder / name for name in damaged}
-    return [path for path in store_files(series) if path not in out and not _is_reference(path)]
+    return [path for path in store_files(series) if path not in out and not is_reference(path)]
 
 
 def _missing(entries: Iterable[Entry], sound: Iterable[Row]) -> list[Entry]:
@@ -210,10 +211,14 @@ def _references(series: Series) -> list[tuple[str, str, str]]:
     """Tell which versions of the reference are named by epochs and are not there."""
     if not series.path.is_file():
         return []
-    with h5py.File(series.path, "r") as file:
-        named = set(strings(file["reference_version"][:])) - {""}
+    try:
+        with h5py.File(series.path, "r") as file:
+            named = set(strings(file["reference_version"][:])) - {""}
+    except (OSError, RuntimeError, KeyError):  # told by `_series`
+        return []
     gone = sorted(version for version in named if not path_of(series, version).is_file())
-    return [("fault", "reference", f"reference_{version}.nc is gone: restore it") for version in gone]
+    says = "is gone: restore it, or station reprocess measures its epochs from another"
+    return [("fault", "reference", f"reference_{version}.nc {says}") for version in gone]
 
 
 def _series(series: Series, sound: list[Row], *, is_whole: bool) -> list[tuple[str, str, str]]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -36,9 +37,10 @@ IMPROVED_MOST = 32  # scans that are read for it
 REFERENCE_PASSES = 3  # a third improves the second by a tenth, a fourth the third by nothing measurable
 
 
-def next_version(series: Series) -> str:
-    """Return the version that comes next."""
-    return str(max((int(version) for version in versions(series)), default=0) + 1)
+def next_version(series: Series, named: Iterable[str | None]) -> str:
+    """Return the version that comes next, after those there are and those that epochs name."""
+    known = [*versions(series), *(version for version in named if version and version.isdigit())]
+    return str(max((int(version) for version in known), default=0) + 1)
 
 
 def scans_due(site: Site, usable: list[str], made: int) -> list[str]:

@@ -173,7 +173,7 @@ class _Redoing:
         if not found.references or isinstance(wanted, Path):
             return found
         sound = [version for version in current(self._series) if version not in found.references]
-        version = next_version(self._series)
+        version = next_version(self._series, (row.reference for row in self._journal.rows()))
         with self._console.status(f"making version {version} of the reference …"):
             if sound:
                 arrivals = self._scans_for(len(sound), at_least=wanted)

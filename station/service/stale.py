@@ -222,11 +222,14 @@ def plan(
     series = series_of(site)
     today = Today(site)
     by_epoch = {Path(entry.epoch).name: entry for entry in entries if entry.epoch}
+    stored = held(series)
     stale = stale_versions(site, series, today, entries)
-    sound = _current(site, series)
-    sound = None if sound is None else sound - set(stale)
+    sound = _current(site, series, stored)
+    if sound is not None:
+        sound -= set(stale)
+        stale = stale or (() if sound else tuple(sorted({one.reference for one in stored} - {""})))
     tasks = [_lost(site, entry) for entry in entries if entry.name in lost]
-    for one in held(series):
+    for one in stored:
         progress()
         entry = by_epoch.get(one.row.epoch_file)
         if entry is None or entry.name in lost or entry.outcome is State.SET_ASIDE:
@@ -285,20 +288,22 @@ def count_by_settings(site: Site) -> int:
     series, today = series_of(site), Today(site)
     if not series.path.is_file():
         return 0
-    sound = _current(site, series)
+    stored = held(series)
+    sound = _current(site, series, stored)
     return sum(
         one.science_hash != site.science_hash
         or bool(today.settings(one.made))
         or (sound is not None and one.reference not in sound)
-        for one in held(series)
+        for one in stored
     )
 
 
-def _current(site: Site, series: Series) -> set[str] | None:
-    """Return the versions that epochs may be measured from; None where there is none yet."""
+def _current(site: Site, series: Series, stored: list[Held]) -> set[str] | None:
+    """Return the versions that epochs may be measured from; None where there never was one."""
     if isinstance(site.reference.scans, Path):
         return {version_of_given(site.reference.scans)}
-    return set(current(series)) or None
+    made = set(current(series))
+    return made if made or any(one.reference for one in stored) else None
 
 
 def stale_versions(site: Site, series: Series, today: Today, entries: Iterable[Entry]) -> tuple[str, ...]:

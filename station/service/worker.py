@@ -17,6 +17,7 @@ from station.service import child
 from station.service.inbox import Arrival
 from station.service.integrity import (
     holds_epochs,
+    is_reference,
     lost,
     quarantine,
     restore_zeros,
@@ -130,7 +131,11 @@ class Worker:
 
     def prove(self) -> None:
         """Prove every file against its checksum and put aside those that are damaged."""
-        self._put_aside(self.run(verify, self._journal.files()).damaged)
+        damaged = self.run(verify, self._journal.files()).damaged
+        self._put_aside(damaged)
+        for name in filter(is_reference, damaged):  # a new version is made instead
+            quarantine(self._series, [name])
+            self._journal.forget_files([name])
 
     def join_closed(self) -> None:
         """Join closed days and months."""
@@ -166,10 +171,13 @@ class Worker:
         self._put_aside(damaged)
         if damaged:
             self._have_lost_done_again()
-        return bool(damaged)
+        return not all(map(is_reference, damaged))
 
     def _put_aside(self, damaged: Iterable[str]) -> None:
         for name in damaged:
+            if is_reference(name):
+                log.error("%s", logfmt(file=name, reason="damaged: restore it, or station reprocess"))
+                continue
             quarantine(self._series, [name])
             self._journal.forget_files([name])
             log.error(
@@ -256,7 +264,7 @@ class Worker:
                 log.warning("%s", logfmt(reference="waiting", reason=f"no longer there: {', '.join(gone)}"))
             return
         try:
-            version = next_version(self._series)
+            version = next_version(self._series, (row.reference for row in self._journal.rows()))
             if made:
                 self.run(improve_reference, there, version, list(made)[-1], ())
             else:
@@ -339,8 +347,8 @@ def _require_same_grid(site: Site) -> None:
     if held.shape != given.shape or off_m > 1e-3 * given.cell_m:
         raise ConfigError(
             f"[grid] is not that of {site.station.data}: {held.nx} x {held.ny} cells of {held.cell_m:.6g} m"
-            f" from west {held.west_m:.10g}, north {held.north_m:.10g}: restore it, or give station.data a new"
-            " folder"
+            f" from west {held.west_m:.10g}, north {held.north_m:.10g}: restore it, or give station.data a"
+            " new folder"
         )
 
 

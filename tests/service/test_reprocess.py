@@ -127,6 +127,43 @@ def test_damaged_and_missing_epochs_are_named_and_rebuilt_bit_by_bit(folder):
     assert len(list((folder / "data").rglob("*.damaged"))) == 2
 
 
+def test_a_damaged_month_is_rebuilt_from_its_scans(folder):
+    before = values(folder)
+    site = site_of(folder)
+    data = site.station.data
+    with Journal(data / "journal.sqlite") as journal:
+        Worker(site, journal).join_closed()
+        for kind in ("epochs", "days"):  # as the sweep does after two days
+            gone = [str(path.relative_to(data)) for path in (data / kind).rglob("*.nc")]
+            shutil.rmtree(data / kind)
+            journal.forget_files(gone)
+    assert faults(folder) == []
+    assert same(values(folder), before) == []
+    (month,) = (data / "months").rglob("*.nc")
+    damage(month)
+    assert month.name in faults(folder)[0]
+    assert len(faults(folder)) == 1 + len(SCANS)
+    status, said = run(site)
+    assert (status, "5 × epoch damaged or missing" in said) == (0, True)
+    assert same(values(folder), before) == []
+    assert faults(folder) == []
+
+
+def test_a_damaged_reference_is_made_anew(folder):
+    before = values(folder)
+    site = site_of(folder)
+    for version in ("1", "2"):
+        damage(site.station.data / f"reference_{version}.nc")
+    assert sum("reference_" in one for one in faults(folder)) == 2
+    assert "instead of 1 2" in run(site)[1]
+    after = values(folder)
+    assert set(after.reference_version.values) == {"3"}
+    assert faults(folder) == []
+    first = [one.isel(time=slice(4)) for one in (after, before)]
+    assert same(*first, OTHERWISE | {"reference_version"}) == []
+    assert run(site)[1] == "0 epochs to be done again"
+
+
 def test_the_service_goes_on_without_a_damaged_epoch_and_redoes_it(folder):
     before = values(folder)
     epoch_of(folder, SCANS[2]).write_bytes(b"no file of this kind")
