@@ -129,8 +129,9 @@ class _Redoing:
             self._mend()
             found = self._look(between_s)
             if found.tasks:
+                self._settle_zeros(found.there())
                 found = self._with_reference(found, between_s)
-            todo = [task for task in found.tasks if task.arrival is not None]
+            todo = found.there()
             self._settle_zeros(todo)
             try:
                 failed = self._redo(todo, hands)

@@ -96,6 +96,10 @@ class Plan:
     tasks: tuple[Task, ...]
     references: tuple[str, ...]
 
+    def there(self) -> list[Task]:
+        """Return what can be done: the tasks whose scan is there."""
+        return [task for task in self.tasks if task.arrival is not None]
+
     def why(self) -> dict[str, int]:
         """Return how many epochs each reason holds for."""
         return dict(Counter(reason for task in self.tasks for reason in task.reasons).most_common())

@@ -21,7 +21,7 @@ def publish(site: Site, progress: Progress) -> None:
     Epochs are joined first where they are too many files.
     """
     series = series_of(site)
-    if len({row.path for row in store.rows(series)}) > MOST_SOURCES:
+    if max(len(store.sources(series.path)), len(store.epochs(series))) > MOST_SOURCES:
         join.join_closed(series, datetime.now(UTC), progress)
     build_series(series)
     progress()

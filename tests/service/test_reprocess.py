@@ -149,6 +149,7 @@ def test_a_damaged_month_is_rebuilt_from_its_scans(folder):
     assert faults(folder) == []
 
 
+@pytest.mark.slow
 def test_a_damaged_reference_is_made_anew(folder):
     before = values(folder)
     site = site_of(folder)
@@ -196,6 +197,7 @@ def test_a_flag_makes_its_epoch_unusable_and_lifting_it_good_again(folder):
     assert same(values(folder), before) == []
 
 
+@pytest.mark.slow
 def test_a_flag_on_a_scan_of_a_later_version_redoes_what_was_measured_from_that(folder):
     (folder / "flags.csv").write_text("from,to,reason\n2025-07-15T02:50:00,2025-07-15T03:10:00,crane\n")
     site = site_of(folder, more='[flags]\nfile = "flags.csv"\n')
@@ -228,6 +230,24 @@ def test_a_corrected_sop_redoes_its_epochs_only(folder):
     assert [str(one).partition("-")[0] for one in after.sop_id.values] == ["sop"] * 4 + ["sop_2"]
     assert after.scanner_east.values[-1] != before.scanner_east.values[-1]
     assert after.isel(time=slice(4)).identical(before.isel(time=slice(4)))
+
+
+def test_the_zero_of_an_sop_is_that_of_its_first_scan_in_whatever_order_they_are_redone(folder, monkeypatch):
+    shutil.copy(folder / "sop.dat", folder / "sop_2.dat")
+    site = site_of(folder, ("[map]", '[[sop]]\nfrom = 2025-07-15T02:30:00Z\nfile = "sop_2.dat"\n\n[map]'))
+    elsewhere = site.model_copy(update={"station": site.station.model_copy(update={"data": folder / "new"})})
+    module._find_zero(elsewhere, arrival_of(site, site.scans.inbox / f"{SCANS[3]}.laz"), lambda: None)
+    (wanted,) = (folder / "new" / "lean_zero").glob("sop_2-*.json")
+
+    forward = module._Redoing._redo
+    monkeypatch.setattr(module._Redoing, "_redo", lambda self, todo, hands: forward(self, todo[::-1], hands))
+    monkeypatch.setattr(module._Redoing, "_with_reference", lambda _, found, __: found)
+    monkeypatch.setattr(module.os, "sched_getaffinity", lambda _: {0})
+    status, said = run(site)
+    assert (status, "2 × other SOP" in said) == (0, True)
+    (found,) = (folder / "data" / "lean_zero").glob("sop_2-*.json")
+    assert (found.name, found.read_text()) == (wanted.name, wanted.read_text())
+    assert values(folder).lean_zero.values[3:].tolist() == [wanted.read_text()] * 2
 
 
 def test_another_setting_makes_the_reference_anew_and_everything_from_it(folder, tmp_path):
