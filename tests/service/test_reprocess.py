@@ -1,10 +1,14 @@
 """A change of mind redoes exactly what it affects; what nothing affects comes out bit by bit the same."""
 
+import contextlib
 import os
 import shutil
 import signal
+import subprocess
+import sys
 from dataclasses import replace
 
+import numpy as np
 import pytest
 
 import station
@@ -284,6 +288,28 @@ def test_another_setting_makes_the_reference_anew_and_everything_from_it(folder,
     assert same(first, live, OTHERWISE | {"reference_version"}) == []
 
 
+@pytest.mark.slow
+def test_kills_at_any_moment_of_reprocessing_change_no_value(folder, tmp_path):
+    """Killed six times, then left alone: as if it had never been disturbed."""
+    quiet = shutil.copytree(folder, tmp_path / "quiet")
+    other = ("min_points = 1", "min_points = 2")
+    assert run(site_of(quiet, other))[0] == 0
+    site = site_of(folder, other)
+    seed = int(np.random.default_rng().integers(1 << 30))
+    rng = np.random.default_rng(seed)
+    for _ in range(6):
+        with subprocess.Popen(
+            [sys.executable, "-m", "station.cli", "reprocess", site.path], stdout=subprocess.DEVNULL
+        ) as going:
+            with contextlib.suppress(subprocess.TimeoutExpired):
+                going.wait(rng.uniform(1.0, 15.0))
+            going.kill()
+    assert run(site)[0] == 0, seed
+    assert same(values(folder), values(quiet), OTHERWISE | {"reference_version"}) == [], seed
+    assert set(values(folder).reference_version.values) <= {str(version) for version in range(3, 10)}, seed
+    assert faults(folder) == [], seed
+
+
 def test_a_log_and_weather_that_come_late(made, tmp_path):
     wanted = values(made)
     folder = shutil.copytree(made, tmp_path / "station")
@@ -343,6 +369,7 @@ def test_a_lost_journal_is_made_anew_from_the_epochs(folder):
     with Journal(path) as journal:
         before = {row.name: row for row in journal.rows()}
         sums = journal.files()
+    zeros = {file.name: file.read_text() for file in (site.station.data / "lean_zero").iterdir()}
     path.unlink()
     shutil.rmtree(site.station.data / "lean_zero")
     files = sorted((folder / "data" / "epochs").rglob("*.nc"))
@@ -354,6 +381,7 @@ def test_a_lost_journal_is_made_anew_from_the_epochs(folder):
             journal.seen([(arrival.name, arrival.size, arrival.mtime_ns, "")])
             assert worker.take(arrival)
         assert journal.files() == sums
+        assert zeros == {file.name: file.read_text() for file in (site.station.data / "lean_zero").iterdir()}
         lately = {"figures", "seen_utc_s", "changed_utc_s"}
         for row in journal.rows():
             for name in set(vars(row)) - lately:
