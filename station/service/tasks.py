@@ -70,6 +70,7 @@ class Past:
     revision: int = 0
     content: tuple[str, str] | None = None  # SHA-256 of the scan and log that were judged under its name
     stored: Mapping[str, str] = field(default_factory=dict)  # names of other scans stored, by their SHA-256
+    patient: bool = False  # it may wait a while for its weather
 
 
 @dataclass(frozen=True)
@@ -103,25 +104,20 @@ def series_of(site: Site) -> Series:
 
 
 def attend(site: Site, arrival: Arrival, past: Past, progress: Progress) -> Outcome | Same | Refused:
-    """Measure a scan as it arrives in the service, unless its bytes were judged before.
-
-    It may wait a while for its weather: NotReadyError then, or where it changes meanwhile.
-    """
+    """Measure a scan as it arrives, unless its bytes were judged before; raises as `process`."""
     sha256 = sha256_of(arrival.path) if past.content or past.stored else ""
     if past.content == (sha256, sha256_of_log(arrival)):
         return Same(arrival.name, sha256)
     if sha256 in past.stored:
         return Same(past.stored[sha256], sha256)
     progress()
-    return redo(site, arrival, past, progress, patient=True)
+    return redo(site, arrival, past, progress)
 
 
-def redo(
-    site: Site, arrival: Arrival, past: Past, progress: Progress, *, patient: bool = False
-) -> Outcome | Refused:
+def redo(site: Site, arrival: Arrival, past: Past, progress: Progress) -> Outcome | Refused:
     """Measure a scan, whatever is known of it, from the version of the reference it was measured from."""
     try:
-        return process(site, arrival, progress, patient=patient, past=past)
+        return process(site, arrival, progress, patient=past.patient, past=past)
     except ScanError as error:
         is_file = arrival.path.is_file() and not arrival.path.is_symlink()
         return Refused(

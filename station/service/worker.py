@@ -38,7 +38,7 @@ from station.service.references import (
 )
 from station.service.retention import due_to_go, retire
 from station.service.stale import count_by_settings, late
-from station.service.tasks import Outcome, Past, Progress, Refused, Same, attend, open_only, redo, series_of
+from station.service.tasks import Outcome, Past, Progress, Refused, Same, attend, open_only, series_of
 from station.service.upkeep import join_epochs, publish, sweep_store
 
 log = logging.getLogger("station")
@@ -58,7 +58,7 @@ class Worker:
         should_stop: Callable[[], bool] = lambda: False,
         patient: bool = False,
     ) -> None:
-        """`patient`: as in the service, scans may wait for their weather, and are told by their bytes.
+        """`patient`: as in the service, scans may wait for weather, and one only touched is not done again.
 
         Raises ConfigError where the store is of another grid.
         """
@@ -80,11 +80,15 @@ class Worker:
         """
         self._taken[arrival.name] = arrival
         entry = self._journal.entry(arrival.name)
-        past = past_of(entry)
-        if self._patient:
-            past = past_of(entry, self._journal.others_stored(arrival.name, arrival.size))
+        past = Past(
+            reference=entry.reference if entry else None,
+            revision=(entry.revision if entry else None) or 0,
+            content=_judged(entry) if self._patient else None,
+            stored=self._journal.others_stored(arrival.name, arrival.size),
+            patient=self._patient,
+        )
         try:
-            outcome = self._mending(attend if self._patient else redo, arrival, past)
+            outcome = self._mending(attend, arrival, past)
         except ScanError as error:
             return self._set_aside(arrival, str(error))
         except NotReadyError as error:
@@ -299,17 +303,11 @@ class Worker:
         )
 
 
-def past_of(entry: Entry | None, others: dict[str, str] | None = None) -> Past:
-    """Return what a scan's journal row says of its past; `others` are the scans it might be a copy of."""
-    if entry is None:
-        return Past(stored=others or {})
-    judged = others is not None and entry.outcome is not None and entry.sha256
-    return Past(
-        reference=entry.reference,
-        revision=entry.revision or 0,
-        content=(entry.sha256 or "", entry.log_sha256) if judged else None,
-        stored=others or {},
-    )
+def _judged(entry: Entry | None) -> tuple[str, str] | None:
+    """Return the checksums of the scan and log that were judged under a name; None where none were."""
+    if entry is None or entry.outcome is None or not entry.sha256:
+        return None
+    return entry.sha256, entry.log_sha256
 
 
 def remember(journal: Journal, name: str, outcome: Outcome) -> None:

@@ -360,6 +360,7 @@ def test_a_touched_scan_is_not_measured_again_and_a_copy_is_put_aside(folder):
         assert not worker.take(arrival_of(site, copy))
         assert journal.entry(copy.name).state is State.SET_ASIDE
         assert journal.entry(copy.name).reason == f"the same bytes as {path.name}, which is stored"
+        assert not Worker(site, journal).take(arrival_of(site, copy))  # nor by `station process`
     assert sorted((folder / "data" / "epochs").rglob("*")) == files
 
 
