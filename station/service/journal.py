@@ -15,6 +15,7 @@ from enum import StrEnum
 from typing import TYPE_CHECKING, NamedTuple, Self
 
 from station.errors import StoreError
+from station.service.journal_file import explain, open_to_read, open_to_write
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Mapping
@@ -23,36 +24,7 @@ if TYPE_CHECKING:
 FIRST_PAUSE_S = 30.0  # before a scan that was not ready is tried again; doubled each time
 LONGEST_PAUSE_S = 3600.0
 
-_SCHEMA = """
-CREATE TABLE IF NOT EXISTS scan (
-    name TEXT PRIMARY KEY,
-    size INTEGER NOT NULL,
-    mtime_ns INTEGER NOT NULL,
-    state TEXT NOT NULL CHECK (state IN ('waiting', 'stored', 'set_aside', 'later')),
-    waits_for TEXT NOT NULL DEFAULT '',
-    reason TEXT NOT NULL DEFAULT '',
-    sha256 TEXT,
-    log_sha256 TEXT NOT NULL DEFAULT '',
-    outcome TEXT CHECK (outcome IN ('stored', 'set_aside')),
-    verdict TEXT,
-    epoch TEXT,
-    start_utc_s REAL,
-    revision INTEGER,
-    reference TEXT,
-    figures TEXT NOT NULL DEFAULT '{}',
-    attempts INTEGER NOT NULL DEFAULT 0,
-    next_try_utc_s REAL,
-    seen_utc_s REAL NOT NULL,
-    changed_utc_s REAL NOT NULL
-) STRICT;
-CREATE INDEX IF NOT EXISTS scan_by_sha256 ON scan (sha256);
-CREATE TABLE IF NOT EXISTS file (
-    path TEXT PRIMARY KEY,
-    sha256 TEXT NOT NULL
-) STRICT;
-"""
 _OF_EPOCH = ("sha256", "log_sha256", "verdict", "reason", "epoch", "start_utc_s", "revision", "reference")
-_LATER_COLUMNS = {"log_sha256": "TEXT NOT NULL DEFAULT ''"}  # which older journals lack
 
 
 class State(StrEnum):
@@ -120,9 +92,9 @@ class Journal:
         self._notes = path.parent / "set_aside"
         self._now_s = now_s
         try:
-            self._rows = _open_to_read(path) if read_only else _open_to_write(path)
+            self._rows = open_to_read(path) if read_only else open_to_write(path)
         except sqlite3.Error as error:
-            raise StoreError(_explain(path, error)) from error
+            raise StoreError(explain(path, error)) from error
 
     def close(self) -> None:
         """Let go of the file."""
@@ -385,43 +357,7 @@ class Journal:
         try:
             yield
         except sqlite3.Error as error:
-            raise StoreError(_explain(self._path, error)) from error
-
-
-def _open_to_write(path: Path) -> sqlite3.Connection:
-    rows = sqlite3.connect(path, isolation_level=None, timeout=20.0)
-    try:
-        rows.execute("PRAGMA journal_mode = WAL")
-        rows.execute("PRAGMA synchronous = FULL")
-        rows.executescript(_SCHEMA)
-        known = {column[1] for column in rows.execute("PRAGMA table_info(scan)")}
-        for column, kind in _LATER_COLUMNS.items():
-            if column not in known:
-                rows.execute(f"ALTER TABLE scan ADD COLUMN {column} {kind}")
-    except sqlite3.Error:
-        rows.close()
-        raise
-    return rows
-
-
-def _open_to_read(path: Path) -> sqlite3.Connection:
-    """Open without leaving a file behind: a reader of another user must not own the writer's side files."""
-    if not path.exists():
-        empty = sqlite3.connect(":memory:", isolation_level=None)
-        empty.executescript(_SCHEMA)
-        return empty
-    side = path.with_name(path.name + "-wal")
-    quiet = not side.exists() or side.stat().st_size == 0
-    mode = "immutable=1" if quiet else "mode=ro"
-    return sqlite3.connect(f"{path.absolute().as_uri()}?{mode}", uri=True, isolation_level=None, timeout=20.0)
-
-
-def _explain(path: Path, error: sqlite3.Error) -> str:
-    if isinstance(error, sqlite3.OperationalError):
-        return f"{path}: the journal cannot be used: {error}: is the disk full, or the folder another user's?"
-    return (
-        f"{path}: the journal is damaged: {error}: move it and its -wal away, it is made anew from the epochs"
-    )
+            raise StoreError(explain(self._path, error)) from error
 
 
 def _entry(row: tuple[object, ...]) -> Entry:
