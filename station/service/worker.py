@@ -291,13 +291,15 @@ class Worker:
         return find_scan(self._site, name, entry.start_utc_s if entry else None)
 
     def run(self, task: Callable[..., T], *args: object) -> T:
-        """Run a task of this site in a child."""
+        """Run a task of this site in a child: at most `timeout_s` a scan, one without scans for ever."""
+        listed = [one for arg in args for one in (arg if isinstance(arg, list) else [arg])]
+        scans = sum(isinstance(one, Arrival) for one in listed)
         return child.run(
             task,
             self._site,
             *args,
             memory_gb=self._site.service.memory_gb,
-            timeout_s=self._site.scans.timeout_s,
+            timeout_s=self._site.scans.timeout_s * scans if scans else math.inf,
             on_progress=self._on_progress,
             should_stop=self._should_stop,
         )

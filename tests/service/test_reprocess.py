@@ -416,16 +416,16 @@ def test_a_scan_that_is_gone_is_named_and_its_epoch_stays(folder):
 
 def test_a_scan_is_redone_from_the_archive(folder):
     before = values(folder)
-    more = '[flags]\nfile = "flags.csv"\n[retention]\nraw = "move"\nkeep_days = 1\narchive = "old"\n'
+    more = '[flags]\nfile = "flags.csv"\n[retention]\nraw = "move"\nkeep_days = 0\narchive = "old"\n'
     (folder / "flags.csv").write_text("from,to,reason\n")
     site = site_of(folder, more=more)
     with Journal(site.station.data / "journal.sqlite") as journal:
         Worker(site, journal, patient=True).sweep()
-    left = sorted(path.name for path in site.scans.inbox.iterdir())
-    assert left == [f"{SCANS[0]}-incl.txt", f"{SCANS[0]}.laz"]  # the scan of the SOP
-    damage(epoch_of(folder, LAST))
+    left = sorted(path.name for path in site.scans.inbox.glob("*.laz"))
+    assert left == [f"{SCANS[0]}.laz", f"{LAST}.laz"]  # the scan of the SOP, and the newest
+    damage(epoch_of(folder, SCANS[2]))
     assert run(site)[0] == 0
-    assert redone(folder) == [LAST]
+    assert redone(folder) == [SCANS[2]]
     assert same(values(folder), before) == []
 
 
