@@ -235,7 +235,7 @@ class _Redoing:
         failed, waiting = 0, iter(todo)
         running: dict[Future[Outcome | Refused], Task] = {}
         with self._progress() as bar:
-            shown = bar.add_task(f"redoing on {hands.count}", total=len(todo))
+            shown = bar.add_task(f"redoing, {hands.count} at once", total=len(todo))
             while True:
                 while len(running) < hands.count + 1 and not self._stop.is_set():
                     task = next(waiting, None)
