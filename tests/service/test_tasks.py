@@ -13,7 +13,7 @@ import pytest
 from station.config import read_site
 from station.errors import ConfigError, NotReadyError, ScanError
 from station.service import tasks
-from station.service.once import arrival_of
+from station.service.places import arrival_of
 from station.simulation.motion import sensor_faults
 from station.simulation.station import simulate, tiny
 
