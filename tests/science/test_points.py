@@ -10,7 +10,7 @@ from station.quantities import Grid, Scanner
 from station.science import beam, points, registration, shared
 from station.science.uncertainty import sigma_angle
 
-SCANNER = Scanner("sim", 1.55, 0.3e-3, 0.0, 0.02, math.radians(0.002), 0.0, 6000.0)
+SCANNER = Scanner("sim", 1.55, 0.3e-3, 0.0, 0.02, math.radians(0.002), 0.0, 0.0, 6000.0)
 OFFSET_M = np.array([[400.0, 900.0, -200.0], [150.0, 520.0, 340.0]])
 AXIS = Rotation.from_rotvec([0.3, -0.5, 0.1]).apply([0.0, 0.0, 1.0])  # leans by more than 30°
 DRAWS = 40_000

@@ -140,7 +140,7 @@ def test_too_few_points_for_a_triangle():
 
 EYE_M = np.array([0.42, -0.31, 1.63])
 FIELD = Grid(west_m=-120.0, north_m=230.0, cell_m=5.0, nx=18, ny=16)
-SCANNER = Scanner("sim", 1.55, 0.0, 0.0, 0.02, 0.0, 0.0, 6000.0)
+SCANNER = Scanner("sim", 1.55, 0.0, 0.0, 0.02, 0.0, 0.0, 0.0, 6000.0)
 BASIS = shared.basis(FIELD, tuple(EYE_M))
 SNOW_M = 2.0
 
