@@ -35,6 +35,8 @@ _ONE_THREAD = dict.fromkeys(("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "RAYON_N
 _TICK_S = 0.2
 _GONE_WITH_ITS_SERVER = 255  # what multiprocessing reports where the fork server died
 _NOT_STARTED = ("not started", None)
+# A scan that needs too much meets RLIMIT_AS; the kernel kills where the machine or the unit has less.
+_FROM_OUTSIDE = {signal.SIGKILL, signal.SIGTERM, signal.SIGINT, signal.SIGHUP}
 
 _forks = multiprocessing.get_context("forkserver")
 
@@ -65,8 +67,8 @@ def run(
 
     `on_progress` is called here for each `progress()` there, and while waiting within `timeout_s`. Raises the
     StationError the task raised; ScanError where the child ran out of memory or time, panicked, or died by a
-    signal; NotReadyError where `should_stop()` became true or the child could not be started; RuntimeError
-    with the child's traceback for a bug.
+    signal of its own making; NotReadyError where `should_stop()` became true, or the child could not be
+    started or was killed from outside; RuntimeError with the child's traceback for a bug.
     """
     prepare()
     here, there = _forks.Pipe()
@@ -140,12 +142,14 @@ def _end(child: ForkServerProcess) -> int | None:
     return exit_status
 
 
-def _cause_of_death(exit_status: int | None) -> ScanError:
+def _cause_of_death(exit_status: int | None) -> ScanError | NotReadyError:
+    """Say what a child died of: a decoder that crashes is the scan's fault, a kill from outside is not."""
     if exit_status is None or exit_status >= 0:
         return ScanError(f"the decoder ended the process without a word (exit status {exit_status})")
     name = signal.Signals(-exit_status).name
-    hint = ": probably out of memory" if name == "SIGKILL" else ""
-    return ScanError(f"the decoder died by {name}{hint}")
+    if -exit_status in _FROM_OUTSIDE:
+        return NotReadyError(f"the process was killed ({name}): is the machine out of memory?")
+    return ScanError(f"the decoder died by {name}")
 
 
 def _work(there: Connection, task: Callable[..., object], args: tuple[object, ...], memory: int) -> None:

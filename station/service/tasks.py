@@ -23,7 +23,7 @@ from station.archive import join, store
 from station.archive.aggregate import Aggregates
 from station.archive.areas import update_areas
 from station.archive.layout import Series
-from station.archive.reference import read_reference, write_reference
+from station.archive.reference import read_reference, settle_reference, write_reference
 from station.archive.series import build_series
 from station.config import Site
 from station.errors import NotReadyError, ScanError, StoreError
@@ -312,6 +312,7 @@ def publish(site: Site, progress: Progress) -> None:
     Epochs are joined first where they are too many files.
     """
     series = series_of(site)
+    settle_reference(series)
     if len(store.sources(series.path)) > MOST_SOURCES:
         join.join_closed(series, datetime.now(UTC), progress)
     build_series(series)

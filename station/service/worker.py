@@ -31,6 +31,7 @@ log = logging.getLogger("station")
 T = TypeVar("T")
 IMPROVED_EVERY = 4  # a version is due at four times the scans of the one before
 IMPROVED_MOST = 32  # scans that are read for it
+PATIENT_TRIES = 4  # at a reference that is not ready; then scans go on without
 
 
 class Worker:
@@ -52,6 +53,7 @@ class Worker:
         self._should_stop = should_stop
         self._patient = patient
         self._taken: dict[str, Arrival] = {}
+        self._reference_tries = 0
 
     def take(self, arrival: Arrival) -> bool:
         """Measure and store a scan, and say so in the journal and in one log line; tell whether it is stored.
@@ -96,7 +98,8 @@ class Worker:
     def recover(self) -> None:
         """Make journal and files agree: epochs without their journal row are redone, the series is rebuilt.
 
-        An epoch written just before a power cut is found by `process` as the same and not stored twice.
+        An epoch written just before a power cut is found by `process` as the same and not stored twice. A
+        reference that was due is made now: what comes next is to be measured from it, as without the cut.
         """
         data = self._site.station.data
         lost = [row.name for row in self._journal.rows(State.STORED) if row.epoch and not self._is_there(row)]
@@ -105,6 +108,7 @@ class Worker:
         self._journal.again(lost)
         if any(path for kind in ("epochs", "days", "months") for path in (data / kind).glob("**/*.nc")):
             self._run(publish)
+        self._make_reference_when_due()
 
     def join_closed(self) -> None:
         """Join closed days and months."""
@@ -137,9 +141,13 @@ class Worker:
         wanted = self._site.reference.scans
         if isinstance(wanted, Path):
             return
-        usable = [row for row in self._journal.rows(State.STORED) if row.verdict == "good"]
+        stored = self._journal.rows(State.STORED)
+        usable = [row for row in stored if row.verdict == "good"]
         usable.sort(key=lambda row: row.start_utc_s or 0.0)
         version = self._versions() + 1
+        if version > 1 and (bare := [row.name for row in stored if not row.reference]):
+            # A power cut came between the reference and its first use.
+            self._journal.again(name for name in bare if self._arrival(name).path.is_file())
         due = wanted * IMPROVED_EVERY ** (version - 1)
         if len(usable) < due or (version > 1 and not self._site.adjusts):
             return
@@ -159,7 +167,11 @@ class Worker:
             made = self._run(build_reference if version == 1 else improve_reference, arrivals, str(version))
         except (ScanError, NotReadyError) as error:
             log.warning("%s", logfmt(reference="failed", reason=error))
+            self._reference_tries += 1
+            if isinstance(error, NotReadyError) and self._patient and self._reference_tries < PATIENT_TRIES:
+                raise  # rather than have scans measured from an older one
             return
+        self._reference_tries = 0
         log.info("%s", logfmt(reference=made, scans=len(arrivals)))
         if version == 1:
             others = (row.name for row in self._journal.rows(State.STORED) if row.reference != made)
