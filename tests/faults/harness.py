@@ -24,7 +24,7 @@ from station.simulation.station import simulate
 HERE = Path(__file__).parent
 HOOKS = HERE / "hooks"
 RECORD = 96  # bytes a boundary takes, see hooks/boundaries.py
-PATIENCE_S = 120.0
+PATIENCE_S = 60.0
 SCANS = 6
 LATER = "later"  # where scans lie before they arrive
 NOT_VALUES = {"epoch_file"}  # a revision more or less is no other value
@@ -88,6 +88,7 @@ class Station:
     warm: Warm | None = None
     pid: int | None = None
     starts: int = 0
+    logged: int = 0  # characters of the log before this start
     kills: int = 0
     steps: Path | None = None
     period_s: float = 5.0
@@ -100,6 +101,7 @@ class Station:
         """Start the service: forked from the warm process, or by its command where there is none."""
         assert self.pid is None
         self.starts += 1
+        self.logged = len(self.log())
         self.steps = self.folder / f"steps.{self.starts}"
         plan = {"steps": str(self.steps), "died": str(self.folder / "died"), **plan}
         environment = {"FAULTS_PLAN": json.dumps(plan)}
@@ -222,20 +224,29 @@ class Station:
         at_rest = all(row.state in {State.STORED, State.SET_ASIDE} for row in rows.values())
         return at_rest and {f"{stem(hour)}.laz" for hour in hours} <= rows.keys()
 
+    def is_through(self, *hours):
+        """Tell whether the service that runs has looked around and found nothing left to do."""
+        looked = "service=running" in self.log()[self.logged :]
+        return looked and self.is_done(*hours) and not self.processes()[3:]
+
     def await_(self, what, within_s=PATIENCE_S):
-        """Wait until something holds; the service must live meanwhile."""
+        """Wait until something holds."""
         until_s = time.monotonic() + within_s
         while not what():
-            assert self.is_alive(), self.log()[-3000:]
             assert time.monotonic() < until_s, self.log()[-3000:]
-            time.sleep(0.05)
+            nap()
 
     def finish(self, *hours):
         """Have an undisturbed service bring all to an end."""
         if not self.is_alive():
             self.start()
-        self.await_(lambda: self.is_done(*hours) and self.log().count("service=running") > 0)
+        self.await_(lambda: self.is_alive() and self.is_through(*hours))
         self.end()
+
+
+def nap():
+    """Wait a moment."""
+    time.sleep(0.05)
 
 
 def stem(hour):

@@ -97,12 +97,14 @@ def _cross(label, full=None):
     step = _record(plan["steps"], label)
     for number, (at, delay_s, whom) in enumerate(plan.get("kills", ())):
         ours = whom != "child" or multiprocessing.parent_process() is not None
-        if step >= at and ours and number not in _state["pending"]:
-            _state["pending"].add(number)
-            claim = f"{plan['steps']}.kill{number}"
+        claim = f"{plan['steps']}.kill{number}"
+        if step < at or not ours or number in _state["pending"] or os.path.exists(claim):  # noqa: PTH110 - is quick
+            continue
+        _state["pending"].add(number)
+        if delay_s:
             threading.Thread(target=_kill, args=(whom, delay_s, claim), daemon=True).start()
-            if not delay_s:
-                time.sleep(60)  # whoever it is dies here
+        else:
+            _kill(whom, 0.0, claim)
     if plan.get("once") and label not in _lines(plan["died"]):
         _write(plan["died"], f"{label}\n".encode())
         _kill(plan["once"], 0.0, f"{plan['steps']}.once")
