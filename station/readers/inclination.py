@@ -12,13 +12,14 @@ from station.readers.scan import WEEK_S, foreign_code
 
 COLUMNS = ("time", "roll", "pitch")
 MOST_BYTES = 1 << 26  # 1 Hz for a month
+FARTHEST_S = 86_400.0  # from the middle of the log: no scan lasts longer
 
 
 def read_inclination(path: Path) -> InclinationLog:
     """Read `Time,Roll,Pitch` in degrees, as written, in radians; a row that cannot be read is all NaN.
 
     Such rows stay, so that who cleans the log can count them. A last line without its end is one of them:
-    half a number is a wrong number. GPS seconds of the week run on past the week's end, as the scan's do.
+    half a number is a wrong number; and so is a time more than a day from the others. GPS seconds of the week run on past the week's end, as the scan's do.
     Raises ScanError where no row can be read, NotReadyError where the disk or its rights fail.
     """
     with foreign_code(f"{path.name} cannot be read"), path.open("rb") as file:
@@ -39,8 +40,9 @@ def read_inclination(path: Path) -> InclinationLog:
     readable = np.isfinite(rows).all(axis=-1)
     if not readable.any():
         raise ScanError(f"{path.name}: no row of {len(rows)} can be read")
-    rows[~readable] = np.nan
     time_s = _past_week(rows[:, 0], rows[readable][0, 0])
+    readable &= np.abs(time_s - np.median(time_s[readable])) <= FARTHEST_S
+    time_s[~readable] = rows[~readable] = np.nan
     return InclinationLog(time_s, np.radians(rows[:, 1]), np.radians(rows[:, 2]))
 
 

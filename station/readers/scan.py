@@ -233,4 +233,9 @@ def utc_interval(reader: ScanReader, pattern: str) -> tuple[datetime, datetime, 
     if times_s is None:
         return start, start, TimeKind.NONE
     kind = time_kind(*times_s, start, standard=reader.header.standard_time)
-    return start, start + timedelta(seconds=times_s[1] - times_s[0]), kind
+    try:
+        return start, start + timedelta(seconds=times_s[1] - times_s[0]), kind
+    except OverflowError as error:
+        raise ScanError(
+            f"time stamps from {times_s[0]:g} to {times_s[1]:g} s: no scan lasts so long: they are corrupt"
+        ) from error

@@ -31,7 +31,6 @@ log = logging.getLogger("station")
 T = TypeVar("T")
 IMPROVED_EVERY = 4  # a version is due at four times the scans of the one before
 IMPROVED_MOST = 32  # scans that are read for it
-PATIENT_TRIES = 4  # at a reference that is not ready; then scans go on without
 
 
 class Worker:
@@ -53,7 +52,6 @@ class Worker:
         self._should_stop = should_stop
         self._patient = patient
         self._taken: dict[str, Arrival] = {}
-        self._reference_tries = 0
 
     def take(self, arrival: Arrival) -> bool:
         """Measure and store a scan, and say so in the journal and in one log line; tell whether it is stored.
@@ -167,11 +165,7 @@ class Worker:
             made = self._run(build_reference if version == 1 else improve_reference, arrivals, str(version))
         except (ScanError, NotReadyError) as error:
             log.warning("%s", logfmt(reference="failed", reason=error))
-            self._reference_tries += 1
-            if isinstance(error, NotReadyError) and self._patient and self._reference_tries < PATIENT_TRIES:
-                raise  # rather than have scans measured from an older one
             return
-        self._reference_tries = 0
         log.info("%s", logfmt(reference=made, scans=len(arrivals)))
         if version == 1:
             others = (row.name for row in self._journal.rows(State.STORED) if row.reference != made)

@@ -59,7 +59,7 @@ class Warm:
     def __init__(self):
         self.process = subprocess.Popen(
             [sys.executable, str(HERE / "warm.py")],
-            stdin=subprocess.PIPE, stdout=subprocess.PIPE, encoding="utf-8", env=_environment(),
+            stdin=subprocess.PIPE, stdout=subprocess.PIPE, encoding="utf-8", env=environment(),
         )  # fmt: skip
         assert self.process.stdout.readline() == "warm\n"
 
@@ -73,7 +73,7 @@ class Warm:
             self.process.stdin.close()
 
 
-def _environment(**more):
+def environment(**more):
     told = {**os.environ, "OPENBLAS_NUM_THREADS": "1", "PYTHONPATH": os.pathsep.join(sys.path), **more}
     for name in ("NOTIFY_SOCKET", "JOURNAL_STREAM", "WATCHDOG_USEC"):
         told.pop(name, None)
@@ -92,8 +92,9 @@ class Station:
     kills: int = 0
     steps: Path | None = None
     period_s: float = 5.0
+    clock: Path | None = None  # file that says by how much the service's clock is off
     popen: subprocess.Popen | None = None
-    user: dict = field(default_factory=dict)
+    before: list[str] = field(default_factory=list)  # of the command that starts it
 
     # ---- the service
 
@@ -104,18 +105,19 @@ class Station:
         self.logged = len(self.log())
         self.steps = self.folder / f"steps.{self.starts}"
         plan = {"steps": str(self.steps), "died": str(self.folder / "died"), **plan}
-        environment = {"FAULTS_PLAN": json.dumps(plan)}
+        orders = {"FAULTS_PLAN": json.dumps(plan)}
         site, log = str(self.folder / "site.toml"), str(self.folder / "log")
         if self.warm is not None:
-            order = {"site": site, "log": log, "environment": environment, "period_s": self.period_s}
+            order = {"site": site, "log": log, "environment": orders}
+            order |= {"period_s": self.period_s, "clock": str(self.clock) if self.clock else ""}
             self.pid = self.warm.start(order)
             return
-        environment = _environment(**environment)
-        environment["PYTHONPATH"] = f"{HOOKS}{os.pathsep}{environment['PYTHONPATH']}"
+        orders["PYTHONPATH"] = os.pathsep.join([str(HOOKS), *sys.path])
         with open(log, "a") as told:  # noqa: PTH123 - a text of a path
             self.popen = subprocess.Popen(
-                [sys.executable, "-m", "station.cli", "run", site], stderr=told, env=environment, **self.user
-            )
+                [*self.before, sys.executable, "-m", "station.cli", "run", site],
+                stderr=told, env=environment(**orders),
+            )  # fmt: skip
         self.pid = self.popen.pid
 
     def is_alive(self):
@@ -244,9 +246,9 @@ class Station:
         self.end()
 
 
-def nap():
+def nap(seconds=0.05):
     """Wait a moment."""
-    time.sleep(0.05)
+    time.sleep(seconds)
 
 
 def stem(hour):

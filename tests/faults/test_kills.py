@@ -6,6 +6,7 @@ import harness
 import pytest
 
 ALL = range(harness.SCANS)
+RANDOM_KILLS = 300
 HOLDS = "lost=0 doubled=0 wrong=0"
 
 
@@ -42,7 +43,7 @@ def test_a_death_at_every_write_boundary(make, quiet, capsys, whom):
 
 
 def drawn(dice, *, kills, most=60):
-    """Draw moments to kill at: boundaries, and a little later, mostly of the child, in the end of the service."""
+    """Draw moments to kill at, a boundary and a little later: the child so many times, then the service."""
     at, plan = 0, []
     for _ in range(kills):
         at += dice.randrange(1, most)
@@ -53,3 +54,23 @@ def drawn(dice, *, kills, most=60):
 
 def test_a_few_random_kills(make, quiet, dice, capsys):
     live_through(make(), quiet(), [drawn(dice, kills=2) for _ in range(3)], capsys)
+
+
+@pytest.mark.slow
+def test_three_hundred_random_kills(make, quiet, dice, capsys):
+    """Kills of the service by kills -9, and of its child, which decodes, publishes, joins."""
+    stations = []
+    while sum(station.kills for station in stations) < RANDOM_KILLS:
+        method = "joint" if len(stations) % 5 == 4 else "none"
+        station = make(method)
+        live_through(station, quiet(method), [drawn(dice, kills=dice.randrange(3)) for _ in range(12)], capsys)
+        stations.append(station)
+    with capsys.disabled():
+        kills, starts = (sum(getattr(one, name) for one in stations) for name in ("kills", "starts"))
+        print(f"\n  trials={len(stations)} starts={starts} kills={kills} {HOLDS}")
+
+
+@pytest.mark.slow
+def test_kills_of_a_service_started_by_its_command(make, quiet, dice, capsys):
+    """The same without the shortcut of the other tests, which fork the service from a warm process."""
+    live_through(make(cold=True), quiet(), [drawn(dice, kills=2) for _ in range(5)], capsys)

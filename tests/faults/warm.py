@@ -30,6 +30,8 @@ def be_service(order):
         os.dup2(opened, at)
     boundaries.install()
     boundaries.hurry(order["period_s"])
+    if order["clock"]:
+        boundaries.set_clock(order["clock"])
     start_fork_server()
     from station.cli import main
 
