@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -44,6 +45,18 @@ def read_inclination(path: Path) -> InclinationLog:
     readable &= np.abs(time_s - np.median(time_s[readable])) <= FARTHEST_S
     time_s[~readable] = rows[~readable] = np.nan
     return InclinationLog(time_s, np.radians(rows[:, 1]), np.radians(rows[:, 2]))
+
+
+def in_week_of(log: InclinationLog, time_s: float) -> InclinationLog:
+    """Return a clean log in the GPS week that a scan counts its seconds in, of which `time_s` is one.
+
+    Where the week ends between the starts of scan and log, only one of the two is seen to run on.
+    """
+    apart_s = time_s - float(np.median(log.time_s))
+    weeks = round(apart_s / WEEK_S)
+    if abs(weeks) != 1 or abs(apart_s - weeks * WEEK_S) > FARTHEST_S:
+        return log
+    return replace(log, time_s=log.time_s + weeks * WEEK_S)
 
 
 def _numbers(line: str, places: list[int]) -> tuple[float, ...]:

@@ -223,6 +223,16 @@ def scan_start(
     return named
 
 
+def require_begun(start: datetime, now_s: float) -> None:
+    """Raise NotReadyError where a scan begins in the future: then a clock is wrong, or its name's zone."""
+    ahead_s = start.timestamp() - now_s
+    if ahead_s > CLOCKS_AGREE_S:
+        raise NotReadyError(
+            f"begins at {start:%Y-%m-%d %H:%M:%S} UTC, {timedelta(seconds=round(ahead_s))} ahead of this computer's"
+            " clock: is the scanner's clock wrong, or this one, or the name in local time? Held back until then"
+        )
+
+
 def utc_interval(reader: ScanReader, pattern: str) -> tuple[datetime, datetime, TimeKind]:
     """Return start and end of a scan (UTC) and what its time stamps count; end = start where none are.
 

@@ -16,7 +16,7 @@ from station.config import Origin, Site, SopSection
 from station.errors import ConfigError, NotReadyError, ScanError
 from station.pipeline import Pose, Setup, Told
 from station.quantities import Air, Habits, HeadTrack, InclinationLog, Shared
-from station.readers.inclination import read_inclination
+from station.readers.inclination import in_week_of, read_inclination
 from station.readers.scan import ScanReader, open_scan
 from station.readers.sop import read_matrix, sop_for
 from station.readers.weather import air_at, read_weather
@@ -203,7 +203,10 @@ def _log(site: Site, path: Path | None, track: HeadTrack | None, lacking: list[s
         return None
     if dropped > 0.1 * (dropped + rows):
         lacking.append(f"inclination log bad: {dropped} of {dropped + rows} rows dropped")
-    return log if track is None or _covers(log, track, lacking) else None
+    if track is None:
+        return log
+    log = in_week_of(log, float(track.time_s[0]))
+    return log if _covers(log, track, lacking) else None
 
 
 def _covers(log: InclinationLog, track: HeadTrack, lacking: list[str]) -> bool:

@@ -39,7 +39,7 @@ from station.pipeline import (
 from station.quantities import Bools, Habits, Measurement, Quality, Reference
 from station.readers.polygons import mask, read_polygons
 from station.readers.raster import read_geotiff
-from station.readers.scan import ScanReader, open_scan, utc_interval
+from station.readers.scan import ScanReader, open_scan, require_begun, utc_interval
 from station.science import ground
 from station.science.adjustment import Adjustment, distrust
 from station.science.grid import Gridder, Stack
@@ -91,8 +91,8 @@ def process(
 ) -> Outcome:
     """Measure a scan and store its epoch, unless just this is stored.
 
-    Raises ScanError where the scan cannot be used; NotReadyError where it changes meanwhile, or `patient` and
-    still without weather shortly after its arrival.
+    Raises ScanError where the scan cannot be used; NotReadyError where it changes meanwhile, begins in the
+    future, or `patient` and still without weather shortly after its arrival.
     """
     began_s = time.monotonic()
     series = series_of(site)
@@ -144,6 +144,7 @@ def _measure(
 ) -> store.Epoch:
     with _opened(site, arrival.path) as reader:
         start, end, _ = utc_interval(reader, site.scans.name)
+        require_begun(start, time.time())
         gathered = gather(
             site,
             reader,

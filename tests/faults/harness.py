@@ -11,6 +11,7 @@ import signal
 import subprocess
 import sys
 import time
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -134,14 +135,13 @@ class Station:
         assert self._has_ended(within_s), self.log()
         self._ended()
 
-    def end(self, number=signal.SIGTERM):
-        """End the service; it must say so if it was asked."""
-        os.kill(self.pid, number)
+    def end(self):
+        """Ask the service to end; it must say so, unless one of its kills came first."""
+        kills = self.kills
+        with suppress(ProcessLookupError):
+            os.kill(self.pid, signal.SIGTERM)
         self.wait()
-        if number == signal.SIGTERM:
-            assert self.log().endswith("service=stopped\n"), self.log()[-2000:]
-        else:
-            self.kills += 1
+        assert self.log().endswith("service=stopped\n") or self.kills > kills, self.log()[-2000:]
 
     def close(self):
         """Leave nothing running."""
@@ -225,6 +225,11 @@ class Station:
         rows = self.rows()
         at_rest = all(row.state in {State.STORED, State.SET_ASIDE} for row in rows.values())
         return at_rest and {f"{stem(hour)}.laz" for hour in hours} <= rows.keys()
+
+    def is_stored(self, hour):
+        """Tell whether a scan is in the store."""
+        row = self.rows().get(f"{stem(hour)}.laz")
+        return row is not None and row.state is State.STORED
 
     def is_through(self, *hours):
         """Tell whether the service that runs has looked around and found nothing left to do."""
