@@ -252,6 +252,18 @@ def test_a_full_disk_is_waited_out(write_site, start):
     wait_for(lambda: 'service="goes on"' in service.log())
 
 
+def test_after_a_fault_of_the_store_it_reconciles_again(write_site, start):
+    path = write_site(settle_s=0.0)
+    (path.parent / "data" / "full").touch()
+    drop(path, FIRST)
+    service = start(path)
+    wait_for(lambda: "service=paused" in service.log())
+    before = did(path).count("recover")
+    (path.parent / "data" / "full").unlink()
+    wait_for(lambda: stored(path) == [FIRST])
+    assert did(path).count("recover") > before
+
+
 def test_a_second_service_on_the_same_data_is_refused(write_site, start):
     path = write_site()
     first = start(path)
