@@ -54,7 +54,7 @@ def _closed(kind: str, start: datetime, now: datetime) -> bool:
 def _is_joined(series: Series, found: list[Row], kind: str) -> bool:
     """Tell whether all epochs lie in one file of this kind, or in those of the next larger.
 
-    A day may lie in two: in its month, and what came later in a file of the day, until the month is joined anew.
+    A day may lie in two: in its month, and what came later in a file of the day, until that is made anew.
     """
     paths = {row.path.relative_to(series.folder) for row in found}
     kinds = {path.parts[0] for path in paths}

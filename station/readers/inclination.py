@@ -20,7 +20,8 @@ def read_inclination(path: Path) -> InclinationLog:
     """Read `Time,Roll,Pitch` in degrees, as written, in radians; a row that cannot be read is all NaN.
 
     Such rows stay, so that who cleans the log can count them. A last line without its end is one of them:
-    half a number is a wrong number; and so is a time more than a day from the others. GPS seconds of the week run on past the week's end, as the scan's do.
+    half a number is a wrong number; and so is a time more than a day from the others. GPS seconds of the week
+    run on past the week's end, as the scan's do.
     Raises ScanError where no row can be read, NotReadyError where the disk or its rights fail.
     """
     with foreign_code(f"{path.name} cannot be read"), path.open("rb") as file:

@@ -228,8 +228,8 @@ def require_begun(start: datetime, now_s: float) -> None:
     ahead_s = start.timestamp() - now_s
     if ahead_s > CLOCKS_AGREE_S:
         raise NotReadyError(
-            f"begins at {start:%Y-%m-%d %H:%M:%S} UTC, {timedelta(seconds=round(ahead_s))} ahead of this computer's"
-            " clock: is the scanner's clock wrong, or this one, or the name in local time? Held back until then"
+            f"begins at {start:%Y-%m-%d %H:%M:%S} UTC, {timedelta(seconds=round(ahead_s))} ahead of this"
+            " computer's clock: held back until then; is one of the two clocks wrong, or its name in local time?"
         )
 
 

@@ -2,8 +2,8 @@
 
     python fuzz_cases.py FOLDER FIRST KIND=COUNT...
 
-Prints a line of JSON: by kind, how many cases were accepted and refused, and what was found. A case that hangs
-is ended by SIGALRM, a native crash by its own signal: `FOLDER/at.FIRST` says which it was.
+Prints a line of JSON: by kind, how many cases were accepted and refused, and what was found. A case that
+hangs is ended by SIGALRM, a native crash by its own signal: `FOLDER/at.FIRST` says which it was.
 """
 
 from __future__ import annotations
@@ -27,13 +27,13 @@ import numpy as np
 
 from station.config import WeatherColumns, read_site
 from station.errors import ConfigError, ScanError
+from station.quantities import Grid, HeadTrack
 from station.readers.inclination import read_inclination
 from station.readers.polygons import mask, read_polygons
 from station.readers.scan import open_scan, utc_interval
 from station.readers.sop import read_matrix
 from station.readers.weather import LIMITS, air_at, read_weather
 from station.science import inclination, pose
-from station.quantities import Grid, HeadTrack
 
 PATIENCE_S = 5  # for one case of a few kilobytes
 MEMORY = 1 << 29  # beyond what the modules take
@@ -56,9 +56,9 @@ ODD_NUMBERS = (0, 1, 2, 127, 128, 255, 256, 32767, 65535, 2**31 - 1, 2**31, 2**3
 ODD_DOUBLES = (0.0, -0.0, 1e-300, 1e300, -1e300, 1e18, math.nan, math.inf, -math.inf, -1.0, 604_800.0, 1e9)
 ODD_WORDS = (
     "nan", "inf", "-inf", "1e999", "1e300", "-1e300", "1e18", "1e9", "-1", "0", "00", "", " ", "1_0", "0x10",
-    "1,5", "NAN", '"', "'", "\\", "\0", "\ufeff", "é", "\u2028", "٣", "\r", "\n", "\t", "9" * 400, "a" * 70_000,
-    "[" * 2000, "{" * 300, "../../etc/passwd", "~nobody_at_all/x", "/dev/zero", "/dev/full", "9999-12-31",
-    "0001-01-01", "2025-07-15 24:00:00", "-0", "true", "[]", "null", "#", "=", "e", "1e-320", "+", "-7999",
+    "1,5", "NAN", '"', "'", "\\", "\0", "\ufeff", "é", "\u2028", "٣", "\r", "\n", "\t", "9" * 400,
+    "a" * 70_000, "[" * 2000, "{" * 300, "../../etc/passwd", "~nobody_at_all/x", "/dev/zero", "/dev/full",
+    "9999-12-31", "0001-01-01", "2025-07-15 24:00:00", "-0", "true", "[]", "null", "#", "=", "e", "1e-320", "+", "-7999",
 )  # fmt: skip
 
 
@@ -235,9 +235,7 @@ def check_polygons(path, _dice):
 
 
 COLUMNS = {
-    "dat": WeatherColumns(
-        temperature_c="TAact_2m_Avg", humidity_pct="RHact_2m_Avg", pressure_hpa="Pact"
-    ),
+    "dat": WeatherColumns(temperature_c="TAact_2m_Avg", humidity_pct="RHact_2m_Avg", pressure_hpa="Pact"),
     "csv": WeatherColumns(time="time", temperature_c="t", humidity_pct="rh", pressure_hpa="p"),
 }
 READ_TEXT = {

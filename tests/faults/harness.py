@@ -226,10 +226,10 @@ class Station:
         at_rest = all(row.state in {State.STORED, State.SET_ASIDE} for row in rows.values())
         return at_rest and {f"{stem(hour)}.laz" for hour in hours} <= rows.keys()
 
-    def is_stored(self, hour):
-        """Tell whether a scan is in the store."""
-        row = self.rows().get(f"{stem(hour)}.laz")
-        return row is not None and row.state is State.STORED
+    def state(self, name):
+        """Tell where a scan stands, None before it was seen."""
+        row = self.rows().get(name)
+        return row.state if row else None
 
     def is_through(self, *hours):
         """Tell whether the service that runs has looked around and found nothing left to do."""

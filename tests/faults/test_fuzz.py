@@ -32,7 +32,10 @@ def corpus(tmp_path_factory):
     shutil.copy(station / harness.LATER / f"{harness.stem(0)}-incl.txt", place / "incl.txt")
     weather = (station / "weather.dat").read_text().splitlines(keepends=True)[:200]
     (place / "weather.dat").write_text("".join(weather))
-    rows = [f"2025-07-15T0{n // 60}:{n % 60:02d}:00Z,{n / 10 - 3},{50 + n / 9},{684 + n / 50}\n" for n in range(180)]
+    rows = [
+        f"2025-07-15T0{n // 60}:{n % 60:02d}:00Z,{n / 10 - 3},{50 + n / 9},{684 + n / 50}\n"
+        for n in range(180)
+    ]
     (place / "weather.csv").write_text("time,t,rh,p\n" + "".join(rows))
     write_scans(laspy.read(station / harness.LATER / f"{harness.stem(0)}.laz"), place)
     return folder
@@ -82,7 +85,9 @@ def fuzz(corpus, capsys, *, rounds, each):
     after = resource.getrusage(resource.RUSAGE_CHILDREN)
     found = [line for part in told for one in part.values() for line in one["found"]]
     names = ("accepted", "refused", "finds")
-    sums = {kind: [sum(part.get(kind, {}).get(name, 0) for part in told) for name in names] for kind in wanted}
+    sums = {
+        kind: [sum(part.get(kind, {}).get(name, 0) for part in told) for name in names] for kind in wanted
+    }
     total = sum(map(sum, sums.values()))
     with capsys.disabled():
         print(f"\n  STATION_FAULTS_SEED={seed}")

@@ -21,7 +21,7 @@ def live_through(station, quiet, plans, capsys, *, hours=ALL):
     station.drop(*hours)
     for plan in plans:
         station.start(**plan)
-        station.await_(lambda: station.is_through(*hours) or not station.is_alive())  # noqa: B023 - called at once
+        station.await_(lambda: station.is_through(*hours) or not station.is_alive())
         if station.is_alive():
             station.end()
             break
@@ -63,7 +63,9 @@ def test_three_hundred_random_kills(make, quiet, dice, capsys):
     while sum(station.kills for station in stations) < RANDOM_KILLS:
         method = "joint" if len(stations) % 5 == 4 else "none"
         station = make(method)
-        live_through(station, quiet(method), [drawn(dice, kills=dice.randrange(3)) for _ in range(12)], capsys)
+        live_through(
+            station, quiet(method), [drawn(dice, kills=dice.randrange(3)) for _ in range(12)], capsys
+        )
         stations.append(station)
     with capsys.disabled():
         kills, starts = (sum(getattr(one, name) for one in stations) for name in ("kills", "starts"))

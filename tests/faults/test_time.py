@@ -22,9 +22,9 @@ WEEK_S = 604_800
 
 
 def timed(station, name, first_s):
-    """Put scan 0 into the inbox under another name, its own seconds and those of its log counted from `first_s`.
+    """Put scan 0 and its log into the inbox under another name, their seconds counted from `first_s`.
 
-    Seconds are of the GPS week where `first_s` is given.
+    These are seconds of the GPS week then; None: the scanner's, as they are.
     """
     scan = laspy.read(station.folder / harness.LATER / f"{harness.stem(0)}.laz")
     own_s = np.asarray(scan.gps_time)
@@ -51,7 +51,7 @@ def measured(station, path):
 
 @pytest.mark.parametrize("into_s", [-12.0, 1.0, 3.0])
 def test_a_scan_across_the_end_of_the_gps_week(make, into_s):
-    """Before, in and just after the roll-over, with a log that begins before: as with the scanner's seconds."""
+    """Before and just after the roll-over, with a log that begins before: as with the scanner's seconds."""
     station = make()
     start = datetime(2025, 7, 19, 23, 59, 42, tzinfo=UTC) + timedelta(seconds=into_s)  # 18 leap seconds
     assert (gps_seconds(start) - into_s) % WEEK_S == 0
@@ -76,9 +76,7 @@ def test_a_name_in_local_time_is_set_aside_with_a_hint(make):
     scan.gps_time = np.asarray(scan.gps_time) - np.min(scan.gps_time) + gps_seconds(noon) - 1e9
     scan.write(path)
     station.start()
-    station.await_(lambda: station.is_done())
-    station.await_(lambda: path.name in station.rows())
-    station.await_(lambda: station.rows()[path.name].state is State.SET_ASIDE)
+    station.await_(lambda: station.state(path.name) is State.SET_ASIDE)
     station.end()
     assert "local time (UTC+2 h)" in (station.data / "set_aside" / f"{path.name}.txt").read_text()
 
@@ -91,16 +89,17 @@ def test_a_scan_from_the_future_is_held_back_until_its_time(make):
     path = timed(station, f"{ahead:%y%m%d_%H%M%S}", None)
     station.drop(0)
     station.start()
-    station.await_(lambda: station.is_stored(0))
-    station.await_(lambda: station.rows()[path.name].state is State.LATER)
+    station.await_(lambda: station.state(f"{harness.stem(0)}.laz") is State.STORED)
+    station.await_(lambda: station.state(path.name) is State.LATER)
     assert "ahead of this computer's clock" in station.rows()[path.name].waits_for
     with netCDF4.Dataset(station.data / "series.nc") as file:
         assert file["time"][-1] < time.time()
     station.clock.write_text(str(30 * 3600))
-    station.await_(lambda: station.rows()[path.name].state is State.STORED)
+    station.await_(lambda: station.state(path.name) is State.STORED)
     station.end()
 
 
+@pytest.mark.slow
 def test_other_bytes_under_the_same_name_take_the_place_of_the_first(make, quiet):
     """A re-sent scan makes a new revision, the series shows it once; the first bytes again make a third."""
     station = make()
@@ -125,6 +124,9 @@ def test_other_bytes_under_the_same_name_take_the_place_of_the_first(make, quiet
     (station.inbox / f".{name}").replace(station.inbox / name)
     station.await_(lambda: station.is_done() and station.rows()[name].sha256 == first.sha256)
     station.end()
-    with netCDF4.Dataset(station.data / "series.nc") as file, netCDF4.Dataset(quiet().data / "series.nc") as q:
+    with (
+        netCDF4.Dataset(station.data / "series.nc") as file,
+        netCDF4.Dataset(quiet().data / "series.nc") as q,
+    ):
         assert file["point_total"][2] == q["point_total"][2]
         np.testing.assert_array_equal(file["elevation"][2], q["elevation"][2])

@@ -1,4 +1,4 @@
-"""What a station's world does to it: disks fill up, rights go, folders and clocks change, scans come as they like."""
+"""What a station's world does to it: disks fill up, rights go, clocks jump, scans come as they like."""
 
 from __future__ import annotations
 
@@ -10,7 +10,6 @@ import tempfile
 from pathlib import Path
 
 import harness
-import netCDF4
 import pytest
 
 ALL = range(harness.SCANS)
@@ -71,6 +70,7 @@ def small_disk():
         subprocess.run(["umount", folder], check=True)
 
 
+@pytest.mark.slow
 def test_a_really_full_disk_is_waited_out(make, quiet, small_disk):
     """The service must know that there is no room before it begins, pause, and go on when there is room."""
     station = make(folder=small_disk / "station")
@@ -95,7 +95,8 @@ def test_a_really_full_disk_is_waited_out(make, quiet, small_disk):
 # ---- rights and folders
 
 
-def test_rights_that_go_and_come_back(make, quiet):
+@pytest.mark.slow
+def test_rights_that_go_and_come_back(make):
     """Read-only data, an inbox nobody may list, a scan nobody may read: waited out, and told."""
     station = make(cold=True)
     if not os.getuid():  # root without the right to ignore rights
@@ -121,11 +122,12 @@ def test_rights_that_go_and_come_back(make, quiet):
     station.inbox.chmod(0o755)
     station.drop(5)
     station.finish(*ALL)
-    # The scan that could not be read came after others: the reference is of other scans than in the quiet run.
+    # The scan that could not be read came after others: the reference is of others than in the quiet run.
     harness.assert_sound(station, ALL)
     assert 'service="goes on"' in station.log()
 
 
+@pytest.mark.slow
 def test_an_inbox_that_is_removed_and_made_again(make, quiet, dice):
     station = make()
     station.period_s = 0.3
@@ -184,6 +186,7 @@ def test_a_scan_replaced_while_it_is_read(make, quiet, dice):
 # ---- clocks
 
 
+@pytest.mark.slow
 def test_a_clock_that_jumps(make, quiet, dice):
     """Back by years and forth by years, while scans are measured, wait and are joined."""
     station = make()

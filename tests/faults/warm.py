@@ -51,7 +51,7 @@ def start_fork_server():
         multiprocessing.util.spawnv_passfds = spawn
 
 
-def fork_instead(path, args, keep):
+def fork_instead(_, args, keep):
     """Start what Python's own would start as `python -c 'from multiprocessing.forkserver import main…'`."""
     command = args[-1] if isinstance(args[-1], str) else args[-1].decode()
     pid = os.fork()
@@ -59,7 +59,7 @@ def fork_instead(path, args, keep):
         return pid
     status = 1
     try:
-        for number in [int(name) for name in os.listdir("/proc/self/fd")]:
+        for number in [int(path.name) for path in Path("/proc/self/fd").iterdir()]:
             if number > 2 and number not in keep:
                 try:
                     os.close(number)
@@ -75,10 +75,10 @@ def fork_instead(path, args, keep):
 
 def main():
     """Take orders until there are no more."""
-    import laspy, lazrs, netCDF4, scipy.signal  # noqa: F401, E401
-    import station.service.worker  # noqa: F401
+    import laspy  # noqa: F401
 
-    import station.cli  # noqa: F401
+    import station.cli
+    import station.service.worker  # noqa: F401
 
     signal.signal(signal.SIGCHLD, signal.SIG_IGN)  # nobody here waits for them
     print("warm", flush=True)

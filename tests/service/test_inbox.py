@@ -132,7 +132,9 @@ def test_a_scan_to_be_done_again_goes_before_later_ones(make_inbox, drop, clock,
     drop(FIRST)
     inbox.look()
     clock.forward(60)
-    journal.stored(inbox.look().first.name, sha256="0", verdict="good", epoch="e", start_utc_s=0.0, revision=1)
+    journal.stored(
+        inbox.look().first.name, sha256="0", verdict="good", epoch="e", start_utc_s=0.0, revision=1
+    )
     drop(SECOND)
     for anew in (inbox, make_inbox()):  # also after a restart
         anew.look()

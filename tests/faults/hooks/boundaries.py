@@ -111,7 +111,7 @@ class _Rows(sqlite3.Connection):
 
 def _shown(target):
     """Name a file or descriptor in the data folder, without what differs from run to run; None elsewhere."""
-    path = os.readlink(f"/proc/self/fd/{target}") if isinstance(target, int) else os.fspath(target)
+    path = Path(f"/proc/self/fd/{target}").readlink() if isinstance(target, int) else Path(target)
     _, found, below = f"{path}/".partition("/data/")
     return re.sub(r"\.\d+\.part/$", ".part/", below) if found else None
 
