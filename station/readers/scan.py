@@ -229,7 +229,7 @@ def require_begun(start: datetime, now_s: float) -> None:
     if ahead_s > CLOCKS_AGREE_S:
         raise NotReadyError(
             f"begins at {start:%Y-%m-%d %H:%M:%S} UTC, {timedelta(seconds=round(ahead_s))} ahead of this"
-            " computer's clock: held back until then; is one of the two clocks wrong, or its name in local time?"
+            " computer's clock: held back until then; is one of the clocks wrong, or its name in local time?"
         )
 
 

@@ -11,6 +11,7 @@ import multiprocessing.util
 import os
 import signal
 import sys
+import traceback
 from multiprocessing import forkserver
 from pathlib import Path
 
@@ -90,6 +91,9 @@ def main():
                 be_service(json.loads(line))
             except SystemExit as ended:
                 status = ended.code or 0
+            except BaseException:
+                traceback.print_exc()
+                raise
             finally:
                 os._exit(status)
         print(pid, flush=True)

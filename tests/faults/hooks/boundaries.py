@@ -5,9 +5,9 @@ service is started by its command, by `warm.py` where it is forked. `FAULTS_PLAN
 
     steps     file; each boundary that any process crosses appends a record of 96 bytes to it
     kills     [[step, delay_s, whom], ...]: at that step or the first after it, so much later
-    once      whom to kill at every boundary that is not yet named in the file `died`; "" for nobody
-    died      file with the labels of boundaries where someone has died
-    full      [length, of]: the disk is full for so many of so many boundaries, as far as Python asks it
+    once      whom to kill at every boundary that is not yet named in the file `died`; "full": nobody dies,
+              but the disk is full there
+    died      file with the labels of boundaries where that has been
 
 `whom`: "child" (that decodes), "service" (its child must end by itself), "both" at once. A boundary is the
 moment before and the moment after each fsync, rename, link, new folder, deletion and commit.
@@ -97,9 +97,10 @@ class _Rows(sqlite3.Connection):
             if statement.lstrip().startswith(("UPDATE", "INSERT", "DELETE")):
                 self._last = f"{statement.split()[0]} {values[-1] if values else ''}"
             return super().execute(statement, values)
-        _cross(f"before commit {self._last}", full=sqlite3.OperationalError("database or disk is full"))
+        full = sqlite3.OperationalError("database or disk is full")
+        _cross(f"before commit {self._last}", full)
         told = super().execute(statement, values)
-        _cross(f"after commit {self._last}")
+        _cross(f"after commit {self._last}", full)
         return told
 
     def executemany(self, statement, rows):
@@ -131,9 +132,10 @@ def _cross(label, full=None):
             _kill(whom, 0.0, claim)
     if plan.get("once") and label not in _lines(plan["died"]):
         _write(plan["died"], f"{label}\n".encode())
-        _kill(plan["once"], 0.0, f"{plan['steps']}.once{step}")
-    if plan.get("full") and step % plan["full"][1] < plan["full"][0]:
-        raise full or OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), label)
+        if plan["once"] == "full" and label.split(" ", 2)[2]:  # without its data folder no service starts
+            raise full or OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), label)
+        if plan["once"] != "full":
+            _kill(plan["once"], 0.0, f"{plan['steps']}.once{step}")
 
 
 def _kill(whom, delay_s, claim):
