@@ -250,18 +250,7 @@ def test_a_full_disk_is_waited_out(write_site, start):
     (path.parent / "data" / "full").unlink()
     wait_for(lambda: stored(path) == [FIRST])
     wait_for(lambda: 'service="goes on"' in service.log())
-
-
-def test_after_a_fault_of_the_store_it_reconciles_again(write_site, start):
-    path = write_site(settle_s=0.0)
-    (path.parent / "data" / "full").touch()
-    drop(path, FIRST)
-    service = start(path)
-    wait_for(lambda: "service=paused" in service.log())
-    before = did(path).count("recover")
-    (path.parent / "data" / "full").unlink()
-    wait_for(lambda: stored(path) == [FIRST])
-    assert did(path).count("recover") > before
+    assert did(path).count("recover") > 1  # what was broken off between file and journal is made to agree
 
 
 def test_a_second_service_on_the_same_data_is_refused(write_site, start):
