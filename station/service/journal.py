@@ -9,7 +9,7 @@ from __future__ import annotations
 import json
 import sqlite3
 import time
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, fields
 from enum import StrEnum
 from typing import TYPE_CHECKING, NamedTuple, Self
@@ -183,7 +183,8 @@ class Journal:
                 attempts=0,
                 next_try_utc_s=None,
             )
-        self._note(name).unlink(missing_ok=True)
+        with suppress(OSError):  # it is stored all the same
+            self._note(name).unlink(missing_ok=True)
 
     def set_aside(self, name: str, reason: str, *, sha256: str | None = None, log_sha256: str = "") -> None:
         """Note that a scan cannot be used, and why, here and in `set_aside/<name>.txt`."""

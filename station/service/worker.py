@@ -121,7 +121,8 @@ class Worker:
         """Make journal and files agree: checksums are completed, lost rows made anew, the series is rebuilt.
 
         Epochs that are lost or damaged are redone where their scan is still in the inbox. One written just
-        before a power cut is found by `tasks.process` as the same and not stored twice.
+        before a power cut is found by `tasks.process` as the same and not stored twice. A reference that was
+        due is made now: what comes next is to be measured from it, as without the cut.
         """
         self._put_aside(self.run(unopened))
         self.seal()
@@ -129,6 +130,7 @@ class Worker:
         self._have_lost_done_again()
         if holds_epochs(self._series):
             self._mending(publish)
+        self._make_reference_when_due()
 
     def seal(self) -> None:
         """Note the checksums of files that have none; put aside those that cannot be read."""
@@ -260,6 +262,8 @@ class Worker:
         """Build the master surface once enough usable scans are stored; make a better one of ever more."""
         wanted, usable = self._site.reference.scans, self._usable()
         made = current(self._series)
+        if made and not isinstance(wanted, Path):
+            self._have_bare_done_again()
         chosen = scans_due(self._site, usable, len(made))
         if isinstance(wanted, Path) or not chosen or len(usable) < number_due(self._site, len(made)):
             return
@@ -284,6 +288,12 @@ class Worker:
         if not made:
             others = (row.name for row in self._journal.rows(State.STORED) if row.reference != version)
             self._journal.again(others)
+
+    def _have_bare_done_again(self) -> None:
+        """Redo what is stored without change: the power went between the reference and its first use."""
+        bare = [row.name for row in self._journal.rows(State.STORED) if not row.reference]
+        inbox = self._site.scans.inbox
+        self._journal.again(name for name in bare if name in self._taken or (inbox / name).is_file())
 
     def _arrival(self, name: str) -> Arrival | None:
         """Find a scan again: where it was taken from, in the inbox or in the archive."""
