@@ -244,6 +244,15 @@ class ServiceSection(Section):
     memory_gb: Annotated[float, Field(ge=0.5, le=1024)] = 5.0
 
 
+class ProductsSection(Section):
+    """What is made of every scan for people and other tools."""
+
+    page: bool = True
+    geotiff: bool = False
+    quicklook_width_px: Annotated[int, Field(ge=400, le=4000)] = 1200
+    change_limit_m: Positive | None = None
+
+
 class SiteFile(Section):
     """The whole file."""
 
@@ -261,6 +270,7 @@ class SiteFile(Section):
     reference: ReferenceSection = ReferenceSection()
     areas: AreasSection | None = None
     service: ServiceSection = ServiceSection()
+    products: ProductsSection = ProductsSection()
 
     @model_validator(mode="after")
     def _chain_is_complete(self) -> SiteFile:
@@ -317,6 +327,7 @@ class Site(SiteFile):
                 "path": True,
                 "service": True,
                 "station": True,
+                "products": True,
                 "areas": True,  # their series is made anew from the epochs
                 "scans": {"inbox", "settle_s", "expected_every_s", "polling", "timeout_s", "name"},
                 "sop": True,  # an epoch names the SOP it was made with

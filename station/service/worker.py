@@ -9,11 +9,12 @@ from pathlib import Path
 from typing import TypeVar
 
 from station.config import Site
-from station.errors import NotReadyError, ScanError
+from station.errors import NotReadyError, ScanError, StationError
 from station.service import child
 from station.service.inbox import Arrival
 from station.service.journal import Entry, Journal, State
 from station.service.logs import logfmt
+from station.service.show import show
 from station.service.tasks import (
     Outcome,
     Progress,
@@ -81,6 +82,7 @@ class Worker:
             figures=outcome.figures,
         )
         _say(arrival.name, outcome)
+        self._show()
         self._make_reference_when_due()
         return True
 
@@ -117,6 +119,14 @@ class Worker:
     def _set_aside(self, arrival: Arrival, error: ScanError) -> None:
         self._journal.set_aside(arrival.name, str(error))
         log.warning("%s", logfmt(scan=arrival.name, verdict="set_aside", reason=error))
+        self._show()
+
+    def _show(self) -> None:
+        """Bring the page up to what is stored; what fails there keeps no scan from the store."""
+        try:
+            self._run(show)
+        except (StationError, RuntimeError) as error:
+            log.warning("%s", logfmt(page="failed", reason=error))
 
     def _is_there(self, row: Entry) -> bool:
         """Tell whether a stored epoch still is: as itself, or joined into its day or month."""

@@ -1,0 +1,46 @@
+"""What is made of a scan for people and other tools, in a child process, from archive and journal."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+
+from station.config import Site
+from station.products.page import Told, write_page
+from station.service.health import status
+from station.service.journal import Journal, State
+from station.service.tasks import Progress, series_of
+
+
+def show(site: Site, progress: Progress) -> None:
+    """Bring the page up to what is stored, and write the newest change as GeoTIFF, as the site asks for.
+
+    Raises StoreError where something cannot be read or written.
+    """
+    progress()
+    wanted = site.products
+    if wanted.page:
+        series, folder = series_of(site), page_folder(site)
+        write_page(series, folder, _told(site), wanted.quicklook_width_px, wanted.change_limit_m, progress)
+
+
+def page_folder(site: Site) -> Path:
+    """Return the folder of the station's page."""
+    return site.station.data / "page"
+
+
+def _told(site: Site) -> Told:
+    found = status(site)
+    with Journal(site.station.data / "journal.sqlite", read_only=True) as journal:
+        stored = journal.rows(State.STORED)
+    seconds = ((Path(row.name).stem, row.figures.get("seconds")) for row in stored)
+    return Told(
+        name=site.station.name,
+        institution=site.station.institution,
+        written_s=round(time.time(), 1),
+        expected_every_s=site.scans.expected_every_s,
+        waiting=found["waiting"],
+        set_aside=found["set_aside"],
+        faults=found["faults"],
+        seconds={name: float(took) for name, took in seconds if isinstance(took, float | int)},
+    )
