@@ -46,7 +46,7 @@ def change_map(look: Look, caption: Caption, limit_m: float, width_px: int, sinc
     if seen.any():
         told = (
             f"median σ {_metres(float(np.median(look.sigma_m[seen])))} ·"
-            f" {100 * certain.sum() / seen.sum():.0f} % changed"
+            f" {100 * np.count_nonzero(certain) / np.count_nonzero(seen):.0f} % changed"
         )
     return _picture(painted, look, caption, scale, keys, told, width_px)
 
@@ -66,7 +66,8 @@ def points_map(look: Look, caption: Caption, width_px: int) -> Image.Image:
     """How many points the cells have, and which were not seen."""
     points = look.points if look.points is not None else np.full_like(look.change_m, np.nan)
     seen, known = np.isfinite(points), np.isfinite(look.base.shade)
-    told = f"{100 * np.count_nonzero(seen & known) / max(np.count_nonzero(known), 1):.0f} % of the known seen"
+    share = np.count_nonzero(seen & known) / (np.count_nonzero(known) or 1)
+    told = f"{100 * share:.0f} % of the known ground seen"
     scale = points_scale()
     return _picture(_over(look, seen, scale, points), look, caption, scale, (), told, width_px)
 

@@ -65,13 +65,13 @@ def _what_changed(site: Site, series: xr.Dataset, truth: xr.Dataset) -> Table:
     for name in ("scan", "measured, m", "± 1 σ, m", "true, m", "cells changed at 95 %"):
         table.add_column(name, justify="left" if name == "scan" else "right", no_wrap=True)
     for i, scan_id in enumerate(str(one) for one in series.scan_id.values):
-        measured_m, sigma_m, _ = found.mean_change(ice, found.row(i))
         seen = ice & np.isfinite(series.elevation_change[i].values)
+        measured = found.area(seen, found.row(i))
         true_m = (truth.change.values[in_truth.index(scan_id)] - zero)[seen].mean()
         certain = (series.quality[i].values[seen].astype(int) & Quality.CHANGE_SIGNIFICANT) > 0
         told = (
-            f"{measured_m:+.3f}",
-            f"{sigma_m:.3f}",
+            f"{measured.mean_m:+.3f}",
+            f"{measured.mean_sigma_m:.3f}",
             f"{true_m:+.3f}",
             f"{100 * certain.mean():.0f} %",
         )
