@@ -102,6 +102,29 @@ def look_at(row: Row, base: Base, *, points: bool = False) -> Look:
     return Look(base, change_m, sigma_m, mean_points)
 
 
+def look_between(row: Row, other: Row, base: Base, series: Series) -> Look:
+    """Read what changed from another epoch to one, with its sigma.
+
+    What both do not know of one reference surface cancels cell by cell; what each scan's cells share adds up.
+    Raises StoreError where a file cannot be read.
+    """
+    where = base.rows, base.columns, base.factor
+    with _opened(series.folder / f"reference_{base.version}.nc") as file:
+        surface = file["reference_random_uncertainty"]
+        (_, before_m2), known = _sums([surface, surface], None, *where)
+    total_m2 = np.zeros(base.shade.shape, np.float32)
+    change_m = []
+    for one in (row, other):
+        with _opened(one.path) as file:
+            sums, count = _sums([file[name] for name in (CHANGE, SIGMA, RANDOM)], one.index, *where)
+        with np.errstate(invalid="ignore", divide="ignore"):
+            change_m.append(sums[0] / count)
+            own_m2 = np.maximum(sums[2] / count - before_m2 / known, 0) / count
+            total_m2 += own_m2 + np.maximum(sums[1] - sums[2], 0) / count
+    difference_m = change_m[0] - change_m[1]
+    return Look(base, difference_m, np.where(np.isfinite(difference_m), np.sqrt(total_m2), np.nan), None)
+
+
 def _means(file: Any, index: int, base: tuple[slice, slice, int]) -> tuple[Floats32, Floats32]:  # noqa: ANN401 - h5py has no types
     """Mean change of blocks of cells and its sigma: what they share is taken as one within a block."""
     (total, sigma_m2, random_m2), count = _sums(
@@ -125,15 +148,15 @@ def _sums(
     for top in range(0, ny, max(1, BAND_ROWS // factor)):
         bottom = min(top + max(1, BAND_ROWS // factor), ny)
         band = slice(rows.start + top * factor, rows.start + bottom * factor)
-        for variable, total in zip(variables, sums, strict=True):
+        for place, (variable, total) in enumerate(zip(variables, sums, strict=True)):
             values = _read(variable, index, band, columns)
-            if variable is variables[0]:
+            if place == 0:
                 seen = values < FILL / 2
                 if not seen.any():
                     break
                 count[top:bottom] = _blocks(seen.astype(np.float32), factor)
             values *= seen
-            if variable is not variables[0]:
+            if place > 0:
                 values *= values
             total[top:bottom] = _blocks(values, factor)
     return sums, count

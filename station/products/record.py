@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import netCDF4
 import numpy as np
 
+from station.archive.areas import AREA_VARIABLES
 from station.archive.layout import Series, strings
 from station.archive.variables import VERDICTS
 from station.errors import StoreError
@@ -59,7 +60,7 @@ def read_record(series: Series) -> Record:
 
 
 def read_areas(series: Series) -> list[AreaRecord]:
-    """Read all areas from `areas.nc`; none where there is no such file."""
+    """Read all areas from `areas.nc`; none where there is no such file, or one of an older version."""
     path = series.folder / "areas.nc"
     if not path.is_file():
         return []
@@ -68,7 +69,9 @@ def read_areas(series: Series) -> list[AreaRecord]:
             start_s = np.asarray(file["time_bnds"][:, 0], dtype=np.float64)
             names = [str(name) for name in file["area_name"][:]]
             size_m2 = _column(file["area_size"])
-            over_time = [name for name, one in file.variables.items() if one.dimensions == ("time", "area")]
+            over_time = [row.name for row in AREA_VARIABLES if row.dims == ("time", "area")]
+            if not set(over_time) <= set(file.variables):
+                return []
             columns = {name: _column(file[name]) for name in over_time}
     except (OSError, RuntimeError, KeyError, IndexError) as error:
         raise StoreError(f"{path}: cannot be read: {error}") from error

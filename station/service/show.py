@@ -6,6 +6,7 @@ import time
 from pathlib import Path
 
 from station.config import Site
+from station.products.export import export
 from station.products.page import Told, write_page
 from station.service.health import status
 from station.service.journal import Journal, State
@@ -22,6 +23,8 @@ def show(site: Site, progress: Progress) -> None:
     if wanted.page:
         series, folder = series_of(site), page_folder(site)
         write_page(series, folder, _told(site), wanted.quicklook_width_px, wanted.change_limit_m, progress)
+    if wanted.geotiff and (site.station.data / "reference.nc").is_file():
+        export(site, "geotiff", None, site.station.data / "geotiff")
 
 
 def page_folder(site: Site) -> Path:
