@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import time
+import zipfile
 from collections.abc import Callable
 from dataclasses import dataclass
 from datetime import datetime, timedelta
@@ -150,7 +151,7 @@ def kept_base(series: Series, folder: Path, version: str, pixels: int) -> Base:
     path = folder / f".terrain_{version}_{pixels}.npz"
     grid = series.grid
     try:
-        with np.load(path, allow_pickle=False) as file:
+        with path.open("rb") as raw, np.load(raw, allow_pickle=False) as file:
             if np.array_equal(file["grid"], [grid.west_m, grid.north_m, grid.cell_m, grid.nx, grid.ny]):
                 top, bottom, left, right, factor = (int(n) for n in file["part"])
                 west_m, north_m, cell_m = (float(n) for n in file["place"])
@@ -159,7 +160,7 @@ def kept_base(series: Series, folder: Path, version: str, pixels: int) -> Base:
                 part = Grid(west_m, north_m, cell_m, nx, ny)
                 rows, columns = slice(top, bottom), slice(left, right)
                 return Base(version, factor, rows, columns, shade.astype(np.float32), part)
-    except (OSError, ValueError, KeyError):
+    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile):
         pass  # not there yet, or damaged: made anew
     base = base_of(series, version, pixels)
     shade = np.where(np.isfinite(base.shade), 1 + 254 * np.nan_to_num(base.shade), 0).round().astype(np.uint8)

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from PIL import Image, ImageDraw, ImageFont
+from PIL import Image, ImageDraw, ImageFont, ImageOps
 
 from station.products.colours import Pixels, Scale, change_scale, points_scale, sigma_scale
 from station.products.look import Look
@@ -17,7 +17,8 @@ from station.quantities import Bools
 
 ASSETS = Path(__file__).parent / "assets"
 MOST_BYTES = 150_000  # of a map: ten seconds at 128 kbit/s
-QUALITIES = (82, 70, 55, 40, 25)  # of lossy WebP, the first that is small enough
+# Quality of lossy WebP, and how much smaller the picture: the first that is small enough.
+WORSE = ((82, 1.0), (65, 1.0), (45, 1.0), (25, 1.0), (40, 0.7), (40, 0.5))
 TALLEST = 1.1  # a map is as high as the picture is wide, and no more
 PAPER, INK, FAINT = (250, 250, 248), (30, 33, 38), (105, 110, 118)
 UNSEEN, MUTED = (216.0, 40.0), (128.0, 84.0)  # grey of terrain in the shade, and how much light adds
@@ -83,10 +84,11 @@ def encoded(picture: Image.Image, most_bytes: int = MOST_BYTES) -> bytes:
         quality=20,
         method=1,
     )
-    for quality in QUALITIES:
+    for quality, size in WORSE:
         if len(found) <= most_bytes:
             break
-        found = _webp(picture, quality=quality, method=2)
+        less = picture if size == 1 else ImageOps.scale(picture, size, Image.Resampling.BOX)
+        found = _webp(less, quality=quality, method=2)
     return found
 
 

@@ -28,7 +28,7 @@ STATIC = {  # what each is made of; one style sheet is one round trip
     "uplot.js": ("uplot.js",),
     "icon.svg": ("icon.svg",),
 }
-POINTS = 300  # of a curve; of a longer series every nth, up to the newest
+POINTS = 250  # of a curve; of a longer series every nth, up to the newest
 MOST_AREAS = 8  # with a curve, so that the page stays light
 TABLE_ROWS = 24
 LISTED = 20  # of what waits or is set aside
@@ -75,6 +75,7 @@ def write_page(
         "expected_every_s": told.expected_every_s,
         "station": series.station_id,
         "maps": [{"time_s": one.start.timestamp(), "file": one.file} for one in gallery.change],
+        "area_time_s": _numbers(areas[0].start_s[_picked(len(areas[0].start_s))], 0) if areas else [],
         "areas": [_area(area) for area in areas],
         "health": _health(record, told) if record is not None else None,
     }
@@ -112,14 +113,14 @@ def _picked(count: int) -> slice:
 
 
 def _numbers(values: Floats, digits: int) -> list[float | None]:
-    return [round(float(one), digits) if np.isfinite(one) else None for one in values]
+    told = (round(float(one), digits) if np.isfinite(one) else None for one in values)
+    return [int(one) if one is not None and not digits else one for one in told]
 
 
 def _area(area: AreaRecord) -> dict[str, Any]:
     few = _picked(len(area.start_s))
     return {
         "name": area.name,
-        "time_s": _numbers(area.start_s[few], 0),
         "mean_m": _numbers(area.columns["mean_change"][few], 4),
         "sigma_m": _numbers(area.columns["mean_change_uncertainty"][few], 5),
     }

@@ -160,7 +160,7 @@
     if (areas) areas.replaceChildren();
     health.replaceChildren();
     for (const area of data.areas) {
-      curve(areas, `${area.name}: mean change since the reference, m`, area.time_s, [
+      curve(areas, `${area.name}: mean change since the reference, m`, data.area_time_s, [
         { values: area.mean_m, half: area.sigma_m.map((s) => s == null ? null : 1.959964 * s), digits: 3 }]);
     }
     if (data.health) drawHealth(health, data.health);
