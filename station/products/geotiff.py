@@ -52,7 +52,6 @@ def _write(path: Path, series: Series, values: Any, told: str, tags: dict[str, s
         import rasterio  # noqa: PLC0415 - an extra
         from rasterio.io import MemoryFile  # noqa: PLC0415
         from rasterio.shutil import copy  # noqa: PLC0415
-        from rasterio.transform import from_origin  # noqa: PLC0415
     except ImportError as error:
         raise StationError("GeoTIFF needs rasterio: pip install 'tls-station[export]'") from error
     grid = series.grid
@@ -63,7 +62,7 @@ def _write(path: Path, series: Series, values: Any, told: str, tags: dict[str, s
         "height": grid.ny,
         "width": grid.nx,
         "crs": series.crs,
-        "transform": from_origin(grid.west_m, grid.north_m, grid.cell_m, grid.cell_m),
+        "transform": rasterio.Affine(grid.cell_m, 0, grid.west_m, 0, -grid.cell_m, grid.north_m),
         "nodata": float("nan"),
     }
     try:

@@ -79,7 +79,7 @@ def encoded(picture: Image.Image, most_bytes: int = MOST_BYTES) -> bytes:
     Cells larger than a pixel are small and quick so; a field of single noisy pixels is not.
     """
     found = _webp(
-        picture.quantize(256, Image.Quantize.FASTOCTREE, dither=Image.Dither.NONE).convert("RGB"),
+        picture.quantize(256, Image.Quantize.MAXCOVERAGE, dither=Image.Dither.NONE).convert("RGB"),
         lossless=True,
         quality=20,
         method=1,

@@ -104,7 +104,7 @@ def plot_film(
     times = [FRAME_MS] * (len(frames) - 1) + [LAST_FRAME_MS]
     if out.suffix == ".gif":
         frames = [
-            frame.quantize(256, Image.Quantize.FASTOCTREE, dither=Image.Dither.NONE) for frame in frames
+            frame.quantize(256, Image.Quantize.MAXCOVERAGE, dither=Image.Dither.NONE) for frame in frames
         ]
     frames[0].save(out, save_all=True, append_images=frames[1:], duration=times, loop=0, quality=70, method=2)
     return out

@@ -1,6 +1,7 @@
 """A small store with a reference: change known cell by cell, names that a page must not take for markup."""
 
 import json
+import shutil
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -103,18 +104,26 @@ def fill(series, site, hours):
     update_areas(series, areas, Aggregates(series), lambda: None)
 
 
-@pytest.fixture
-def site(tmp_path):
-    """A site with six epochs in its store."""
-    (tmp_path / "inbox").mkdir()
-    (tmp_path / "site.toml").write_text(SITE.format(evil=EVIL))
+@pytest.fixture(scope="session")
+def stored(tmp_path_factory):
+    """A folder with a site file and six epochs in its store."""
+    folder = tmp_path_factory.mktemp("stored")
+    (folder / "inbox").mkdir()
+    (folder / "site.toml").write_text(SITE.format(evil=EVIL))
     boxes = [box("rises", 632050, 5185850, 632200, 5185950), box(EVIL, 632300, 5185650, 632500, 5185800)]
-    (tmp_path / "areas.geojson").write_text(json.dumps({"type": "FeatureCollection", "features": boxes}))
-    site = read_site(tmp_path / "site.toml")
+    (folder / "areas.geojson").write_text(json.dumps({"type": "FeatureCollection", "features": boxes}))
+    site = read_site(folder / "site.toml")
     series = Series(site.station.data, "hef", GRID, "EPSG:32632", name=EVIL)
     write_reference(series, make_reference())
     fill(series, site, range(6))
-    return site
+    return folder
+
+
+@pytest.fixture
+def site(stored, tmp_path):
+    """A site of its own."""
+    shutil.copytree(stored, tmp_path, dirs_exist_ok=True)
+    return read_site(tmp_path / "site.toml")
 
 
 @pytest.fixture

@@ -73,7 +73,7 @@ def test_hostile_names_are_text(write, small):
     assert all(attributes["src"].startswith("maps/hef_2025") for attributes in images)
     assert not any(name.startswith("on") or name == "style" for _, one in html.found for name in one)
     scripts = [attributes["src"] for tag, attributes in html.found if tag == "script"]
-    assert scripts == ["data.js", "uplot.js", "page.js"]
+    assert scripts == ["data.js", "page.js", "uplot.js"]
     # Station, title, area, scan, its verdict's reason, what waits, what is set aside.
     assert html.text.count(small.EVIL) >= 7
     assert "Institute of <Tests>" in html.text

@@ -184,7 +184,7 @@
     curve(health, "Air pressure, hPa", t, [{ values: h.air_pressure, digits: 1 }]);
     curve(health, "Time a scan took, s", t, [{ values: h.seconds, digits: 1 }]);
   }
-  draw();
+  addEventListener("DOMContentLoaded", draw);  // when the last script is there; lamp and map do not wait for it
   matchMedia("(prefers-color-scheme: dark)").addEventListener("change", draw);
   let width = innerWidth;
   addEventListener("resize", () => {
