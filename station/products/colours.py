@@ -89,6 +89,14 @@ def _colours(hexed: str) -> Pixels:
     return np.frombuffer(bytes.fromhex(hexed), np.uint8).reshape(-1, 3)
 
 
+def palette() -> Pixels:
+    """Return up to 256 colours (k, 3) that all maps can do with: greys that stay grey, scales in light."""
+    greys = np.repeat(np.linspace(96, 252, 40).round()[:, None], 3, axis=1)
+    lit = [np.minimum(_colours(_VIK) * light, 255) for light in (0.86, 0.93, 1.0, 1.05)]
+    words = [(250, 250, 248), (30, 33, 38), (70, 72, 76), (105, 110, 118), (158, 60, 0), (203, 155, 125)]
+    return np.vstack([greys, *lit, _colours(_LAJOLLA), _colours(_DAVOS), words]).round().astype(np.uint8)
+
+
 def round_up(value: float) -> float:
     """Return the next of 0.1, 0.2, 0.5, 1, 2, 5 and so on."""
     decade = 10.0 ** np.floor(np.log10(value))

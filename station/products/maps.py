@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont, ImageOps
 
-from station.products.colours import Pixels, Scale, change_scale, points_scale, sigma_scale
+from station.products.colours import Pixels, Scale, change_scale, palette, points_scale, sigma_scale
 from station.products.look import Look
 from station.quantities import Bools
 
@@ -74,22 +74,24 @@ def points_map(look: Look, caption: Caption, width_px: int) -> Image.Image:
 
 
 def encoded(picture: Image.Image, most_bytes: int = MOST_BYTES) -> bytes:
-    """Return a picture as WebP: crisp in 256 colours where that is small enough, else as good as it may be.
+    """Return a picture as WebP: crisp in few colours where that is small enough, else as good as it may be.
 
     Cells larger than a pixel are small and quick so; a field of single noisy pixels is not.
     """
-    found = _webp(
-        picture.quantize(256, Image.Quantize.MAXCOVERAGE, dither=Image.Dither.NONE).convert("RGB"),
-        lossless=True,
-        quality=20,
-        method=1,
-    )
+    found = _webp(few_colours(picture).convert("RGB"), lossless=True, quality=20, method=1)
     for quality, size in WORSE:
         if len(found) <= most_bytes:
             break
         less = picture if size == 1 else ImageOps.scale(picture, size, Image.Resampling.BOX)
         found = _webp(less, quality=quality, method=2)
     return found
+
+
+def few_colours(picture: Image.Image) -> Image.Image:
+    """Return a picture in the colours of all maps."""
+    with_colours = Image.new("P", (1, 1))
+    with_colours.putpalette(palette().tobytes())
+    return picture.quantize(palette=with_colours, dither=Image.Dither.NONE)
 
 
 def _webp(picture: Image.Image, **how: Any) -> bytes:  # noqa: ANN401 - as Pillow takes them

@@ -17,7 +17,7 @@ from station.errors import StationError
 from station.products.areas import PREVIOUS, REFERENCE, AreaLine, Span, epoch
 from station.products.gallery import default_limit
 from station.products.look import Base, Look, base_of, look_at, look_between
-from station.products.maps import Caption, change_map, points_map, sigma_map
+from station.products.maps import Caption, change_map, few_colours, points_map, sigma_map
 from station.products.record import Record, read_record
 
 if TYPE_CHECKING:
@@ -103,9 +103,7 @@ def plot_film(
     frames = [_drawn(album, look_at(row, base), row, "change", "the reference") for row in each(chosen)]
     times = [FRAME_MS] * (len(frames) - 1) + [LAST_FRAME_MS]
     if out.suffix == ".gif":
-        frames = [
-            frame.quantize(256, Image.Quantize.MAXCOVERAGE, dither=Image.Dither.NONE) for frame in frames
-        ]
+        frames = [few_colours(frame) for frame in frames]
     frames[0].save(out, save_all=True, append_images=frames[1:], duration=times, loop=0, quality=70, method=2)
     return out
 

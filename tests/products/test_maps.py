@@ -124,6 +124,19 @@ def test_sigma_and_points_have_their_maps(series, last, small):
         assert np.ptp(cell_colour(picture, 10, 10)) > 20
 
 
+def test_what_is_sent_keeps_grey_grey_and_colours_near(series, last):
+    """In few colours: nothing grey takes a tint that could be read as a change."""
+    look = look_at(last, base_of(series, "1", WIDTH))
+    picture = change_map(look, CAPTION, 0.5, WIDTH, "the reference")
+    with Image.open(io.BytesIO(encoded(picture))) as sent:
+        told, wanted = (np.asarray(one.convert("RGB"), dtype=int) for one in (sent, picture))
+    grey = np.ptp(wanted, axis=-1) == 0
+    assert grey.sum() > 10_000
+    assert np.ptp(told[grey], axis=-1).max() <= 3
+    assert np.abs(told - wanted).mean() < 4
+    assert np.percentile(np.abs(told - wanted), 99) < 25
+
+
 def test_scales_are_fixed_and_even():
     scale = change_scale(0.5, "the reference")
     colours = scale.paint(np.array([-9.0, -0.5, 0.0, 0.5, 9.0], np.float32)).astype(int)
