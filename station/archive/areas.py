@@ -81,7 +81,7 @@ def update_areas(
     if not found:
         return None
     path = series.folder / "areas.nc"
-    masks = _fingerprint(series, areas)
+    masks = fingerprint(series, areas)
     known = _read(path, masks, len(areas))
     place = {key: index for index, key in enumerate(_keys(known))}
     at = [place.get((row.time_s, row.epoch_file), LACKING) for row in found]
@@ -101,12 +101,21 @@ def update_areas(
     return path
 
 
-def _fingerprint(series: Series, areas: dict[str, Bools]) -> str:
+def fingerprint(series: Series, areas: dict[str, Bools]) -> str:
     """Identify areas by their names, their order and their cells, and the grid these are of."""
     told = hashlib.sha256(json.dumps([astuple(series.grid), list(areas)]).encode())
     for cells in areas.values():
         told.update(np.packbits(cells).tobytes())
     return told.hexdigest()
+
+
+def is_of(path: Path, series: Series, areas: dict[str, Bools]) -> bool:
+    """Tell whether a file holds the series of just these areas."""
+    try:
+        with h5py.File(path, "r") as file:
+            return bool(file.attrs[MASKS] == np.bytes_(fingerprint(series, areas)))
+    except (OSError, RuntimeError, KeyError):
+        return False
 
 
 def _blank(times: int, areas: int) -> Columns:

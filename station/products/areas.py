@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from station.archive.aggregate import Aggregates
-from station.archive.areas import figures
+from station.archive.areas import figures, is_of
 from station.archive.layout import Series
 from station.archive.store import Row, rows, series_in
 from station.config import Site
@@ -104,11 +104,15 @@ def area_lines(
     file = polygons or (site.areas.file if site.areas else None)
     if file is None:
         raise ConfigError("no areas: name a GeoJSON of polygons, or give [areas] file in the site file")
-    if polygons is None and against == REFERENCE and (kept := read_areas(series)):
-        yield from _kept(kept, span)
-        return
     areas = {name: mask(one, series.grid) for name, one in read_polygons(file, site.map.crs).items()}
-    yield from _computed(series, areas, span, against, each)
+    if (
+        against == REFERENCE
+        and is_of(series.folder / "areas.nc", series, areas)
+        and (kept := read_areas(series))
+    ):
+        yield from _kept(kept, span)
+    else:
+        yield from _computed(series, areas, span, against, each)
 
 
 def _kept(kept: list[AreaRecord], span: Span) -> Iterator[AreaLine]:

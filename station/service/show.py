@@ -9,7 +9,7 @@ from station.config import Site
 from station.products.export import export
 from station.products.page import Told, write_page
 from station.service.health import status
-from station.service.journal import Journal, State
+from station.service.journal import Journal
 from station.service.tasks import Progress, series_of
 
 
@@ -35,15 +35,14 @@ def page_folder(site: Site) -> Path:
 def _told(site: Site) -> Told:
     found = status(site)
     with Journal(site.station.data / "journal.sqlite", read_only=True) as journal:
-        stored = journal.rows(State.STORED)
-    seconds = ((Path(row.name).stem, row.figures.get("seconds")) for row in stored)
+        seconds = journal.seconds()
     return Told(
         name=site.station.name,
         institution=site.station.institution,
         written_s=round(time.time(), 1),
         expected_every_s=site.scans.expected_every_s,
         waiting=found["waiting"],
-        set_aside=found["set_aside"],
+        set_aside=sorted(found["set_aside"], key=lambda one: str(one["since"])),
         faults=found["faults"],
-        seconds={name: float(took) for name, took in seconds if isinstance(took, float | int)},
+        seconds={Path(name).stem: took for name, took in seconds.items()},
     )

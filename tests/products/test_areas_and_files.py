@@ -48,6 +48,18 @@ def test_a_polygon_given_afterwards_says_what_areas_nc_does(site, later):
         assert one.figures["coverage"] < 1  # it has voids
 
 
+def test_areas_nc_of_other_polygons_is_not_believed(site, small):
+    """The owner drew the area anew; the service has not come to it yet."""
+    moved = [
+        small.box("rises", 632300, 5185650, 632500, 5185800),
+        small.box(small.EVIL, 632300, 5185650, 632500, 5185800),
+    ]
+    site.areas.file.write_text(json.dumps({"type": "FeatureCollection", "features": moved}))
+    told = list(area_lines(site, None, ALL, "reference"))[-2:]
+    assert told[0].figures == told[1].figures
+    assert told[0].figures["mean_change"] == pytest.approx(-0.30, abs=0.01)
+
+
 def test_any_two_epochs(site, later):
     """It rises by 5 cm an hour; σ by `station.variance` where nothing is interpolated."""
     hourly = [one for one in area_lines(site, later, ALL, "previous") if one.area == "rises"]

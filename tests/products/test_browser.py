@@ -121,6 +121,13 @@ def test_the_page_works_says_names_as_text_and_asks_nobody_else(tab, address):
         return n; })()"""
     assert tab.run(band) > 200
 
+    # The same numbers as a table.
+    tab.run("document.querySelector('#area-curves details').open = true")
+    rows = tab.await_("document.querySelectorAll('#area-curves tbody tr').length")
+    assert rows == tab.run("STATION.area_time_s.length")
+    newest = tab.run("document.querySelector('#area-curves tbody tr').textContent").replace("−", "-")
+    assert f"{tab.run('STATION.areas[0].mean_m.at(-1)'):.3f}" in newest
+
     # A hostile name is text, everywhere.
     assert tab.run("document.querySelector('h1').textContent") == EVIL
     assert EVIL in tab.run("document.title")

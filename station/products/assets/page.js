@@ -91,14 +91,46 @@
   const paint = (name) => getComputedStyle(document.documentElement).getPropertyValue(name).trim();
   const figures = (value, digits) => value == null ? "–" : value.toFixed(digits).replace("-", "−");
 
+  const cell = (row, tag, text) => row.appendChild(document.createElement(tag)).textContent = text;
+
+  // The same numbers for those who do not see the curve, newest first; made when asked for.
+  function table(heading, time_s, lines) {
+    const fold = document.createElement("details");
+    fold.appendChild(document.createElement("summary")).textContent = "As a table";
+    fold.addEventListener("toggle", () => {
+      if (fold.querySelector("table")) return;
+      const wide = fold.appendChild(document.createElement("div"));
+      wide.className = "wide high";
+      wide.tabIndex = 0;
+      const made = wide.appendChild(document.createElement("table"));
+      made.createCaption().textContent = heading;
+      const top = made.createTHead().insertRow(), body = made.createTBody();
+      cell(top, "th", "time, UTC");
+      for (const line of lines) {
+        cell(top, "th", line.label || "value");
+        if (line.half) cell(top, "th", "±");
+      }
+      for (let i = time_s.length - 1; i >= 0; i--) {
+        const row = body.insertRow();
+        cell(row, "th", utc(time_s[i]));
+        for (const line of lines) {
+          cell(row, "td", figures(line.values[i], line.digits));
+          if (line.half) cell(row, "td", figures(line.half[i], line.digits));
+        }
+      }
+      for (const one of made.querySelectorAll("th")) one.scope = one.closest("thead") ? "col" : "row";
+    });
+    return fold;
+  }
+
   function curve(parent, heading, time_s, lines, band) {
     if (!time_s.length || !lines.some((line) => line.values.some((v) => v != null))) return;
     const card = document.createElement("div"), head = document.createElement("h3");
     const told = document.createElement("p"), place = document.createElement("div");
     card.className = "curve";
     head.textContent = heading;
-    card.append(head, told, place);
-    card.setAttribute("role", "img");
+    card.append(head, told, place, table(heading, time_s, lines));
+    place.setAttribute("role", "img");
     parent.append(card);
     const last = time_s.length - 1;
     const say = (index) => {
@@ -108,7 +140,7 @@
         (line.half && line.half[i] != null ? ` ± ${figures(line.half[i], line.digits)}` : "")).join(", ");
     };
     say(null);
-    card.setAttribute("aria-label", `${heading}. Newest, ${told.textContent}`);
+    place.setAttribute("aria-label", `${heading}. Newest, ${told.textContent}`);
     const rows = [time_s], series = [{}], bands = [];
     for (const line of lines) {
       const colour = paint(line.colour || "--accent");
