@@ -78,6 +78,7 @@ class ScannerSection(Section):
     range_sigma_m: Annotated[float, Field(gt=0, le=1)]
     angle_resolution_deg: Annotated[float, Field(ge=0, le=1)]
     inclination_sigma_deg: Annotated[float, Field(gt=0, le=1)]
+    inclination_range_deg: Annotated[float, Field(gt=0, le=90)]
     range_max_m: Positive
 
     @model_validator(mode="before")
@@ -306,6 +307,7 @@ class Site(SiteFile):
             range_sigma_m=given.range_sigma_m,
             angle_resolution_rad=math.radians(given.angle_resolution_deg),
             inclination_sigma_rad=math.radians(given.inclination_sigma_deg),
+            inclination_range_rad=math.radians(given.inclination_range_deg),
             range_max_m=given.range_max_m,
         )
 

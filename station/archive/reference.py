@@ -49,6 +49,7 @@ _ROWS = (
         "reference_stable", ("y", "x"), "i1", "ground found stable: steep and without change", None, None,
         flag_values=(0, 1), flag_meanings="other stable",
     ),
+    Variable("reference_seen", ("y", "x"), "f4", "share of the scans that saw the cell", "1", None, 3),
     Variable(
         "shared_parameter_noise_variance", ("parameter",), "f8",
         "variance of the lean of each group of scan lines beyond the parameter",
@@ -81,6 +82,7 @@ def write_reference(series: Series, reference: Reference) -> None:
             "reference_variance_factor": reference.variance_factor,
             "reference_intensity": reference.intensity,
             "reference_stable": reference.stable.astype(np.int8),
+            "reference_seen": reference.seen,
         }
         for row in _ROWS:
             if any(dim not in file.dimensions for dim in row.dims):
@@ -108,6 +110,18 @@ def read_reference(series: Series, version: str | None = None) -> Reference | No
         with netCDF4.Dataset(path) as file:
             return _read(file, series)
     except (OSError, RuntimeError, KeyError, IndexError) as error:
+        raise StoreError(f"{path}: cannot be read: {error}") from error
+
+
+def read_habits(series: Series) -> Habits:
+    """Read what the newest reference says of the station's habits; start values where there is none."""
+    path = series.folder / "reference.nc"
+    if not path.is_file():
+        return Habits()
+    try:
+        with netCDF4.Dataset(path) as file:
+            return _habits(file)
+    except (OSError, RuntimeError, AttributeError) as error:
         raise StoreError(f"{path}: cannot be read: {error}") from error
 
 
@@ -140,10 +154,13 @@ def _read(file: netCDF4.Dataset, series: Series) -> Reference:
         intensity=np.asarray(file["reference_intensity"][:].filled(np.nan), dtype=np.float32),
         variance_factor=np.asarray(file["reference_variance_factor"][:].filled(1.0), dtype=np.float32),
         stable=np.asarray(file["reference_stable"][:]) == 1,
-        habits=Habits(
-            **{field.name: float(file.getncattr(f"{HABIT}{field.name}")) for field in fields(Habits)}
-        ),
+        seen=np.asarray(file["reference_seen"][:].filled(np.nan), dtype=np.float32),
+        habits=_habits(file),
     )
+
+
+def _habits(file: netCDF4.Dataset) -> Habits:
+    return Habits(**{field.name: float(file.getncattr(f"{HABIT}{field.name}")) for field in fields(Habits)})
 
 
 def _squared(variable: netCDF4.Variable[Any]) -> Floats32:

@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy import linalg, sparse
 
-from station.quantities import Bools, Floats, Habits, Shared
+from station.quantities import Bools, Floats, Shared
 from station.science.patches import CHI2_MEDIAN, Kind, Patches
 from station.science.shared import GLOBAL, Basis, Sensitivities, by_knots, lines_from_knots
 
@@ -21,8 +21,6 @@ ROUNDS = 8
 SETTLED_M = 0.0001  # a round that moves the patches by less is the last
 ROUNDS_TRUSTING = 2  # until the scatter is known: else whole lines are left out that moving ground pulls away
 TRUSTED = 0.1  # weight of a patch that has not been left out
-MOST_REFUSED = 0.3  # of the stable ground, before an adjustment is doubted
-MOVED_SIGMAS = 4.0  # of what the station does from scan to scan
 TUKEY = 4.685  # 95 % efficient for normal errors
 SCATTER_M = (0.002, 0.02)  # least and most that stable patches differ by beyond their cells' random errors
 SCATTER_MOST_M = 1.0  # the same of moving ones
@@ -30,9 +28,12 @@ TOGETHER_MOST = 40.0  # patches of moving ground that are wrong as one
 CHANGE_AZIMUTH_KNOTS = 4  # knots of the lean, between knots of the change
 CHANGE_STRETCHES = 3  # of range, between knots of the change
 CHANGE_STEPS_M = tuple(float(step) for step in np.geomspace(0.0005, 0.5, 11))
-UNIFORM_CHANGE = 3.0  # one sigma of what all the moving ground changes by, in steps of a knot's
+UNIFORM_CHANGE = 1.0  # one sigma of what all the moving ground changes by, in steps of a knot's
 # The same of what neighbours change by alike, and after how many knots in azimuth and range it no longer is.
 ALIKE_CHANGES = (0.0, 1.0, 3.0, 10.0)
+# Log odds against the same: smooth errors of the air look like it too, but speak for it with tens at most, a
+# smooth snowfall with hundreds.
+ALIKE_ODDS = (0.0, 0.0, 12.0, 24.0)
 ALIKE_AZIMUTH_KNOTS, ALIKE_RANGE_KNOTS = 10.0, 6.0
 
 
@@ -78,26 +79,6 @@ class Adjustment:
     def shared(self) -> Shared:
         """The same by knots, for the store."""
         return by_knots(self.of, self.estimate, self.covariance)
-
-
-def distrust(found: Adjustment, habits: Habits) -> list[str]:
-    """Say what speaks against an adjustment: nothing stable to hold on to, or unusual motion."""
-    reasons = []
-    if not len(found.stable_weight):
-        reasons.append("no stable ground seen")
-    elif found.refused > MOST_REFUSED:
-        reasons.append(f"stable ground disagrees with itself: {found.refused:.0%} of it left out")
-    tilt_rad = float(np.hypot(*found.estimate[:2]))
-    if tilt_rad > MOVED_SIGMAS * habits.tilt_rad:
-        reasons.append(f"scanner leans {np.degrees(tilt_rad):.3f} degree from its SOP: moved?")
-    for name, place, habit, unit in (
-        ("turned", slice(2, 3), habits.heading_rad, "rad"),
-        ("shifted", slice(3, 6), habits.translation_m, "m"),
-    ):
-        size = float(np.linalg.norm(found.estimate[place]))
-        if size > MOVED_SIGMAS * habit:
-            reasons.append(f"scanner {name} by {size:.2g} {unit} against its SOP: moved?")
-    return reasons
 
 
 def turned(felt: Sensitivities, assumed_rad: Floats) -> Floats:
@@ -289,7 +270,8 @@ def _solve(normal: Floats, right: Floats, size: int, changes: _Changes) -> _Solv
         change = _Factored(reduced + changes.precision[alike] / step_m**2)
         change_m = change.solve(told)
         spread = (change.log_determinant() + changes.log_determinant[alike]) / 2 + len(told) * np.log(step_m)
-        found.append((float(told @ change_m / 2 - spread), (alike, step), change_m, change))
+        odds = float(told @ change_m / 2 - spread) - ALIKE_ODDS[alike]
+        found.append((odds, (alike, step), change_m, change))
     _, place, change_m, change = max(found, key=lambda one: one[0])
     estimate = np.concatenate([state.solve(right[:size]) + across @ change_m, change_m])
     step_m = CHANGE_STEPS_M[place[1]] * float(np.hypot(1.0, ALIKE_CHANGES[place[0]]))

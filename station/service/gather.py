@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import math
 from dataclasses import asdict, dataclass
 from datetime import datetime, timedelta
 from pathlib import Path
@@ -24,8 +25,11 @@ from station.science import inclination, pose, prior, shared
 from station.science.air import air_correction, standard_air
 from station.science.inclination import LEVEL, Cycle, Lean
 
-MOST_OF_THE_SCAN = 0.8  # of its time a log must cover to be the scan's log
+MOST_OF_THE_SCAN = 0.97  # of its time a log covers, unless it is late or short
 FEWEST_ROWS = 20  # of a log that is worth filtering
+PEGGED_MOST = 0.1  # of a log, at the end of its sensor's range
+LATE_S = 4.0  # of a log's clock, and so many sigmas, before it is told
+LATE_SIGMAS = 3.0
 
 
 @dataclass(frozen=True)
@@ -190,14 +194,25 @@ def _log(site: Site, path: Path | None, track: HeadTrack | None, lacking: list[s
     if site.inclination is None:
         return None
     if path is None:
-        lacking.append("inclination log missing")
+        if site.inclination.required:
+            lacking.append("inclination log missing")
         return None
+    range_rad = site.instrument.inclination_range_rad
     try:
-        log, dropped = inclination.clean(read_inclination(path))
+        told = read_inclination(path)
+        log, dropped = inclination.clean(told, range_rad)
     except ScanError as error:
         lacking.append(f"inclination log unusable: {error}")
         return None
     rows = len(log.time_s)
+    pegged = inclination.pegged(told, range_rad)
+    if pegged > PEGGED_MOST:
+        if site.inclination.required:
+            lacking.append(
+                f"lean out of the inclination sensor's range of {math.degrees(range_rad):g} degree in"
+                f" {pegged:.0%} of its log, which is not used"
+            )
+        return None
     if rows < FEWEST_ROWS:
         lacking.append(f"inclination log has {rows} good rows")
         return None
@@ -236,6 +251,10 @@ def _lean(
     lean = inclination.relative_lean(log, track, zero, sigma_rad, cutoff_hz, filtered=filtered)
     if lean.gap_s > 2 * lean.memory_s:
         lacking.append(f"inclination log has a gap of {lean.gap_s:.0f} s")
+    if abs(lean.offset_s) > max(LATE_S, LATE_SIGMAS * lean.offset_sigma_s):
+        lacking.append(
+            f"clock of the inclination log {lean.offset_s:+.1f} s off, known to {lean.offset_sigma_s:.1f} s"
+        )
     if track is None:
         return inclination.without_time(lean)
     return lean
@@ -296,7 +315,8 @@ def _log_of(site: Site, stem: str) -> tuple[InclinationLog | None, HeadTrack | N
         return None, None
     with open_scan(scans[0], range_max_m=site.scanner.range_max_m) as reader:
         track = reader.head_track()
-    return inclination.clean(read_inclination(log_path))[0], track
+    log, _ = inclination.clean(read_inclination(log_path), site.instrument.inclination_range_rad)
+    return log, track
 
 
 def _fit(log: InclinationLog, track: HeadTrack | None, sigma_rad: float) -> Cycle:

@@ -161,6 +161,7 @@ def status(site: Site) -> Status:
         "waiting": waiting,
         "set_aside": set_aside,
         "last": _last(last) if last else None,
+        "moved": _moved(site),
         "series": str(data / "series.nc") if (data / "series.nc").exists() else None,
         "disk_free_gb": round(shutil.disk_usage(data).free / 1e9, 2) if data.is_dir() else None,
         "faults": [
@@ -183,6 +184,7 @@ def describe(found: Status) -> str:
     free = found["disk_free_gb"]
     lines.append(f"disk     {f'{free:.2f} GB free' if free is not None else 'no data folder yet'}")
     lines.append(f"series   {found['series'] or 'none yet'}")
+    lines += [f"moved    {found['moved']}"] if found["moved"] else []
     lines += [f"fault    {fault}" for fault in found["faults"]]
     for one in found["waiting"]:
         then = f", next try {one['next_try']}" if one["next_try"] else ""
@@ -216,6 +218,15 @@ def _last(entry: Entry) -> Status:
         "reference": entry.reference,
         "figures": figures,
     }
+
+
+def _moved(site: Site) -> str:
+    from station.service.moved import moved  # noqa: PLC0415 - a status without series needs none of it
+
+    try:
+        return moved(site) if (site.station.data / "series.nc").is_file() else ""
+    except StoreError as error:
+        return str(error)
 
 
 def _room_fault(site: Site) -> str:

@@ -43,6 +43,6 @@ def _told(site: Site) -> Told:
         expected_every_s=site.scans.expected_every_s,
         waiting=found["waiting"],
         set_aside=sorted(found["set_aside"], key=lambda one: str(one["since"])),
-        faults=found["faults"],
+        faults=found["faults"] + ([f"moved: {found['moved']}"] if found["moved"] else []),
         seconds={Path(name).stem: took for name, took in seconds.items()},
     )

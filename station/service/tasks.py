@@ -40,8 +40,8 @@ from station.quantities import Bools, Habits, Measurement, Quality, Reference
 from station.readers.polygons import mask, read_polygons
 from station.readers.raster import read_geotiff
 from station.readers.scan import ScanReader, open_scan, utc_interval
-from station.science import ground
-from station.science.adjustment import Adjustment, distrust
+from station.science import ground, verdict
+from station.science.adjustment import Adjustment
 from station.science.grid import Gridder, Stack
 from station.science.master import improved, master
 from station.science.prior import learned
@@ -160,24 +160,33 @@ def _measure(
         raise ScanError("no point falls on the grid: wrong scans.frame, SOP, CRS or units?")
     progress()
     levelled = _level(site, gridder, gathered, reference)
-    unknown, lacking = gathered.unknown, list(gathered.lacking)
-    if levelled is not None and reference is not None:
-        lacking += distrust(levelled[1], reference.habits)
+    unknown, found = gathered.unknown, levelled[1] if levelled else None
+    if levelled is not None:
         if levelled[1].refused > MOST_REFUSED:
             levelled = None
         else:
             unknown = levelled[1].shared()
     measured = measure(gridder, gathered.setup, unknown, reference, levelled)
     progress()
+    numbers = _numbers(measured, gathered, reader.header.point_count, levelled)
+    word, reason = verdict.judge(
+        gathered.lacking,
+        measured,
+        reference,
+        (gathered.setup.position_m, gathered.setup.axis) if gathered.setup.position_m else None,
+        found,
+        numbers.get("stable_z_std"),
+        None if levelled or reference is None else stable_ground(site, reference),
+    )
     return store.Epoch(
         start_s=start.timestamp(),
         end_s=end.timestamp(),
         scan_id=arrival.path.stem,
         measurement=measured,
         shared=unknown,
-        verdict="degraded" if lacking else "good",
-        verdict_reason="; ".join(lacking),
-        numbers=_numbers(measured, gathered, reader.header.point_count, levelled),
+        verdict=word,
+        verdict_reason=reason,
+        numbers=numbers,
         provenance={
             "scan_sha256": scan_sha256,
             "log_sha256": _sha256(arrival.log) if arrival.log else "",

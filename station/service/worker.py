@@ -14,6 +14,7 @@ from station.service import child
 from station.service.inbox import Arrival
 from station.service.journal import Entry, Journal, State
 from station.service.logs import logfmt
+from station.service.moved import moved_by
 from station.service.show import show
 from station.service.tasks import (
     Outcome,
@@ -82,6 +83,8 @@ class Worker:
             figures=outcome.figures,
         )
         _say(arrival.name, outcome)
+        if self._site.adjusts and (moved := self._run(moved_by, outcome.start_utc_s)):
+            log.warning("%s", logfmt(scan=arrival.name, moved=moved))
         self._show()
         self._make_reference_when_due()
         return True

@@ -110,6 +110,7 @@ def test_the_reference_comes_back_and_its_versions_stay(series):
     elevation[:5] = np.nan
     variance = np.where(np.isnan(elevation), np.nan, 0.0004).astype(np.float32)
     steep = elevation > 2900.0
+    seen = np.where(steep, 0.875, np.nan).astype(np.float32)
     common = Shared(("tilt_east",), ("rad",), np.zeros(1), np.array([[3e-11]]), np.array([2e-12]))
     for version in ("1", "2"):
         given = Reference.given(series.grid, version, elevation, steep)
@@ -120,6 +121,7 @@ def test_the_reference_comes_back_and_its_versions_stay(series):
             shared=common,
             scan_ids=("a", "b"),
             habits=Habits(tilt_rad=0.0002),
+            seen=seen,
         )
         reference.write_reference(series, made)
     told = reference.read_reference(series)
@@ -131,6 +133,8 @@ def test_the_reference_comes_back_and_its_versions_stay(series):
     assert told.shared.noise_variance[0] == 2e-12
     assert told.habits == Habits(tilt_rad=0.0002)
     assert np.array_equal(told.stable, steep)
+    assert np.array_equal(told.seen, seen, equal_nan=True)
+    assert reference.read_habits(series) == told.habits
     assert (series.folder / "reference_1.nc").is_file()
 
 
