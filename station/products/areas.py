@@ -15,9 +15,10 @@ from station.archive.aggregate import Aggregates
 from station.archive.areas import figures, is_of
 from station.archive.layout import Series
 from station.archive.store import Row, rows, series_in
+from station.archive.variables import VERDICTS
 from station.config import Site
 from station.errors import ConfigError, StationError
-from station.products.record import AreaRecord, read_areas, read_record
+from station.products.record import AreaRecord, Record, read_areas, read_record
 from station.quantities import Bools
 from station.readers.polygons import mask, read_polygons
 
@@ -33,6 +34,7 @@ class AreaLine:
     start: datetime
     area: str
     size_m2: float
+    verdict: str  # of the epoch; of a pair the worse
     figures: dict[str, float]
 
 
@@ -110,13 +112,14 @@ def area_lines(
         and is_of(series.folder / "areas.nc", series, areas)
         and (kept := read_areas(series))
     ):
-        yield from _kept(kept, span)
+        yield from _kept(kept, span, read_record(series))
     else:
         yield from _computed(series, areas, span, against, each)
 
 
-def _kept(kept: list[AreaRecord], span: Span) -> Iterator[AreaLine]:
+def _kept(kept: list[AreaRecord], span: Span, record: Record) -> Iterator[AreaLine]:
     """What `areas.nc` holds."""
+    verdicts = dict(zip(record.start_s.tolist(), record.verdict, strict=True))
     for index, start_s in enumerate(kept[0].start_s):
         start = datetime.fromtimestamp(float(start_s), UTC)
         if start not in span:
@@ -124,7 +127,8 @@ def _kept(kept: list[AreaRecord], span: Span) -> Iterator[AreaLine]:
         for area in kept:
             told = {name: float(column[index]) for name, column in area.columns.items()}
             if np.isfinite(told["mean_change"]):
-                yield AreaLine(start, area.name, area.size_m2, told)
+                verdict = verdicts.get(float(start_s), "")
+                yield AreaLine(start, area.name, area.size_m2, verdict, told)
 
 
 def _computed(
@@ -136,6 +140,7 @@ def _computed(
 ) -> Iterator[AreaLine]:
     record = read_record(series)
     versions = dict(zip(record.words["epoch_file"], record.words["reference_version"], strict=True))
+    verdicts = dict(zip(record.words["epoch_file"], record.verdict, strict=True))
     measured = [row for row in rows(series) if versions.get(row.epoch_file)]
     fixed = None if against in {REFERENCE, PREVIOUS} else epoch(series, against)
     before = dict(zip(measured[1:], measured, strict=False)) if against == PREVIOUS else {}
@@ -144,11 +149,12 @@ def _computed(
         other = fixed or before.get(row)
         if row == fixed or (against == PREVIOUS and other is None):
             continue
+        verdict = max((verdicts[one.epoch_file] for one in (row, other) if one), key=VERDICTS.index)
         for name, cells in areas.items():
             size_m2 = float(np.count_nonzero(cells)) * series.grid.cell_m**2
             if size_m2:
                 found = figures(aggregates.area(cells, row, other), size_m2)
-                yield AreaLine(row.start, name, size_m2, found)
+                yield AreaLine(row.start, name, size_m2, verdict, found)
 
 
 def as_csv(lines: Iterable[AreaLine]) -> str:
@@ -157,17 +163,19 @@ def as_csv(lines: Iterable[AreaLine]) -> str:
     writer = csv.writer(told, lineterminator="\n")
     names = [f"{quantity}{end}" for quantity in UNITS for end in ENDS]
     heads = [f"{quantity}{ENDS[end]}_{UNITS[quantity]}" for quantity in UNITS for end in ENDS]
-    writer.writerow(["time_utc", "area", "area_size_m2", *heads, "coverage"])
+    writer.writerow(["time_utc", "area", "area_size_m2", *heads, "coverage", "verdict"])
     for line in lines:
         values = [line.figures[name] for name in (*names, "coverage")]
         shown = [f"{value:.6g}" if np.isfinite(value) else "" for value in values]
-        writer.writerow([f"{line.start:%Y-%m-%dT%H:%M:%SZ}", line.area, f"{line.size_m2:g}", *shown])
+        writer.writerow(
+            [f"{line.start:%Y-%m-%dT%H:%M:%SZ}", line.area, f"{line.size_m2:g}", *shown, line.verdict]
+        )
     return told.getvalue()
 
 
 def as_text(lines: Iterable[AreaLine]) -> str:
     """Return a table for a person."""
-    head = ("time, UTC", "area", "mean, m", "95 %", "median, m", "volume, m³", "95 %", "seen")
+    head = ("time, UTC", "area", "mean, m", "95 %", "median, m", "volume, m³", "95 %", "seen", "verdict")
     body = [
         (
             f"{line.start:%Y-%m-%d %H:%M}",
@@ -178,6 +186,7 @@ def as_text(lines: Iterable[AreaLine]) -> str:
             f"{told['volume_change']:+.1f}",
             f"±{told['volume_change_high'] - told['volume_change']:.1f}",
             f"{100 * told['coverage']:.0f} %",
+            line.verdict,
         )
         for line in lines
         for told in [line.figures]
@@ -185,7 +194,7 @@ def as_text(lines: Iterable[AreaLine]) -> str:
     if not body:
         return "no epoch has a change there"
     wide = [max(len(row[column]) for row in (head, *body)) for column in range(len(head))]
-    left = (0, 1)
+    left = (0, 1, len(head) - 1)
     return "\n".join(
         "  ".join(
             cell.ljust(width) if column in left else cell.rjust(width)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -64,6 +64,8 @@ def write_page(
     """
     record = read_record(series) if series.path.is_file() else None
     areas = read_areas(series)[:MOST_AREAS]
+    if record is not None:
+        areas = [_without_unusable(area, record) for area in areas]
     gallery = Gallery([], None, None, None, (0, 0))
     if record is not None:
         style = Style(told.name or series.station_id, width_px, limit_m)
@@ -115,6 +117,13 @@ def _picked(count: int) -> slice:
 def _numbers(values: Floats, digits: int) -> list[float | None]:
     told = (round(float(one), digits) if np.isfinite(one) else None for one in values)
     return [int(one) if one is not None and not digits else one for one in told]
+
+
+def _without_unusable(area: AreaRecord, record: Record) -> AreaRecord:
+    """Return an area's series with gaps where neither change nor sigma can be relied on."""
+    bad = record.start_s[[verdict == "unusable" for verdict in record.verdict]]
+    gaps = np.isin(area.start_s, bad)
+    return replace(area, columns={name: np.where(gaps, np.nan, one) for name, one in area.columns.items()})
 
 
 def _area(area: AreaRecord) -> dict[str, Any]:

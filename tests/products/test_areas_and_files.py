@@ -56,6 +56,9 @@ def test_areas_nc_of_other_polygons_is_not_believed(site, small):
     ]
     site.areas.file.write_text(json.dumps({"type": "FeatureCollection", "features": moved}))
     told = list(area_lines(site, None, ALL, "reference"))[-2:]
+    assert told[0].verdict == "good"
+    between = list(area_lines(site, None, ALL, "previous"))[-1]
+    assert between.verdict == "degraded"  # the one before was
     assert told[0].figures == told[1].figures
     assert told[0].figures["mean_change"] == pytest.approx(-0.30, abs=0.01)
 
@@ -83,6 +86,7 @@ def test_csv_is_read_back_by_a_spreadsheet(site, small):
     assert len(rows) == 12
     assert rows[0]["time_utc"] == "2025-11-21T00:00:00Z"
     assert rows[1]["area"] == small.EVIL
+    assert [row["verdict"] for row in rows[:3]] == ["degraded", "degraded", "good"]
     for row in rows:
         mean, sigma = float(row["mean_change_m"]), float(row["mean_change_sigma_m"])
         assert float(row["mean_change_low95_m"]) == pytest.approx(mean - 1.96 * sigma, rel=1e-4)

@@ -14,6 +14,7 @@ from PIL import Image
 
 from station.archive import store
 from station.archive.reference import write_reference
+from station.archive.series import build_series
 from station.products import gallery, page
 from station.products.gallery import Style, hang, kept_base, thinned
 from station.products.look import base_of
@@ -94,6 +95,22 @@ def test_what_the_page_says_is_what_is_stored(write, small):
     assert re.search(r"\+0\.30\d ± 0\.00\d", html)  # the newest of the area
     assert "honest" in html
     assert "1.02 σ" in html
+
+
+def test_what_is_unusable_is_a_gap_in_curves(write, series, small):
+    one = replace(small.make_epoch(6), verdict="unusable", verdict_reason="fallen over")
+    store.write_epoch(series, one)
+    build_series(series)
+    folder = write()
+    before = data_of(folder)
+    assert len(before["health"]["time_s"]) == 7
+    short = page._without_unusable(
+        AreaRecord("a", 1.0, read_record(series).start_s, {"mean_change": np.ones(7)}), read_record(series)
+    )
+    assert np.isnan(short.columns["mean_change"]).tolist() == [False] * 6 + [True]
+    html = (folder / "index.html").read_text()
+    assert html.count('class="unusable"') == 2  # the tile and the table
+    assert "unusable: fallen over" in html
 
 
 def test_before_the_first_scan_there_is_a_page_too(tmp_path, told, series):
@@ -215,8 +232,6 @@ def test_an_epoch_of_another_version_of_the_reference(write, series, site, small
     write_reference(series, small.make_reference(version="2"))
     one = small.make_epoch(8, reference="2")
     store.write_epoch(series, one)
-    from station.archive.series import build_series
-
     build_series(series)
     folder = write()
     assert (folder / ".terrain_2_600.npz").is_file()
