@@ -10,7 +10,7 @@ import station
 from station.archive.aggregate import Aggregates
 from station.config import read_site
 from station.quantities import Quality
-from station.service import tasks
+from station.service import references, tasks, upkeep
 from station.service.inbox import Arrival
 from station.simulation.scenario import named
 from station.simulation.station import simulate
@@ -40,9 +40,9 @@ class Measured:
             log = log if self.site.inclination and log.is_file() else None
             status = path.stat()
             arrivals.append(Arrival(path.name, path, log, status.st_size, status.st_mtime_ns))
-        tasks.build_reference(self.site, arrivals[:REFERENCE], "1", lambda: None)
+        references.build_reference(self.site, arrivals[:REFERENCE], "1", lambda: None)
         self.outcomes = [tasks.process(self.site, arrival, lambda: None) for arrival in arrivals[first:]]
-        tasks.publish(self.site, lambda: None)
+        upkeep.publish(self.site, lambda: None)
         self.series = station.open(self.site.station.data).load()
         truth = xr.open_dataset(folder / "truth.nc").load()
         before = truth.change[:REFERENCE].mean("time")

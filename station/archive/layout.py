@@ -270,6 +270,11 @@ def text(values: Sequence[str], dim: str) -> np.ndarray[Any, Any]:
     return netCDF4.stringtochar(told)
 
 
+def kept_of(value: str, dim: str) -> str:
+    """Return a string as it is read again: what `text` keeps of it."""
+    return value.encode("ascii", "replace")[: TEXT_LENGTH[dim]].decode()
+
+
 def strings(characters: np.ndarray[Any, Any]) -> list[str]:
     """Return characters (n, length) as strings: what `text` was given."""
     rows = np.ascontiguousarray(characters).view(f"S{characters.shape[-1]}")

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import json
 import os
-from dataclasses import asdict, fields
+from dataclasses import asdict, dataclass, fields
+from pathlib import Path
 from typing import Any
 
 import netCDF4
@@ -63,17 +65,75 @@ _ROWS = (
 )  # fmt: skip
 
 
-def write_reference(series: Series, reference: Reference) -> None:
+@dataclass(frozen=True)
+class Lineage:
+    """What a version of the reference was made from: `base` is the version whose moving ground it shares."""
+
+    base: str
+    science_hash: str = ""
+    replaces: tuple[str, ...] = ()  # versions of that base that nothing is to be measured from any more
+    made_from: tuple[dict[str, str], ...] = ()  # of each of its scans, what an epoch tells of its origin
+
+
+def path_of(series: Series, version: str) -> Path:
+    """Return the file of a version of the reference."""
+    return series.folder / f"reference_{version}.nc"
+
+
+def versions(series: Series) -> list[str]:
+    """Return the versions made by the station itself, oldest first."""
+    found = (path.stem.removeprefix("reference_") for path in series.folder.glob("reference_*.nc"))
+    return sorted((version for version in found if version.isdigit()), key=int)
+
+
+def current(series: Series) -> dict[str, Lineage]:
+    """Return the versions made by the station that epochs may be measured from, oldest first.
+
+    They share the moving ground of the newest, so that change counts from the same surface.
+    """
+    told = {version: read_lineage(series, version) for version in versions(series)}
+    if not told:
+        return {}
+    base = list(told.values())[-1].base
+    replaced = {version for lineage in told.values() for version in lineage.replaces}
+    return {
+        version: lineage
+        for version, lineage in told.items()
+        if lineage.base == base and version not in replaced
+    }
+
+
+def read_lineage(series: Series, version: str) -> Lineage:
+    """Return what a version was made from; raise StoreError where it cannot be read."""
+    path = path_of(series, version)
+    try:
+        with netCDF4.Dataset(path) as file:
+            known = set(file.ncattrs())
+            return Lineage(
+                base=str(file.base) if "base" in known else version,
+                science_hash=str(file.science_hash) if "science_hash" in known else "",
+                replaces=tuple(str(file.replaces).split()) if "replaces" in known else (),
+                made_from=tuple(json.loads(str(file.made_from))) if "made_from" in known else (),
+            )
+    except (OSError, RuntimeError, ValueError) as error:
+        raise StoreError(f"{path}: cannot be read: {error}") from error
+
+
+def write_reference(series: Series, reference: Reference, lineage: Lineage | None = None) -> None:
     """Write a version of the reference for good, and `reference.nc` as another name of the newest.
 
-    Raises StoreError where it cannot.
+    Without a lineage it stands for itself. Raises StoreError where it cannot.
     """
-    kept = series.folder / f"reference_{reference.version}.nc"
+    lineage = lineage or Lineage(reference.version)
+    kept = path_of(series, reference.version)
     with written_whole(kept) as beside, netCDF4.Dataset(beside, "w", clobber=False) as file:
         shared = reference.shared
         parameters = (shared.names, shared.units) if shared is not None else ((), ())
         lay_out(file, series, f"Reference surface of {series.name or series.station_id}", None, parameters)
         file.setncatts({"reference_version": reference.version, "scan_ids": " ".join(reference.scan_ids)})
+        file.setncatts({"base": lineage.base, "science_hash": lineage.science_hash})
+        file.setncatts({"replaces": " ".join(lineage.replaces)})
+        file.setncatts({"made_from": json.dumps(lineage.made_from)})
         file.setncatts({f"{HABIT}{name}": value for name, value in asdict(reference.habits).items()})
         values = {
             "reference_elevation": reference.elevation_m,
@@ -103,7 +163,7 @@ def write_reference(series: Series, reference: Reference) -> None:
 
 def read_reference(series: Series, version: str | None = None) -> Reference | None:
     """Read the newest reference or a version; None where there is none; StoreError where it fits no grid."""
-    path = series.folder / ("reference.nc" if version is None else f"reference_{version}.nc")
+    path = series.folder / "reference.nc" if version is None else path_of(series, version)
     if not path.is_file():
         return None
     try:

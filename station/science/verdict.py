@@ -132,22 +132,23 @@ def distrust(found: Adjustment, habits: Habits) -> list[str]:
     return reasons
 
 
-def misfit(measured: Measurement, stable: Bools) -> str:
+def misfit(measured: Measurement, stable: Bools) -> list[str]:
     """Say by how much stable ground (ny, nx) is off in a scan that is not adjusted, unless sigma holds it.
 
     Half of the cells are off by more than the figure told, either way.
     """
     chosen = stable & np.isfinite(measured.surface.change_m)
     if np.count_nonzero(chosen) < FEWEST_STABLE:
-        return ""
+        return []
     off_m = np.abs(measured.surface.change_m[chosen])
     sigmas = 1.4826 * float(np.median(off_m / measured.uncertainty_m[chosen]))  # of a normal distribution
     if sigmas <= OFF:
-        return ""
-    return f"stable ground is {np.median(off_m):.2g} m off, {sigmas:.0f} sigma: moved, or another SOP?"
+        return []
+    return [f"stable ground is {np.median(off_m):.2g} m off, {sigmas:.0f} sigma: moved, or another SOP?"]
 
 
 def judge(
+    flag: str,
     lacking: Sequence[str],
     measured: Measurement,
     reference: Reference | None,
@@ -158,23 +159,22 @@ def judge(
 ) -> tuple[str, str]:
     """Return the verdict of an epoch and its reasons, the gravest first.
 
-    Unusable: nothing to work with was seen, or its sigma does not hold the error. Degraded: anything else
-    that is lacking. `place`: of the scanner, and its axis. `found`: how the scan was adjusted, even if that
-    was not used in the end, and `stable_z_std` only where it was, else `stable` (ny, nx).
+    Unusable: a person's `flag` says so, nothing to work with was seen, or its sigma does not hold the error.
+    Degraded: anything else that is lacking. `place`: of the scanner, and its axis. `found`: how the scan was
+    adjusted, even if that was not used in the end, and `stable_z_std` only where it was, else `stable`
+    (ny, nx).
     """
-    fatal: list[str] = []
+    fatal = [f"flagged: {flag}"] if flag else []
     reasons = list(lacking)
-    if reference is None:
-        return ("degraded" if reasons else "good"), "; ".join(reasons)
-    if place is not None:
+    if place is not None and reference is not None:
         told = view(measured.surface.count > 0, reference, *place)
         (fatal if told.share < BLIND else reasons).extend(hidden(told))
-    if found is not None:
+    if found is not None and reference is not None:
         reasons += distrust(found, reference.habits)
     if stable_z_std is not None:
         if stable_z_std > SCATTERED:
             reasons.append(f"stable ground that no fit has seen scatters by {stable_z_std:.1f} sigma")
-    elif stable is not None and reference.shared is not None and (told_off := misfit(measured, stable)):
-        fatal.append(told_off)
+    elif stable is not None and reference is not None and reference.shared is not None:
+        fatal += misfit(measured, stable)
     word = "unusable" if fatal else "degraded" if reasons else "good"
     return word, "; ".join([*fatal, *reasons])

@@ -13,6 +13,7 @@ import multiprocessing.connection
 import os
 import resource
 import signal
+import threading
 import time
 import traceback
 from multiprocessing import forkserver
@@ -44,21 +45,23 @@ _TICK_S = 0.2
 _GONE_WITH_ITS_SERVER = 255  # what multiprocessing reports where the fork server died
 _NOT_STARTED = ("not started", None)
 
+_starting = threading.Lock()  # several threads may each run a child
 _forks = multiprocessing.get_context("forkserver")
 
 
 def prepare(preload: Sequence[str] = PRELOAD) -> None:
     """Start the server that children are forked from; the first call decides what it loads."""
-    before = {name: os.environ.get(name) for name in _ONE_THREAD}
-    os.environ.update(_ONE_THREAD)
-    try:
-        _forks.set_forkserver_preload(list(preload))
-        forkserver.ensure_running()
-    finally:
-        for name, value in before.items():
-            os.environ.pop(name)
-            if value is not None:
-                os.environ[name] = value
+    with _starting:
+        before = {name: os.environ.get(name) for name in _ONE_THREAD}
+        os.environ.update(_ONE_THREAD)
+        try:
+            _forks.set_forkserver_preload(list(preload))
+            forkserver.ensure_running()
+        finally:
+            for name, value in before.items():
+                os.environ.pop(name)
+                if value is not None:
+                    os.environ[name] = value
 
 
 def run(

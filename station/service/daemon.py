@@ -217,6 +217,7 @@ class Daemon:
         else:
             self._let_go()
             self._site, self._parts, self._refused_site = site, parts, ""
+            self._due.add(Wake.SWEEP)  # which tells how many epochs another setting made
             log.info(logfmt(reload="done", station=site.station.id))
         self._heart.ready()
 

@@ -79,11 +79,11 @@ def gather(
     if track is None and site.scans.point_time == "auto":
         lacking.append("no time per point: one mean lean for the whole scan")
     log = _log(site, log_path, track, lacking)
-    zero = _kept_zero(site, sop_id)
+    zero = kept_zero(site, sop_id)
     if zero is None:
         zero = _zero_lean(site, sop, reader, log, track, lacking)
-        if zero is not None and keep_zero:
-            _keep_zero(site, sop_id, zero)
+        if zero is not None and keep_zero and zero != LEVEL:  # absolute: nothing that the SOP holds
+            write_zero(site, sop_id, zero)
     lean = _lean(site, log, track, zero, lacking)
     air, weather_known = _air(site, start + (end - start) / 2, frame.position_m[2], lacking)
     rotation = frame.to_local[:3, :3]
@@ -141,8 +141,9 @@ def setup_of(
 
 
 def sop_identity(sop: SopSection) -> str:
-    """Return a name that changes with the SOP's content."""
-    return f"{sop.file.stem}-{hashlib.sha256(sop.file.read_bytes()).hexdigest()[:8]}"
+    """Return a name that changes with the SOP's content, and with the scan it is said to be solved from."""
+    told = sop.file.read_bytes() + (f"\n{sop.scan}".encode() if sop.scan else b"")
+    return f"{sop.file.stem}-{hashlib.sha256(told).hexdigest()[:8]}"
 
 
 def frame_of(site: Site, sop: SopSection) -> pose.Frame:
@@ -264,7 +265,7 @@ def _zero_file(site: Site, sop_id: str) -> Path:
     return site.station.data / "lean_zero" / f"{sop_id}.json"
 
 
-def _kept_zero(site: Site, sop_id: str) -> Cycle | None:
+def kept_zero(site: Site, sop_id: str) -> Cycle | None:
     """Return the lean an SOP holds, as found when it was first needed."""
     if site.inclination is None or site.inclination.mode == "absolute":
         return None
@@ -275,7 +276,8 @@ def _kept_zero(site: Site, sop_id: str) -> Cycle | None:
     return Cycle(tuple(told["roll_rad"]), tuple(told["pitch_rad"]))
 
 
-def _keep_zero(site: Site, sop_id: str, zero: Cycle) -> None:
+def write_zero(site: Site, sop_id: str, zero: Cycle) -> None:
+    """Keep the lean that an SOP holds."""
     path = _zero_file(site, sop_id)
     with written_whole(path) as beside:
         beside.write_text(json.dumps(asdict(zero)))

@@ -114,7 +114,7 @@ STABLE = (AWAY < 500) & (X > 0)
 def judged(change_m=0.0, sigma_m=0.1, seen=None, lacking=(), z=None, stable=STABLE, known=None):
     noise = np.random.default_rng(5).normal(0, 0.1, GRID.shape)
     told = measured(noise + change_m, sigma_m, seen)
-    return verdict.judge(lacking, told, of_scans() if known is None else known, PLACE, None, z, stable)
+    return verdict.judge("", lacking, told, of_scans() if known is None else known, PLACE, None, z, stable)
 
 
 def test_good_degraded_and_unusable():
@@ -147,8 +147,10 @@ def test_ground_no_fit_has_seen_may_scatter_by_three_sigma():
 
 def test_without_a_reference_only_what_was_lacking_counts():
     told = measured(0.0, 0.1, AWAY < 100)
-    assert verdict.judge((), told, None, PLACE, None, None, None) == ("good", "")
-    assert verdict.judge(("a",), told, None, PLACE, None, None, None) == ("degraded", "a")
+    assert verdict.judge("", (), told, None, PLACE, None, None, None) == ("good", "")
+    assert verdict.judge("", ("a",), told, None, PLACE, None, None, None) == ("degraded", "a")
+    flagged = verdict.judge("spring cleaning", ("a",), told, None, PLACE, None, None, None)
+    assert flagged == ("unusable", "flagged: spring cleaning; a")
 
 
 def test_a_reference_that_does_not_know_the_usual_view_misses_nothing():

@@ -12,8 +12,8 @@ import pytest
 
 from station.config import read_site
 from station.errors import ConfigError, NotReadyError, ScanError
-from station.service import tasks
-from station.service.once import arrival_of
+from station.service import references, tasks
+from station.service.places import arrival_of
 from station.simulation.motion import sensor_faults
 from station.simulation.station import simulate, tiny
 
@@ -172,7 +172,7 @@ def test_no_weather_and_waiting_for_it(folder):
 def test_a_scan_that_sees_less_than_the_reference_did(folder, keep, verdict, says):
     site = read_site(folder / "site.toml")
     first, path = sorted(site.scans.inbox.glob("*.laz"))
-    tasks.build_reference(site, [arrival_of(site, first)], "1", lambda: None)
+    references.build_reference(site, [arrival_of(site, first)], "1", lambda: None)
     full, _ = processed(folder)
     assert (full.verdict, full.reason) == ("good", "")
     scan = laspy.read(path)
