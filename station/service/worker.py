@@ -106,7 +106,7 @@ class Worker:
         _say(arrival.name, outcome)
         if self._site.adjusts and (moved := self.run(moved_by, outcome.start_utc_s)):
             log.warning("%s", logfmt(scan=arrival.name, moved=moved))
-        self._show()
+        self.show()
         self._make_reference_when_due()
         return True
 
@@ -215,10 +215,10 @@ class Worker:
     ) -> bool:
         self._journal.set_aside(arrival.name, reason, sha256=sha256, log_sha256=log_sha256)
         log.warning("%s", logfmt(scan=arrival.name, verdict="set_aside", reason=reason))
-        self._show()
+        self.show()
         return False
 
-    def _show(self) -> None:
+    def show(self) -> None:
         """Bring the page up to what is stored; what fails there keeps no scan from the store."""
         try:
             self.run(show)
