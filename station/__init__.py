@@ -74,8 +74,8 @@ def volume(
 
     `area` is cells (y, x), rows from north to south, or a polygon on the map. With what cells share, and as
     Hartzell et al. (2015) have it, each cell's error its own; and as maps which cell adds how much to the
-    variance. Only cells with a change count. Raises StoreError where there is no series, no reference or no
-    change.
+    variance. Cells without a change are interpolated, as in `areas.nc`. Raises StoreError where there is no
+    series, no reference or no change.
     """
     from station.archive.store import series_in  # noqa: PLC0415
     from station.archive.volume import Volumes, cells_of  # noqa: PLC0415

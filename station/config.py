@@ -280,6 +280,15 @@ class ServiceSection(Section):
     memory_gb: Annotated[float, Field(ge=0.5, le=1024)] = 5.0
 
 
+class ProductsSection(Section):
+    """What is made of every scan for people and other tools."""
+
+    page: bool = True
+    geotiff: bool = False
+    quicklook_width_px: Annotated[int, Field(ge=400, le=4000)] = 1200
+    change_limit_m: Positive | None = None
+
+
 class SiteFile(Section):
     """The whole file."""
 
@@ -299,6 +308,7 @@ class SiteFile(Section):
     flags: FlagsSection | None = None
     retention: RetentionSection = RetentionSection()
     service: ServiceSection = ServiceSection()
+    products: ProductsSection = ProductsSection()
 
     @model_validator(mode="after")
     def _chain_is_complete(self) -> SiteFile:
@@ -395,7 +405,7 @@ def read_site(path: str | Path) -> Site:
         given = tomllib.loads(path.read_text(encoding="utf-8"))
     except OSError as error:
         raise ConfigError(f"{path}: cannot be read: {error.strerror}") from error
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as error:
         raise ConfigError(f"{path}: not valid TOML: {error}") from error
     try:
         site = Site.model_validate({**given, "path": path})

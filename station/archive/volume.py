@@ -8,13 +8,14 @@ import numpy.typing as npt
 import shapely
 import xarray as xr
 
-from station.archive.aggregate import CHANGE, Aggregates
+from station.archive.aggregate import CHANGE, Aggregates, _cells, _Held, _seen
 from station.archive.store import Row
 from station.errors import StoreError
 from station.quantities import Bools, Floats, Grid, Scanner
 from station.science.points import shared_covariance, shot_covariance
 from station.science.shared import against, basis
-from station.science.volume import contributions
+from station.science.voids import area_weights
+from station.science.volume import shared_contributions
 
 
 def cells_of(area: npt.ArrayLike | shapely.Geometry, grid: Grid) -> Bools:
@@ -32,68 +33,65 @@ class Volumes(Aggregates):
     """Volumes of the epochs of a store, and the covariance of their points."""
 
     def change(self, cells: Bools, row: Row, other: Row | None = None) -> xr.Dataset:
-        """Volume of the change over cells (ny, nx) in an epoch, or of the difference to a second one.
+        """Volume of the change over cells (ny, nx) in an epoch, or from a second one to it.
 
-        Only cells with a change count; `coverage` is their share. Three sigmas [m³]: with all that cells
-        share; of that the random part; and as published, the cells' errors each their own. The maps hold the
-        share of each cell in the variance, with what cells share and as published; each sums up to 1.
+        As in `areas.nc`: cells without a change are interpolated; `coverage` is the share of the others.
+        Three sigmas [m³]: with everything; of that the cells' own; and as published, the whole errors of
+        cells each their own. The maps hold the share of each cell in the variance of what was seen, and in the published
+        one; each sums up to 1. Raises StoreError where nothing was seen.
         """
-        epochs = [row] if other is None else [row, other]
-        read = [self._rasters(one) for one in epochs]
-        seen = cells & np.logical_and.reduce([np.isfinite(change_m) for change_m, _ in read])
-        if not seen.any():
+        held = self._held(cells, row, other)
+        chosen = _seen(held, cells)
+        if not chosen.any():
             raise StoreError(f"{row.path}: none of the {np.count_nonzero(cells)} cells has a change")
-        area_m2 = self._series.grid.cell_m**2
-        change_m = read[0][0] - (0.0 if other is None else read[1][0])
-        independent = np.where(seen, area_m2**2 * sum(sigma_m**2 for _, sigma_m in read), np.nan)
-        own, shared = self._shares(seen, epochs)
-        variance = self.variance(np.where(seen, area_m2, 0.0), row, other)
+        size_m2 = self._series.grid.cell_m**2 * np.count_nonzero(cells)
+        weights_m2 = size_m2 * area_weights(cells, chosen)[0][chosen]
+        own, shared = self._contributions(held, chosen, weights_m2, self._random(held, chosen, chosen[cells]))
+        sigmas_m = [self._sigma(one, chosen) for one in ([row] if other is None else [row, other])]
+        published = weights_m2**2 * sum(sigma_m**2 for sigma_m in sigmas_m)
+        found = self.area(cells, row, other)
+
+        def volume(value_m3: float) -> tuple[tuple[()], float, dict[str, str]]:
+            return (), value_m3, {"units": "m3"}
 
         def on_map(values: Floats) -> tuple[tuple[str, str], Floats, dict[str, str]]:
-            return ("y", "x"), values / np.nansum(values), {"units": "1"}
+            share = np.full(cells.shape, np.nan)
+            share[chosen] = values / values.sum()
+            return ("y", "x"), share, {"units": "1"}
 
         return xr.Dataset(
             {
-                "volume_change": ((), float(area_m2 * change_m[seen].sum()), {"units": "m3"}),
-                "volume_change_uncertainty": ((), np.sqrt(variance), {"units": "m3"}),
-                "volume_change_random_uncertainty": ((), np.sqrt(np.nansum(own)), {"units": "m3"}),
-                "volume_change_uncertainty_hartzell2015": (
-                    (), np.sqrt(np.nansum(independent)), {"units": "m3"},
-                ),
-                "area_size": ((), area_m2 * np.count_nonzero(seen), {"units": "m2"}),
-                "coverage": ((), np.count_nonzero(seen) / np.count_nonzero(cells), {"units": "1"}),
+                "volume_change": volume(found.mean_m * size_m2),
+                "volume_change_uncertainty": volume(found.mean_sigma_m * size_m2),
+                "volume_change_random_uncertainty": volume(float(np.sqrt(own.sum()))),
+                "volume_change_uncertainty_hartzell2015": volume(float(np.sqrt(published.sum()))),
+                "area_size": ((), size_m2, {"units": "m2"}),
+                "coverage": ((), found.coverage, {"units": "1"}),
                 "variance_share": on_map(own + shared),
-                "variance_share_hartzell2015": on_map(independent),
+                "variance_share_hartzell2015": on_map(published),
             },
             {"y": self._series.grid.y_m, "x": self._series.grid.x_m},
-        )  # fmt: skip
+        )
 
-    def _rasters(self, row: Row) -> tuple[Floats, Floats]:
-        """Change and sigma (ny, nx) of an epoch's cells [m]."""
+    def _sigma(self, row: Row, chosen: Bools) -> Floats:
+        """One sigma of chosen cells (n,) in an epoch, everything included [m]."""
         with netCDF4.Dataset(row.path) as file:
-            change_m, sigma_m = (
-                np.ma.filled(file[name][row.index].astype(np.float64), np.nan)
-                for name in (CHANGE, f"{CHANGE}_uncertainty")
-            )
-        return change_m, sigma_m
+            return _cells(file[f"{CHANGE}_uncertainty"], row.index, chosen)
 
-    def _shares(self, seen: Bools, epochs: list[Row]) -> tuple[Floats, Floats]:
-        """What each cell (ny, nx) adds to the variance of the volume [m⁶]: its own, the shared."""
-        held = [self._read(one, seen) for one in epochs]
-        weights = np.full(np.count_nonzero(seen), self._series.grid.cell_m**2)
-        total = np.where(seen, np.zeros((2, *seen.shape)), np.nan)
-        for one in held:
-            random_m2, unknown = one.random_m**2, one.unknown
-            if len(held) > 1:  # what one reference does not know is in both and goes
-                before_m2 = one.reference.random_variance_m2[seen]
-                random_m2 = np.maximum(random_m2 - before_m2, 0.0) + self._apart(held, seen) * before_m2
-            elif unknown is not None and not one.adjusted:
-                unknown = against(unknown, one.reference.shared)
+    def _contributions(
+        self, held: list[_Held], chosen: Bools, weights: Floats, random_m2: list[Floats]
+    ) -> tuple[Floats, Floats]:
+        """What each chosen cell (n,) adds to the variance of a weighted sum: its own, the shared."""
+        own, common = np.zeros(len(weights)), np.zeros(len(weights))
+        for one, own_m2 in zip(held, random_m2, strict=True):
+            own += weights**2 * own_m2
+            unknown = one.unknown
             if unknown is None:
-                total[0, seen] += weights**2 * random_m2
-            else:
-                total[:, seen] += contributions(weights, random_m2, self._felt(one, seen), unknown)
-        return total[0], total[1]
+                continue
+            if len(held) == 1 and not one.adjusted:
+                unknown = against(unknown, one.reference.shared)
+            common += shared_contributions(weights, self._felt(one, chosen), unknown)
+        return own, common
 
     def point_covariance(self, points_m: Floats, row: Row, scanner: Scanner) -> Floats:
         """Covariance (n, 3, 3) of points (n, 3) on the map in an epoch [m²]: shot, pose, lean, air.

@@ -220,14 +220,12 @@ def variance(of: Volume, covariance_m2: Floats, offset_m: Floats, basis: Basis, 
     return aggregate_variance(weights, own_m2, felt, unknown)
 
 
-def contributions(
-    weights: Floats, random_variance_m2: Floats, felt: Sensitivities, unknown: Shared
-) -> tuple[Floats, Floats]:
-    """What each cell or point (n,) adds to the variance of a weighted sum of heights: its own, the shared.
+def shared_contributions(weights: Floats, felt: Sensitivities, unknown: Shared) -> Floats:
+    """What each cell or point (n,) adds to the variance of a weighted sum of heights by what all share.
 
-    Both together sum up to `shared.aggregate_variance`. A shared part below nought is of a place that takes
-    away from what others add, as on the other side of a tilt's axis.
-    Source: EQUATIONS 6.2, term by term: a² σ_r² and a J C g.
+    With a² σ_r², its own, they sum up to `shared.aggregate_variance`. One below nought takes away from what
+    others add, as on the other side of a tilt's axis.
+    Source: EQUATIONS 6.2, term by term: a J C g.
     """
     of = felt.of
     back = unknown.covariance @ felt.total(weights)
@@ -241,7 +239,7 @@ def contributions(
         + felt.lean * (lean[lean_before] * (1 - lean_share) + lean[lean_after] * lean_share + own[felt.line])
         + felt.refraction * (bend[bend_before] * (1 - bend_share) + bend[bend_after] * bend_share)
     )
-    return weights**2 * random_variance_m2, weights * height_m2
+    return np.asarray(weights * height_m2)
 
 
 def net_variance(on_m6: float, off_m6: float) -> float:

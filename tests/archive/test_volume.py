@@ -1,8 +1,11 @@
 """Volumes of a simulated station, and the covariance of its points."""
 
+import json
+
 import numpy as np
 import pytest
 import shapely
+import xarray as xr
 
 import station
 from station.config import read_site
@@ -99,6 +102,20 @@ def test_an_area_is_a_polygon_or_cells(site, box):
     told, wanted = (station.volume(site, area, LAST) for area in (around, same))
     assert told.identical(wanted)
     assert 0 < told.coverage < 1
+    assert (np.isfinite(told.variance_share.values).sum() / same.sum()) == told.coverage
+
+
+def test_the_volume_is_that_of_the_areas(site):
+    """Voids and all: one number for one area."""
+    polygons = json.loads((site.parent / "areas.geojson").read_text(encoding="utf-8"))["features"]
+    with xr.open_dataset(read_site(site).station.data / "areas.nc") as areas:
+        for index, one in enumerate(polygons):
+            told = station.volume(site, shapely.geometry.shape(one["geometry"]), LAST)
+            for name in ("volume_change", "volume_change_uncertainty"):
+                assert told[name] == pytest.approx(float(areas[name][LAST, index]), rel=1e-6)
+
+
+def test_no_area(site):
     with pytest.raises(ValueError, match=r"an area of \(2, 2\) cells on a grid"):
         station.volume(site, np.ones((2, 2)), LAST)
     with pytest.raises(StoreError, match="none of the 0 cells has a change"):
