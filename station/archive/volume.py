@@ -37,8 +37,8 @@ class Volumes(Aggregates):
 
         As in `areas.nc`: cells without a change are interpolated; `coverage` is the share of the others.
         Three sigmas [m³]: with everything; of that the cells' own; and as published, the whole errors of
-        cells each their own. The maps hold the share of each cell in the variance of what was seen, and in the published
-        one; each sums up to 1. Raises StoreError where nothing was seen.
+        cells each their own. The maps hold the share of each cell in the variance of what was seen, and in
+        the published one; each sums up to 1. Raises StoreError where nothing was seen.
         """
         held = self._held(cells, row, other)
         chosen = _seen(held, cells)
