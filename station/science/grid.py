@@ -158,9 +158,10 @@ class Stack:
         """Take the step from the scan before, in units of what it should be."""
         if self._last is not None:
             before_m, before_m2 = self._last
-            steps = (mean_m - before_m) ** 2 / (variance_m2 + before_m2)
-            there = np.isfinite(steps)
-            self._steps[there] += np.minimum(steps[there], STEP_MOST**2)
+            expected_m2 = variance_m2 + before_m2
+            there = np.isfinite(mean_m - before_m) & (expected_m2 > 0)
+            steps = (mean_m - before_m)[there] ** 2 / expected_m2[there]
+            self._steps[there] += np.minimum(steps, STEP_MOST**2)
             self._pairs[there] += 1
         self._last = mean_m, variance_m2
 
