@@ -72,10 +72,10 @@ class Attribution:
         return told
 
     def of_area(self, name: str, chosen: Bools, *, simulate: bool = True) -> dict[str, Any] | None:
-        """Return the shares in the variance of the mean of the chosen cells (ny, nx); None where none has a change.
+        """Return the shares in the variance of the mean change of the chosen cells (ny, nx).
 
-        With `simulate`, Sobol indices of some of its cells too, and beside them the shares of the same cells to first
-        order; both take the inputs as independent of each other.
+        None where none has a change. With `simulate`, Sobol indices of some of its cells too, and beside them
+        the shares of the same cells to first order; both take the inputs as independent of each other.
         """
         inside = chosen[self.cells]
         if not inside.any():

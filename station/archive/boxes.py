@@ -1,4 +1,7 @@
-"""Boxes over time beside the lean of the scanner: Fig. 2 of Voordendag et al. (2023) from a station's own data."""
+"""Boxes over time beside the lean of the scanner.
+
+Fig. 2 of Voordendag et al. (2023) from a station's own data.
+"""
 
 from __future__ import annotations
 
@@ -9,7 +12,7 @@ import netCDF4
 import numpy as np
 from scipy import sparse
 
-from station.archive.aggregate import Aggregates
+from station.archive.aggregate import Aggregates, _Held
 from station.archive.layout import Series
 from station.archive.observed import some_epochs
 from station.archive.store import Row
@@ -26,9 +29,10 @@ LEAN = ("platform_roll", "platform_pitch")
 
 
 def box_statistics(series: Series, most: int, progress: Callable[[], None]) -> list[dict[str, Any]]:
-    """Return mean and scatter of the change in boxes, in at most so many epochs, with the lean of the scanner.
+    """Return mean and scatter of the change in boxes, and the lean of the scanner, epoch by epoch.
 
-    Boxes are spread evenly over the ranges that the reference knows. Empty where no epoch has a reference.
+    At most so many epochs, spread over the series. Boxes are spread evenly over the ranges that the reference
+    knows. Empty where no epoch has a reference.
     """
     some = some_epochs(series, most)
     if not some:
@@ -43,8 +47,6 @@ def box_statistics(series: Series, most: int, progress: Callable[[], None]) -> l
     for row in some:
         one = held._read(row, cells)  # noqa: SLF001 - the same room
         key = one.reference.version, one.scanner
-        if one.unknown is None:
-            continue
         if felt is None or felt[0] != key:
             places = _places(series.grid, cells, weights, one)
             felt = key, Sums(held._felt(one, cells)), places  # noqa: SLF001
@@ -55,12 +57,14 @@ def box_statistics(series: Series, most: int, progress: Callable[[], None]) -> l
 
 def _of_epoch(
     row: Row,
-    one: Any,
+    one: _Held,
     of: Ints,
     weights: sparse.csr_array,
     felt: Sums,
-    places: list[dict[str, float]],  # noqa: ANN401
+    places: list[dict[str, float]],
 ) -> list[dict[str, Any]]:
+    if one.unknown is None:
+        return []
     seen = np.isfinite(one.change_m)
     kept, share = renormalised(weights, seen)
     change_m = np.where(seen, one.change_m, 0.0)
@@ -74,7 +78,8 @@ def _of_epoch(
     return [
         {
             "time": start, **lean, "box": box + 1, **places[box], "seen": float(share[box]),
-            "mean_change_m": float(mean_m[box]), "sigma_m": float(sigma_m[box]), "scatter_m": float(scatter_m[box]),
+            "mean_change_m": float(mean_m[box]), "sigma_m": float(sigma_m[box]),
+            "scatter_m": float(scatter_m[box]),
         }
         for box in range(len(places)) if share[box] > 0
     ]  # fmt: skip
@@ -90,7 +95,9 @@ def _scanner(row: Row) -> tuple[float, float, float]:
 
 
 def _boxes(grid: Grid, known: Bools, eye_m: tuple[float, float]) -> tuple[Bools, Ints, sparse.csr_array]:
-    """Choose boxes: their cells (ny, nx), the box of each cell (n,), and the weights of their means (boxes, n)."""
+    """Choose boxes: their cells (ny, nx), the box of each cell (n,), the weights of their means (boxes,
+    n).
+    """
     nothing = np.zeros(grid.shape, bool), np.empty(0, np.int64), means(np.zeros(1, np.int64))
     if not np.isfinite(eye_m).all():
         return nothing
@@ -116,7 +123,7 @@ def _boxes(grid: Grid, known: Bools, eye_m: tuple[float, float]) -> tuple[Bools,
     return cells, of, means(of)
 
 
-def _places(grid: Grid, cells: Bools, weights: sparse.csr_array, one: Any) -> list[dict[str, float]]:  # noqa: ANN401
+def _places(grid: Grid, cells: Bools, weights: sparse.csr_array, one: _Held) -> list[dict[str, float]]:
     """Say where each box is and how it is seen."""
     row, column = np.nonzero(cells)
     east, north = (
@@ -124,7 +131,7 @@ def _places(grid: Grid, cells: Bools, weights: sparse.csr_array, one: Any) -> li
         for g in smooth_gradient(one.reference.elevation_m, grid.cell_m)
     )
     points = grid.x_m[column], grid.y_m[row], one.reference.elevation_m[cells]
-    view = View.of(points, one.scanner[:3], east, north)
+    view = View.of(points, (one.scanner[0], one.scanner[1], one.scanner[2]), east, north)
     columns = {
         "east_m": points[0], "north_m": points[1], "range_m": view.range_m,
         "incidence_deg": np.degrees(np.arccos(view.cos_incidence)),

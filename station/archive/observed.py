@@ -52,9 +52,10 @@ class Observed:
 
 
 def observe(series: Series, most: int, progress: Callable[[], None]) -> Observed:
-    """Compare change with its sigma on withheld stable ground, in at most so many epochs spread over the series.
+    """Compare change with its sigma on withheld stable ground.
 
-    Epochs that the reference was made of are left out: they know it. Raises StoreError where nothing is stored.
+    In at most so many epochs, spread over the series. Epochs that the reference was made of are left out:
+    they know it. Raises StoreError where nothing is stored.
     """
     found = list(_read(series, most, progress))
     if not found:
@@ -121,8 +122,8 @@ class _Ground:
                 weights = calibration.blocks(x_m, y_m, size_m)
                 self.sums[f"{size_m:g} m"] = weights, np.rint(weights @ band).astype(np.int64)
         self.band = band
-        self.all = calibration.means(np.zeros(len(row), np.int64))
-        self.all_of_band = calibration.means(band)
+        self.sums["all"] = calibration.means(np.zeros(len(row), np.int64)), np.array([-1])
+        self.sums["all of band"] = calibration.means(band), np.arange(len(self.bands))
         self.place = np.cumsum(self.cells.ravel()) - 1
         reach_m = float(np.hypot(np.ptp(x_m), np.ptp(y_m)))
         self.edges_m = np.geomspace(grid.cell_m, max(reach_m / 2, 4 * grid.cell_m), LAGS + 1)
@@ -153,9 +154,7 @@ class _Ground:
         """Return how the errors of an epoch compare with their sigma, by scale and band."""
         felt, (seen, change_m, random_m2) = self._felt(one), self._spread_out(one)
         z_of = {"cell": (one.change_m / one.sigma_m, self.band[self.place[one.cell]])}
-        for scale, (weights, band) in {
-            **self.sums, "all": (self.all, np.array([-1])), "all of band": (self.all_of_band, np.arange(len(self.bands))),
-        }.items():  # fmt: skip
+        for scale, (weights, band) in self.sums.items():
             kept, share = calibration.renormalised(weights, seen)
             z = (kept @ change_m) / np.sqrt(np.maximum(felt.variance(kept, random_m2, one.unknown), 1e-18))
             z_of[scale] = np.where(share >= BLOCK_SHARE, z, np.nan), band[: len(z)]
@@ -191,8 +190,8 @@ def _name(band: tuple[float, float]) -> str:
 def _one_epoch(one: _Seen, scale: str, band: str, z: Floats) -> dict[str, Any]:
     known = z[np.isfinite(z)]
     return {
-        "time": one.row.start.strftime("%Y-%m-%dT%H:%M:%SZ"), "scan_id": one.scan_id, "scale": scale, "band": band,
-        "z": known, **asdict(calibration.fit(known)),
+        "time": one.row.start.strftime("%Y-%m-%dT%H:%M:%SZ"), "scan_id": one.scan_id,
+        "scale": scale, "band": band, "z": known, **asdict(calibration.fit(known)),
     }  # fmt: skip
 
 

@@ -65,9 +65,9 @@ ERRATA = (
             " so that published volumes are 150 to 280 times too sure",
             "Σ a² σ_r² + gᵀ C g: `shared.aggregate_variance`"),
     Erratum(VOORDENDAG, "Eq. 2, 5", "a tilt that 23,000 shots share is divided by √n",
-            "tilt as a shared parameter; the printed form with `model = \"voordendag2023\"`"),
+            'tilt as a shared parameter; the printed form with `model = "voordendag2023"`'),
     Erratum(VOORDENDAG, "Eq. 3", "a linear sum of a standard deviation and a bound",
-            "quadrature; the printed form with `model = \"voordendag2023\"`"),
+            'quadrature; the printed form with `model = "voordendag2023"`'),
     Erratum(VOORDENDAG, "Eq. 10", "air of one density along the path; its growth below the scanner is left as noise,"
             " and changes of pressure are called insignificant",
             "a hydrostatic path from the station's own temperature and pressure: `air.air_correction`"),

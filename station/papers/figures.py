@@ -20,8 +20,8 @@ from station.science import air, beam, inclination, mobile, precision, sensitivi
 class Figure:
     """A number of a paper.
 
-    `printed` is what the paper says, None where it prints none; `right` what an independent computation gives;
-    `told` what this program gives. `error` says what the paper has otherwise, and why.
+    `printed` is what the paper says, None where it prints none; `right` what an independent computation
+    gives; `told` what this program gives. `error` says what the paper has otherwise, and why.
     """
 
     paper: str

@@ -50,8 +50,9 @@ def table(found: Sequence[Result]) -> str:
         printed = "-" if figure.printed is None else f"{figure.printed:.5g}"
         mark = "ok" if one.good else "NO"
         lines.append(
-            f"{mark:2} {figure.paper:15} {figure.equation:11} {figure.what:62} {printed:>9} {figure.right:>9.5g}"
-            f" {one.told:>9.5g} {figure.unit:7}{'! ' + figure.error if figure.error else ''}".rstrip()
+            f"{mark:2} {figure.paper:15} {figure.equation:11} {figure.what:62} {printed:>9}"
+            f" {figure.right:>9.5g} {one.told:>9.5g} {figure.unit:7}"
+            f"{'! ' + figure.error if figure.error else ''}".rstrip()
         )
     good = sum(one.good for one in found)
     lines.append(f"{good} of {len(found)} right within their tolerance; ! the paper has it otherwise")
@@ -62,7 +63,8 @@ def page(paper: Paper, found: Sequence[Result]) -> str:
     """Return the page of a paper in Markdown: numbers, errors, where its equations are."""
     rows = [
         f"| {f.what} | {f.equation} | {'–' if f.printed is None else f'{f.printed:.5g}'} | {f.right:.5g}"
-        f" ± {f.tolerance:.2g} | {one.told:.5g} | {f.unit} | {'' if one.good else '**not reproduced** '}{f.error} |"
+        f" ± {f.tolerance:.2g} | {one.told:.5g} | {f.unit}"
+        f" | {'' if one.good else '**not reproduced** '}{f.error} |"
         for one in found
         if (f := one.figure).paper == paper.key
     ]
@@ -73,7 +75,8 @@ def page(paper: Paper, found: Sequence[Result]) -> str:
             f"# {paper.authors}", "", f"{paper.title}", "", f"What it is for here: {paper.subject}.", "",
             "## Numbers", "",
             "Computed by the functions that measure; `right` is from an independent computation.", "",
-            "| what | equation | paper | right | here | unit | note |", "|---|---|---|---|---|---|---|", *rows, "",
+            "| what | equation | paper | right | here | unit | note |", "|---|---|---|---|---|---|---|",
+            *rows, "",
             f"Cannot be reproduced: {NOT_REPRODUCIBLE[paper.key]}.", "",
             "## Errors and open points", "",
             "| equation | in the paper | here |", "|---|---|---|", *wrong, "",
@@ -99,7 +102,7 @@ def write_pages(found: Sequence[Result], folder: Path) -> list[Path]:
 
 
 def _homes(paper: Paper) -> Iterator[tuple[str, str, str]]:
-    """Give every function and class of the science that names the paper: its name, what it gives, its source."""
+    """Give every function and class of the science that names the paper: name, what it gives, source."""
     for found in pkgutil.iter_modules(station.science.__path__):
         module = importlib.import_module(f"station.science.{found.name}")
         for name, member in inspect.getmembers(module):

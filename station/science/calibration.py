@@ -1,4 +1,4 @@
-"""Does the stated sigma match what stable ground shows?"""
+"""Whether the stated sigma matches what stable ground shows."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ SCALES_M = (10.0, 100.0)
 
 @dataclass(frozen=True)
 class Fit:
-    """How errors compare with their sigma: standard deviation of z, robust one, share within 95 %, how many."""
+    """How errors compare with their sigma: spread of z, a robust one, share within 95 %, how many."""
 
     z_std: float
     z_robust: float
@@ -38,7 +38,7 @@ def fit(z: Floats) -> Fit:
 
 @dataclass(frozen=True)
 class Scale:
-    """By what to multiply sigma so that it matches: the factor, its 95 % interval, whether it differs from 1."""
+    """By what to multiply sigma so that it matches, its 95 % interval, whether that is advised."""
 
     factor: float
     low: float
@@ -50,8 +50,8 @@ def scale(z_of_epochs: list[Floats]) -> Scale:
     """Return by what to multiply sigma, from the z of each epoch, oldest first.
 
     Of many values an epoch: the spread in the median epoch, and the interval of the order statistics; of few:
-    the root mean square of all, and the interval of chi-square. Epochs are taken as independent. It is advised where
-    the interval leaves out 1 and the factor is more than a tenth from it.
+    the root mean square of all, and the interval of chi-square. Epochs are taken as independent. It is
+    advised where the interval leaves out 1 and the factor is more than a tenth from it.
     """
     spreads = np.sort([found for z in z_of_epochs if np.isfinite(found := fit(z).z_robust)])
     count = len(spreads)
@@ -116,7 +116,8 @@ def renormalised(weights: sparse.csr_array, seen: Bools) -> tuple[sparse.csr_arr
     """Return weights (m, n) over the cells seen (n,) alone, and the share of each sum that was seen (m,)."""
     kept = weights @ sparse.diags_array(seen.astype(np.float64))
     share = np.asarray(kept.sum(axis=1)).ravel()
-    return sparse.csr_array(sparse.diags_array(1 / np.maximum(share, 1e-12)) @ kept), share
+    even = sparse.csr_array(sparse.diags_array(1 / np.maximum(share, 1e-12)) @ kept)
+    return even, np.asarray(share, dtype=np.float64)
 
 
 def pairs(x_m: Floats, y_m: Floats, edges_m: Floats, each: int, seed: int) -> tuple[Ints, Ints, Ints]:

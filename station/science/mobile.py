@@ -17,8 +17,8 @@ VARIABLES = (
     "horizontal_angle", "vertical_angle", "range", "zero_error",  # of the laser [rad, m]
 )  # fmt: skip
 
-# Leslar et al. (2014), Table 1; the inertial system's are not given there. 0.007 m in height is what the paper's
-# "about 12 %" beside the lever arm implies (EQUATIONS, section 8); attitude is taken as known.
+# Leslar et al. (2014), Table 1; the inertial system's are not given there. 0.007 m in height is what the
+# paper's "about 12 %" beside the lever arm implies (EQUATIONS, section 8); attitude is taken as known.
 INS_M = 0.007
 EXPECTED: dict[str, float] = {
     "x": INS_M, "y": INS_M, "z": INS_M,
@@ -26,11 +26,6 @@ EXPECTED: dict[str, float] = {
     "boresight_x": math.radians(0.02), "boresight_y": math.radians(0.02), "boresight_z": math.radians(0.02),
     "horizontal_angle": math.radians(0.0055), "vertical_angle": math.radians(0.0055),
     "range": 0.008, "zero_error": 0.01,
-}  # fmt: skip
-IDEAL: dict[str, float] = EXPECTED | {
-    "lever_x": 0.004, "lever_y": 0.004, "lever_z": 0.004,
-    "boresight_x": math.radians(0.001), "boresight_y": math.radians(0.001), "boresight_z": math.radians(0.001),
-    "range": 0.003, "zero_error": 0.005,
 }  # fmt: skip
 
 
@@ -64,7 +59,7 @@ def _east_north_up(latitude_rad: float, longitude_rad: float) -> Floats:
 
 
 def abeam(range_m: float) -> Floats:
-    """Return the variables (18,) of a level vehicle heading east on the equator, a point level to its left."""
+    """Variables (18,) of a level vehicle on the equator, heading east, and a point level to its left."""
     at = dict.fromkeys(VARIABLES, 0.0) | {
         "x": 6_378_137.0,
         "horizontal_angle": math.pi / 2,

@@ -1,4 +1,4 @@
-"""What a wrongly assumed scanner does to heights, turned and shifted in full: `shared` without its linearity."""
+"""What a wrongly assumed scanner does to heights, turned and shifted in full; `shared` to first order."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ from station.science.view import Points
 class Moved:
     """A weighted sum of the heights of cells, as a function of what the scan does not know.
 
-    Inputs are the shared parameters (p,), then two of unit variance: what lines have of their own, and what cells
-    have.
+    Inputs are the shared parameters (p,), then two of unit variance: what lines have of their own, and what
+    cells have.
     """
 
     ground: Ground

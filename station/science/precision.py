@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from scipy import optimize, special
@@ -49,8 +50,8 @@ class Planes:
 def sigma_range(residual_m: Floats, cos_incidence: Floats) -> Floats:
     """Standard deviation of ranges from that of shots across a plane [m].
 
-    A range error moves a shot along the beam, of which the plane's normal sees cos α: at 30° that is 15 % and at 45°
-    41 % more than the residual. Source: Ozendi et al. (2016), section 4, who do not divide.
+    A range error moves a shot along the beam, of which the plane's normal sees cos α: at 30° that is 15 % and
+    at 45° 41 % more than the residual. Source: Ozendi et al. (2016), section 4, who do not divide.
     """
     return residual_m / cos_incidence
 
@@ -103,10 +104,10 @@ def _mean(of: Ints, count: Ints, columns: Floats) -> Floats:
 
 @dataclass(frozen=True)
 class RangeModel:
-    """Standard deviation of a range by the brightness of its echo: a I^b + c; nought for a where I does not vary.
+    """Standard deviation of a range by the brightness of its echo: a I^b + c; a is nought where I is all one.
 
-    `typical_m` is that at the median brightness, `typical_error` its own relative error: beyond a third, the planes
-    do not tell it from the noise of the angles.
+    `typical_m` is that at the median brightness, `typical_error` its own relative error: beyond a third, the
+    planes do not tell it from the noise of the angles.
     """
 
     a_m: float
@@ -130,7 +131,7 @@ def _sigma(intensity: Floats | float, a_m: float, b: float, c_m: float) -> Float
 
 
 def by_class(planes: Planes) -> list[dict[str, float | str]]:
-    """Return the median σ of ranges by range, by incidence and by intensity, in quarters of the planes each."""
+    """Return the median σ of ranges by range, by incidence, by intensity, in quarters of the planes each."""
     told: list[dict[str, float | str]] = []
     for name, values in (
         ("range_m", planes.range_m),
@@ -138,11 +139,11 @@ def by_class(planes: Planes) -> list[dict[str, float | str]]:
         ("intensity", planes.intensity),
     ):
         edges = np.unique(np.quantile(values, (0.0, 0.25, 0.5, 0.75, 1.0)))
-        for low, high in zip(edges[:-1], edges[1:], strict=True):
+        for low, high in pairwise(edges.tolist()):
             inside = (values >= low) & ((values < high) | (high == edges[-1]))
             told.append(
                 {
-                    "by": name, "from": float(low), "to": float(high), "planes": float(np.count_nonzero(inside)),
+                    "by": name, "from": low, "to": high, "planes": float(np.count_nonzero(inside)),
                     "sigma_range_m": float(np.median(planes.sigma_range_m[inside])),
                 }
             )  # fmt: skip
@@ -152,9 +153,9 @@ def by_class(planes: Planes) -> list[dict[str, float | str]]:
 def fit_range_model(planes: Planes) -> RangeModel | None:
     """Fit σ_R = a I^b + c, and the angle noise, to planes; None where there are too few.
 
-    What lies across a plane is (σ_R cos α)² + (R σ_a sin α)²: without its second part the beam's width would be taken
-    for range noise wherever a surface is seen aslant. Variances are compared by their logarithms, and planes that
-    are rougher than others of their kind count little.
+    What lies across a plane is (σ_R cos α)² + (R σ_a sin α)²: without its second part the beam's width would
+    be taken for range noise wherever a surface is seen aslant. Variances are compared by their logarithms,
+    and planes that are rougher than others of their kind count little.
     """
     if len(planes.shots) < FEWEST_PLANES:
         return None
@@ -167,11 +168,8 @@ def fit_range_model(planes: Planes) -> RangeModel | None:
     varies = np.percentile(intensity, 90) > VARIES * max(float(np.percentile(intensity, 10)), FAINTEST)
 
     def of(at: Floats) -> tuple[float, float, float]:
-        return (
-            (float(np.exp(at[2])), float(at[3]), float(np.exp(at[0])))
-            if varies
-            else (0.0, 0.0, float(np.exp(at[0])))
-        )
+        c_m = float(np.exp(at[0]))
+        return (float(np.exp(at[2])), float(at[3]), c_m) if varies else (0.0, 0.0, c_m)
 
     def off(at: Floats) -> Floats:
         across_m2 = (_sigma(intensity, *of(at)) * planes.cos_incidence) ** 2 + (sine_m * np.exp(at[1])) ** 2
@@ -180,11 +178,16 @@ def fit_range_model(planes: Planes) -> RangeModel | None:
     guess = np.log(float(np.median(planes.sigma_range_m)) / 2)
     many = 4 if varies else 2
     start = np.array([guess, np.log(2e-5), guess - 1, -0.5])[:many]
-    bounds = (np.array([-16.0, -16.0, -25.0, -3.0])[:many], np.array([0.0, -2.0, 0.0, -0.05])[:many])
+    bounds = ([-16.0, -16.0, -25.0, -3.0][:many], [0.0, -2.0, 0.0, -0.05][:many])
     found = optimize.least_squares(off, start, loss="soft_l1", bounds=bounds)
     scatter = max(2 * found.cost / len(observed), 1.0)
-    covariance = scatter * np.linalg.inv(found.jac.T @ found.jac + 1e-9 * np.eye(many))
-    by = optimize.approx_fprime(found.x, lambda at: float(np.log(_sigma(middle, *of(at)))), 1e-6)
+    jacobian = np.asarray(found.jac, dtype=np.float64)
+    covariance = scatter * np.linalg.inv(jacobian.T @ jacobian + 1e-9 * np.eye(many))
+
+    def log_typical(at: Floats) -> float:
+        return float(np.log(_sigma(middle, *of(at))))
+
+    by = optimize.approx_fprime(found.x, log_typical, 1e-6)
     typical_m = float(_sigma(middle, *of(found.x)))
     error = float(np.sqrt(by @ covariance @ by))
     return RangeModel(*of(found.x), typical_m, error, float(np.exp(found.x[1])), len(observed))
@@ -194,8 +197,8 @@ def fit_range_model(planes: Planes) -> RangeModel | None:
 class AnglePrecision:
     """How well two scans of one scene repeat an angle, as a standard deviation of one scan [rad].
 
-    `sampling_rad` comes from each line having begun elsewhere, so that other spots were hit: it is no error of the
-    angles. `precision_rad` is what is left.
+    `sampling_rad` comes from each line having begun elsewhere, so that other spots were hit: it is no error
+    of the angles. `precision_rad` is what is left.
     """
 
     observed_rad: float
@@ -251,10 +254,10 @@ class _Raster:
 
 
 def angle_precision(scan_m: Floats, again_m: Floats) -> tuple[AnglePrecision, AnglePrecision] | None:
-    """Compare elevations and azimuths of two scans (n, 3) of one scene, in the order of shooting; None if too few.
+    """Compare elevations and azimuths of two scans (n, 3) of one scene, in the order of shooting.
 
-    Lines are set against the nearest of the other scan, and on them shots. The mean difference of a line, and what
-    grows along it, is the sampling.
+    Lines are set against the nearest of the other scan, and on them shots; None where too few match. The mean
+    difference of a line, and what grows along it, is the sampling.
     Source: Ozendi et al. (2016), section 4, who take the sum of both for the precision (EQUATIONS 3.8).
     """
     if min(len(scan_m), len(again_m)) < FEWEST_SHOTS:

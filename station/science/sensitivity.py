@@ -39,7 +39,8 @@ class Share:
     """What one input has of a variance, as shares of the whole.
 
     `part` adds up to 1 over all inputs and is negative where an input offsets others; `first` is what would
-    go if the input became known, `total` what would stay if all others did. All are one for independent inputs.
+    go if the input became known, `total` what would stay if all others did. All are one for independent
+    inputs.
     """
 
     part: float
@@ -80,8 +81,8 @@ def apart(unknown: Shared) -> Shared:
 def cell_shares(felt: Sensitivities, random_m2: Floats, unknown: Shared) -> dict[str, Floats]:
     """Part of each input in the variance of each cell's height (n,); they add up to 1.
 
-    Source: EQUATIONS 8.9. With correlated inputs a part is g_Gᵀ C g over gᵀ C g, of which half the variance with
-    the group alone, less half of that without it, is one half more than the other.
+    Source: EQUATIONS 8.9. With correlated inputs a part is g_Gᵀ C g over gᵀ C g, of which half the variance
+    with the group alone, less half of that without it, is one half more than the other.
     """
     shared_m2 = felt.variance(unknown)
     variance_m2 = shared_m2 + random_m2
@@ -159,8 +160,9 @@ def sobol(model: Model, draw: Draw, groups: list[Bools], draws: int = 256, seed:
         a, b = draw(draws, random), draw(draws, random)
         mixed = [np.where(of[:, None], b, a) for of in groups]
         values = model(np.concatenate([a, b, *mixed], axis=1)).reshape(len(groups) + 2, draws)
-        given = {"f_A": values[:1], "f_B": values[1:2], "f_AB": values[2:, None]}
-        indices = stats.sobol_indices(func=given, n=draws)
+        indices = stats.sobol_indices(
+            func={"f_A": values[:1], "f_B": values[1:2], "f_AB": values[2:, None]}, n=draws
+        )
         found.append((np.ravel(indices.first_order), np.ravel(indices.total_order)))
     first, total = np.moveaxis(np.array(found), 1, 0)
     error = np.sqrt(REPETITIONS)

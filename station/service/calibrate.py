@@ -40,8 +40,8 @@ TABLES = ("overall", "epochs", "variogram", "boxes")
 def calibrate(site: Site, scans: Sequence[Path], most_epochs: int, progress: Progress) -> Told:
     """Return stated against observed sigma, boxes beside the lean, and the precision of ranges and angles.
 
-    Ranges are of the newest of `scans`, angles of the two newest; where none is given, of those in the inbox. Raises
-    StoreError where there is neither a series nor a scan.
+    Ranges are of the newest of `scans`, angles of the two newest; where none is given, of those in the inbox.
+    Raises StoreError where there is neither a series nor a scan.
     """
     series = series_of(site)
     told: Told = {}
@@ -76,13 +76,13 @@ def _precision(site: Site, scans: Sequence[Path], progress: Progress) -> Told:
         "scans": [path.name for path in scans],
         "planes": by_class(planes) if model is not None else [],
         "range": None if model is None else asdict(model),
-        "angles": None if again is None else dict(zip(("elevation", "azimuth"), map(asdict, again), strict=True)),
+        "angles": None if again is None else {"elevation": asdict(again[0]), "azimuth": asdict(again[1])},
         "site_file": _keys(model, again),
     }  # fmt: skip
 
 
 def _shots(site: Site, path: Path) -> tuple[Floats, Floats]:
-    """Read the first shots of a scan: coordinates (n, 3) [m], and intensity (n,), of ones where it has none."""
+    """Read the first shots of a scan: coordinates (n, 3) [m], intensity (n,), ones where it has none."""
     points: list[Floats] = []
     bright: list[Floats] = []
     count = 0
@@ -151,14 +151,15 @@ def describe(told: Told) -> str:
 
 def _stated(told: Told) -> list[str]:
     lines = [
-        "Stated against observed: error over sigma on stable ground that no fit has seen (1 and 95 % are right)",
-        f"{'scale':8}{'range':>14}{'epochs':>8}{'errors':>9}{'sd':>7}{'robust':>8}{'in 95 %':>9}{'factor':>8}  95 % of it",
+        "Error over stated sigma on stable ground that no fit has seen; 1 and 95 % are right",
+        "scale            range  epochs   errors     sd  robust  in 95 %  factor  95 % of it",
     ]
     for row in told["overall"]:
         interval = f"{row['low']:.2f}-{row['high']:.2f}" if math.isfinite(row["factor"]) else ""
         lines.append(
             f"{row['scale']:8}{row['band']:>14}{row['epochs']:8}{row['count']:9}{_number(row['z_std'], 7)}"
-            f"{_number(row['z_robust'], 8)}{_number(100 * row['inside_95'], 9, 0)}{_number(row['factor'], 8)}  {interval}"
+            f"{_number(row['z_robust'], 8)}{_number(100 * row['inside_95'], 9, 0)}"
+            f"{_number(row['factor'], 8)}  {interval}"
             f"{'  multiply sigma by it' if row['advised'] else ''}"
         )
     lines += [
@@ -192,8 +193,8 @@ def _measured(found: Told) -> list[str]:
         lines.append("  range: too few planes")
     for name, angle in (found["angles"] or {}).items():
         lines.append(
-            f"  {name}, {angle['shots']} shots twice: {angle['precision_rad'] * 1e6:.2f} µrad; repeats differ by"
-            f" {angle['observed_rad'] * 1e6:.1f}, of which sampling {angle['sampling_rad'] * 1e6:.1f}"
+            f"  {name}, {angle['shots']} shots twice: {angle['precision_rad'] * 1e6:.2f} µrad; repeats differ"
+            f" by {angle['observed_rad'] * 1e6:.1f}, of which sampling {angle['sampling_rad'] * 1e6:.1f}"
         )
     if found["angles"] is None:
         lines.append("  angles: no two scans with lines in common")

@@ -22,7 +22,7 @@ KINDS = {
 
 
 def sensitivity(site: Site, epoch: int | str, maps: Path | None) -> Told:
-    """Return the shares of the inputs in the variance of an epoch's cells and areas; write maps where asked to.
+    """Return the shares of the inputs in the variance of an epoch's cells and areas, and write maps of them.
 
     Raises StoreError where the store holds nothing of the kind, or maps cannot be written.
     """
