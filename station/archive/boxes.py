@@ -95,9 +95,7 @@ def _scanner(row: Row) -> tuple[float, float, float]:
 
 
 def _boxes(grid: Grid, known: Bools, eye_m: tuple[float, float]) -> tuple[Bools, Ints, sparse.csr_array]:
-    """Choose boxes: their cells (ny, nx), the box of each cell (n,), the weights of their means (boxes,
-    n).
-    """
+    """Choose boxes: their cells (ny, nx), the box of each cell (n,), weights of their means (boxes, n)."""
     nothing = np.zeros(grid.shape, bool), np.empty(0, np.int64), means(np.zeros(1, np.int64))
     if not np.isfinite(eye_m).all():
         return nothing

@@ -59,12 +59,11 @@ def _east_north_up(latitude_rad: float, longitude_rad: float) -> Floats:
 
 
 def abeam(range_m: float) -> Floats:
-    """Variables (18,) of a level vehicle on the equator, heading east, and a point level to its left."""
-    at = dict.fromkeys(VARIABLES, 0.0) | {
-        "x": 6_378_137.0,
-        "horizontal_angle": math.pi / 2,
-        "range": range_m,
-    }
+    """Variables (18,) of a level vehicle on the equator, heading east, and a point level to its left.
+
+    Coordinates count from the vehicle: from the Earth's centre, differences would lose digits.
+    """
+    at = dict.fromkeys(VARIABLES, 0.0) | {"horizontal_angle": math.pi / 2, "range": range_m}
     return np.array([at[name] for name in VARIABLES])
 
 

@@ -50,14 +50,21 @@ def describe(told: Told) -> str:
             _line(f"  {says}", area[kind], area["sigma_m"] if kind == "part" else None)
             for kind, says in KINDS.items()
         ]
-        simulated = area["simulated"]
+        simulated, worst = area["simulated"], list[float]()
         lines.append(_line("  as if independent: linear", simulated["linear"], None))
         for order in ("first", "total"):
+            off = [
+                abs(simulated[order][key] - simulated["linear"][key])
+                / max(simulated[f"{order}_error"][key], 1e-3)
+                for key in INPUTS
+            ]
+            worst.append(max(off))
             lines.append(
                 _line(
                     f"  as if independent: Sobol {order}", simulated[order], None, simulated[f"{order}_error"]
                 )
             )
+        lines.append(f"  farthest apart by {max(worst):.1f} sampling errors")
     if told["maps"]:
         lines += ["", told["maps"]]
     return "\n".join(lines)
@@ -66,6 +73,8 @@ def describe(told: Told) -> str:
 def _line(
     name: str, shares: dict[str, float], sigma_m: float | None, errors: dict[str, float] | None = None
 ) -> str:
-    told = [f"{100 * shares[key]:.0f}" + (f" ± {100 * errors[key]:.0f}" if errors else "") for key in INPUTS]
+    told = [
+        f"{round(100 * shares[key]):d}" + (f" ± {100 * errors[key]:.0f}" if errors else "") for key in INPUTS
+    ]
     sigma = f"{sigma_m:10.4f}" if sigma_m is not None else " " * 10
     return f"{name:34}{sigma}" + "".join(f"{one:>{WIDTH}}" for one in told)
