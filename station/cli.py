@@ -221,7 +221,10 @@ def sensitivity(
     from station.service.sensitivity import describe
     from station.service.sensitivity import sensitivity as attribute
 
-    found = attribute(read_site(site), _epoch(epoch), maps)
+    try:
+        found = attribute(read_site(site), _epoch(epoch), maps)
+    except IndexError:
+        raise typer.BadParameter(f"the series has no epoch at place {epoch}") from None
     print(json.dumps(_plain(found), indent=2) if json_ else describe(found))
 
 
@@ -238,9 +241,13 @@ def papers(
 
     hartzell2015, voordendag2023, ozendi2016, leslar2014. Exits with 1 if one is not right.
     """
-    from station.papers.pages import known, results, table, write_pages
+    from station.papers.errata import PAPERS
+    from station.papers.pages import results, table, write_pages
 
-    found = results(known(paper).key if paper else None)
+    names = [one.key for one in PAPERS]
+    if paper is not None and paper not in names:
+        raise typer.BadParameter(f"choose from {', '.join(names)}")
+    found = results(paper)
     print(table(found))
     for path in write_pages(found, pages) if pages else []:
         print(path)

@@ -54,4 +54,7 @@ def test_a_wrong_number_is_seen_and_fails_the_command(monkeypatch):
     done = CliRunner().invoke(app, ["papers", "hartzell2015"])
     assert done.exit_code == 1
     assert done.output.splitlines()[1].startswith("NO hartzell2015")
-    assert "**not reproduced**" in pages.page(pages.known("hartzell2015"), pages.results())
+    assert "**not reproduced**" in pages.page(PAPERS[0], pages.results())
+    other = CliRunner().invoke(app, ["papers", "hartzel"])
+    assert other.exit_code == 2
+    assert "hartzell2015" in other.output

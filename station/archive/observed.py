@@ -20,6 +20,7 @@ from station.science.shared import against
 Told = list[dict[str, Any]]
 
 BLOCK_SHARE = 0.5  # of a block's cells that a scan must have seen
+RECENT = 50  # epochs that say by what to multiply sigma now
 LAGS = 8  # classes of distance
 PAIRS = 500  # of each
 
@@ -196,12 +197,12 @@ def _one_epoch(one: _Seen, scale: str, band: str, z: Floats) -> dict[str, Any]:
 
 
 def _overall(epochs: Told) -> Told:
-    """Take all epochs together, by scale and band, and say by what to multiply sigma."""
+    """Take all epochs together, by scale and band, and say by what to multiply sigma, by the newest of them."""
     told = []
     for scale, band in dict.fromkeys((one["scale"], one["band"]) for one in epochs):
         of = [one for one in epochs if (one["scale"], one["band"]) == (scale, band)]
         together = calibration.fit(np.concatenate([one["z"] for one in of]))
-        factor = calibration.scale([one["z"] for one in of])
+        factor = calibration.scale([one["z"] for one in of[-RECENT:]])
         told.append({"scale": scale, "band": band, "epochs": len(of), **asdict(together), **asdict(factor)})
     return told
 

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import station.science
-from station.errors import ConfigError, StoreError
+from station.errors import StoreError
 from station.papers.errata import ERRATA, NOT_REPRODUCIBLE, PAPERS, Paper
 from station.papers.figures import FIGURES, Figure
 
@@ -32,14 +32,6 @@ class Result:
 def results(paper: str | None = None) -> list[Result]:
     """Compute the figures of a paper, or of all."""
     return [Result(one, one.told()) for one in FIGURES if paper in {None, one.paper}]
-
-
-def known(key: str) -> Paper:
-    """Return a paper by its key; raise ConfigError where there is none."""
-    for paper in PAPERS:
-        if paper.key == key:
-            return paper
-    raise ConfigError(f"no paper is called {key}: choose from {', '.join(paper.key for paper in PAPERS)}")
 
 
 def table(found: Sequence[Result]) -> str:

@@ -28,12 +28,22 @@ class Fit:
 
 
 def fit(z: Floats) -> Fit:
-    """Compare errors in units of their sigma with a standard normal; NaN is passed over."""
+    """Compare errors in units of their sigma with a standard normal; NaN is passed over.
+
+    Spreads are about nought: what all errors have in common counts.
+    """
     z = z[np.isfinite(z)]
     if len(z) < FEWEST:
         return Fit(np.nan, np.nan, np.nan, len(z))
-    robust = float(stats.median_abs_deviation(z, scale="normal"))
-    return Fit(float(np.sqrt(np.mean(z**2))), robust, float(np.mean(np.abs(z) < LIMIT_95)), len(z))
+    return Fit(_rms(z), _robust(z), float(np.mean(np.abs(z) < LIMIT_95)), len(z))
+
+
+def _rms(z: Floats) -> float:
+    return float(np.sqrt(np.mean(z**2)))
+
+
+def _robust(z: Floats) -> float:
+    return float(np.median(np.abs(z)) / stats.norm.ppf(0.75))
 
 
 @dataclass(frozen=True)
@@ -47,28 +57,24 @@ class Scale:
 
 
 def scale(z_of_epochs: list[Floats]) -> Scale:
-    """Return by what to multiply sigma, from the z of each epoch, oldest first.
+    """Return by what to multiply sigma, from the z of each epoch.
 
-    Of many values an epoch: the spread in the median epoch, and the interval of the order statistics; of few:
-    the root mean square of all, and the interval of chi-square. Epochs are taken as independent. It is
-    advised where the interval leaves out 1 and the factor is more than a tenth from it.
+    The spread of all z, robust where epochs have many; its interval by leaving out one epoch after the other,
+    as errors within an epoch go together. It is advised where the interval leaves out 1 and the factor is
+    more than a tenth from it.
     """
-    spreads = np.sort([found for z in z_of_epochs if np.isfinite(found := fit(z).z_robust)])
-    count = len(spreads)
-    if count * 2 > len(z_of_epochs):
-        reach = int(np.ceil(LIMIT_95 * np.sqrt(count) / 2))
-        factor = float(np.median(spreads))
-        low, high = spreads[max((count - 1) // 2 - reach, 0)], spreads[min(count // 2 + reach, count - 1)]
-    else:
-        z = np.concatenate([np.asarray(one)[np.isfinite(one)] for one in z_of_epochs] or [np.empty(0)])
-        count = len(z)
-        if count < FEWEST_EPOCHS:
-            return Scale(np.nan, np.nan, np.nan, advised=False)
-        factor = float(np.sqrt(np.mean(z**2)))
-        low, high = (factor * np.sqrt(count / stats.chi2.ppf(p, count)) for p in (0.975, 0.025))
-    away = max(factor, 1 / max(factor, 1e-9)) > NEAR_ONE
-    advised = count >= FEWEST_EPOCHS and away and not low <= 1 <= high
-    return Scale(factor, float(low), float(high), bool(advised))
+    known = [z[np.isfinite(z)] for z in z_of_epochs if np.isfinite(z).any()]
+    count = len(known)
+    if count < FEWEST_EPOCHS:
+        return Scale(np.nan, np.nan, np.nan, advised=False)
+    spread = _robust if np.mean([len(z) for z in known]) >= FEWEST else _rms
+    log = np.log(spread(np.concatenate(known)))
+    without = [np.log(spread(np.concatenate(known[:at] + known[at + 1 :]))) for at in range(count)]
+    error = np.sqrt((count - 1) * np.var(without))
+    reach = stats.t.ppf(0.975, count - 1) * error
+    factor, low, high = (float(np.exp(one)) for one in (log, log - reach, log + reach))
+    away = max(factor, 1 / factor) > NEAR_ONE
+    return Scale(factor, low, high, advised=bool(away and not low <= 1 <= high))
 
 
 def range_bands(range_m: Floats) -> list[tuple[float, float]]:

@@ -20,6 +20,7 @@ FLAT = 0.2  # largest spread across a plane against the smaller one along it
 STEEPEST_COS = math.cos(math.radians(80.0))
 FEWEST_LINE = 10  # shots that two scans have in common on a line
 FEWEST_PLANES = 30
+ROUGHER = 1.2
 FAINTEST = 1e-3  # intensity
 VARIES = 1.5  # brightest to faintest tenth, below which nothing is learned of intensity
 
@@ -148,6 +149,11 @@ def by_class(planes: Planes) -> list[dict[str, float | str]]:
                 }
             )  # fmt: skip
     return told
+
+
+def is_rough(model: RangeModel, wider: RangeModel) -> bool:
+    """Tell whether planes fitted in wider windows are noisier: then it is the ground, and not the scanner."""
+    return wider.typical_m > ROUGHER * model.typical_m
 
 
 def fit_range_model(planes: Planes) -> RangeModel | None:

@@ -25,6 +25,7 @@ from station.science.precision import (
     by_class,
     find_planes,
     fit_range_model,
+    is_rough,
     window_for,
 )
 from station.service.tasks import series_of
@@ -33,6 +34,7 @@ Told = dict[str, Any]
 Progress = Callable[[], None]
 REPEATS = 2  # scans that are compared
 MOST_SHOTS = 2_000_000  # of a scan, from its beginning; more say nothing new of its noise
+WIDER = 1.7  # windows, to see whether the ground is rough
 TRUSTED = 1 / 3  # relative error of a range noise that is worth a key
 TABLES = ("overall", "epochs", "variogram", "boxes")
 
@@ -70,14 +72,16 @@ def _precision(site: Site, scans: Sequence[Path], progress: Progress) -> Told:
         progress()
     xyz_m, intensity = shots[-1]
     again = angle_precision(xyz_m, shots[0][0]) if len(shots) > 1 else None
-    planes = find_planes(xyz_m, intensity, window_for(xyz_m))
-    model = fit_range_model(planes)
+    width_rad = window_for(xyz_m)
+    planes, wide = (find_planes(xyz_m, intensity, width * width_rad) for width in (1.0, WIDER))
+    model, wider = fit_range_model(planes), fit_range_model(wide)
+    rough = model is not None and wider is not None and is_rough(model, wider)
     return {
         "scans": [path.name for path in scans],
         "planes": by_class(planes) if model is not None else [],
-        "range": None if model is None else asdict(model),
+        "range": None if model is None else asdict(model) | {"rough": rough},
         "angles": None if again is None else {"elevation": asdict(again[0]), "azimuth": asdict(again[1])},
-        "site_file": _keys(model, again),
+        "site_file": _keys(None if rough else model, again),
     }  # fmt: skip
 
 
@@ -184,6 +188,8 @@ def _measured(found: Told) -> list[str]:
         told = f"{model['typical_m'] * 1e3:.1f} mm ± {100 * model['typical_error']:.0f} %"
         if model["typical_error"] >= TRUSTED:
             told = "not told apart from that of the angles: every plane is seen too aslant or too far"
+        elif model["rough"]:
+            told = f"at most {told}: the ground is rough, scan walls or slabs more densely"
         lines.append(f"  range, {model['planes']} planes: {told}")
         if model["a_m"] > 0 and model["typical_error"] < TRUSTED:
             lines.append(f"    by intensity I: {model['a_m']:.2g} I^{model['b']:.2f} + {model['c_m']:.2g} m")

@@ -48,6 +48,15 @@ def test_its_interval_holds_the_truth_nineteen_times_of_twenty():
     assert np.isnan(calibration.scale([]).factor)
 
 
+def test_what_all_cells_of_an_epoch_have_in_common_counts():
+    rng = np.random.default_rng(7)
+    epochs = [rng.normal() + rng.normal(size=300) for _ in range(200)]
+    told = calibration.scale(epochs)
+    assert told.factor == pytest.approx(np.sqrt(2), rel=0.08)
+    assert told.low < np.sqrt(2) < told.high
+    assert told.high - told.low > 0.1  # 200 epochs, not 60,000 cells
+
+
 @pytest.mark.parametrize("farthest_m", [37.0, 560.0, 4500.0])
 def test_bands_of_range_hold_every_cell(farthest_m):
     bands = calibration.range_bands(np.array([1.0, farthest_m]))

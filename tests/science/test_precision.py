@@ -47,6 +47,22 @@ def test_range_noise_by_intensity_and_angle_noise_are_found():
     assert model.typical_error < 0.05
 
 
+def test_rough_ground_is_not_taken_for_noise():
+    """Bumps of 5 cm, a metre long, at 100 m: wider windows find them noisier. A wall stays as it is."""
+    rng = np.random.default_rng(9)
+    elevation, azimuth = rng.uniform(-0.05, 0.05, (2, 60_000))
+    for bumps_m, rough in ((0.05, True), (0.0, False)):
+        range_m = 100 / np.cos(azimuth) / np.cos(elevation) + 0.005 * rng.normal(size=60_000)
+        range_m += bumps_m * np.sin(600 * azimuth) * np.cos(700 * elevation)
+        xyz_m = beam.cartesian(range_m, elevation, azimuth)
+        width_rad = precision.window_for(xyz_m)
+        models = [
+            precision.fit_range_model(precision.find_planes(xyz_m, np.ones(60_000), width))
+            for width in (width_rad, 1.7 * width_rad)
+        ]
+        assert precision.is_rough(*models) == rough
+
+
 def test_scans_without_intensity_have_one_range_noise():
     xyz_m, bright = walls(lambda _: 0.005, seed=4)
     model = precision.fit_range_model(precision.find_planes(xyz_m, np.ones_like(bright), 0.02))
@@ -89,8 +105,8 @@ def test_classes_of_planes_tell_what_the_noise_hangs_on():
 def test_noise_of_a_simulated_scanner(range_noise_m, divergence_mrad):
     """Rock at 200-360 m, seen at 50-75°: the noise of ranges and the beam's width are told apart."""
     scenario = replace(
-        tiny(hours=1), azimuth_deg=(150.0, 160.0), elevation_deg=(-30.0, -15.0), lines=300, shots_per_line=450,
-        terrain_step_m=8.0, roughness_m=0.0, line_jitter_deg=0.0,
+        tiny(hours=1), azimuth_deg=(150.0, 160.0), elevation_deg=(-30.0, -15.0),
+        lines=300, shots_per_line=450, terrain_step_m=8.0, roughness_m=0.0, line_jitter_deg=0.0,
         range_noise_m=range_noise_m, beam_divergence_mrad=divergence_mrad,
     )  # fmt: skip
     shot = Station(scenario).scan(0)

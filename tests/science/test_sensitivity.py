@@ -123,13 +123,13 @@ def test_shares_of_cells_against_dense_algebra():
     random_m2 = rng.uniform(0.01, 0.1, len(felt)) ** 2
     told = cell_shares(felt, random_m2, unknown)
     assert sum(told.values()) == pytest.approx(np.ones(len(felt)), abs=1e-5)
-    J, C = dense(felt), unknown.covariance
-    total = np.einsum("ni,ij,nj->n", J, C, J) + random_m2 + (felt.variance(unknown) - felt.variance(
-        Shared(unknown.names, unknown.units, unknown.estimate, C, 0 * unknown.noise_variance)
+    effect, covariance = dense(felt), unknown.covariance
+    total = np.einsum("ni,ij,nj->n", effect, covariance, effect) + random_m2 + (felt.variance(unknown) - felt.variance(
+        Shared(unknown.names, unknown.units, unknown.estimate, covariance, 0 * unknown.noise_variance)
     ))  # fmt: skip
     for group in ("tilt", "refraction", "range"):
         of = members(unknown.names, group)
-        wanted = np.einsum("ni,ij,nj->n", J[:, of], C[of], J) / total
+        wanted = np.einsum("ni,ij,nj->n", effect[:, of], covariance[of], effect) / total
         assert told[group] == pytest.approx(wanted, rel=1e-4, abs=1e-5)
     assert any((values < -1e-3).any() for values in told.values())  # tied inputs offset each other
 
