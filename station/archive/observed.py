@@ -197,7 +197,7 @@ def _one_epoch(one: _Seen, scale: str, band: str, z: Floats) -> dict[str, Any]:
 
 
 def _overall(epochs: Told) -> Told:
-    """Take all epochs together, by scale and band, and say by what to multiply sigma, by the newest of them."""
+    """Take all epochs together, by scale and band; the newest say by what to multiply sigma."""
     told = []
     for scale, band in dict.fromkeys((one["scale"], one["band"]) for one in epochs):
         of = [one for one in epochs if (one["scale"], one["band"]) == (scale, band)]
