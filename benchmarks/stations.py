@@ -12,7 +12,7 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 from station.config import Site, read_site
-from station.service import tasks
+from station.service import references, tasks, upkeep
 from station.service.inbox import Arrival
 from station.simulation import files
 from station.simulation.scenario import Scenario, dense, named
@@ -119,9 +119,9 @@ def processed(home: Path, method: Method, *, keep: bool = False) -> list[dict[st
     count = site.reference.scans
     if not isinstance(count, int):
         raise TypeError("the simulation's site file counts its reference scans")
-    tasks.build_reference(site, arrivals[:count], "1", _quiet)
+    references.build_reference(site, arrivals[:count], "1", _quiet)
     outcomes = [asdict(tasks.process(site, arrival, _quiet)) for arrival in arrivals]
-    tasks.publish(site, _quiet)
+    upkeep.publish(site, _quiet)
     told.write_text(json.dumps(outcomes))
     return outcomes
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 import sys
-from datetime import datetime
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Annotated
 
@@ -27,6 +27,7 @@ app = typer.Typer(
 SiteArgument = Annotated[
     Path, typer.Argument(metavar="SITE", help="The site file (TOML).", show_default=False)
 ]
+TIMES = ["%Y-%m-%d", "%Y-%m-%dT%H:%M:%S", "%Y-%m-%dT%H:%M:%SZ"]
 Json = Annotated[bool, typer.Option("--json", help="Print JSON.")]
 
 
@@ -57,14 +58,22 @@ def init(
 
 
 @app.command()
-def check(site: SiteArgument, *, json_: Json = False) -> None:
+def check(
+    site: SiteArgument,
+    *,
+    store: Annotated[
+        bool, typer.Option("--store", help="Instead: prove the store against journal and checksums.")
+    ] = False,
+    json_: Json = False,
+) -> None:
     """Try site file, SOP, folders, weather, newest scan.
 
     Everything that can be known before going live; exits with 1 if something must be mended.
     """
-    from station.service.check import check as look
+    from station.service.check import check as try_all
+    from station.service.check import check_store
 
-    findings = look(site)
+    findings = check_store(site) if store else try_all(site)
     if json_:
         print(json.dumps(findings, indent=2))
     else:
@@ -92,6 +101,34 @@ def process(
     from station.service.once import one_line, process_scans
 
     sys.exit(process_scans(read_site(site), scans, lambda entry: print(one_line(entry), flush=True)))
+
+
+@app.command()
+def reprocess(
+    site: SiteArgument,
+    *,
+    from_: Annotated[
+        datetime | None,
+        typer.Option("--from", formats=TIMES, metavar="TIME", help="Only scans from then (UTC) on."),
+    ] = None,
+    to: Annotated[
+        datetime | None, typer.Option(formats=TIMES, metavar="TIME", help="Only scans before.")
+    ] = None,
+    scheduler: Annotated[
+        str | None,
+        typer.Option(metavar="ADDR", help="A Dask cluster: tcp://127.0.0.1:PORT or tls://HOST:PORT."),
+    ] = None,
+    dry_run: Annotated[bool, typer.Option("--dry-run", help="Only tell how many, and why.")] = False,
+) -> None:
+    """Redo what a changed SOP, setting, flag or log affects, and only that.
+
+    On all cores; interrupted, it goes on when started again. Exits with 3 if some scan is gone or set aside.
+    """
+    from station.config import read_site
+    from station.service.reprocess import reprocess as redo
+
+    begin, end = (moment.replace(tzinfo=UTC) if moment else None for moment in (from_, to))
+    sys.exit(redo(read_site(site), (begin, end), print, scheduler=scheduler, dry_run=dry_run))
 
 
 @app.command()

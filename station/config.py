@@ -78,6 +78,7 @@ class ScannerSection(Section):
     range_sigma_m: Annotated[float, Field(gt=0, le=1)]
     angle_resolution_deg: Annotated[float, Field(ge=0, le=1)]
     inclination_sigma_deg: Annotated[float, Field(gt=0, le=1)]
+    inclination_range_deg: Annotated[float, Field(gt=0, le=90)]
     range_max_m: Positive
 
     @model_validator(mode="before")
@@ -238,6 +239,26 @@ class AreasSection(Section):
     file: Path
 
 
+class FlagsSection(Section):
+    """A person's list of times whose epochs are not to be used."""
+
+    file: Path
+
+
+class RetentionSection(Section):
+    """What becomes of raw scans that are stored and verified."""
+
+    raw: Literal["leave", "move", "delete"] = "leave"
+    keep_days: NotNegative = 30.0
+    archive: Path | None = None
+
+    @model_validator(mode="after")
+    def _says_where(self) -> RetentionSection:
+        if self.raw == "move" and self.archive is None:
+            raise ValueError('raw = "move" needs archive, the folder to move scans to')
+        return self
+
+
 class ServiceSection(Section):
     """The running service."""
 
@@ -260,6 +281,8 @@ class SiteFile(Section):
     uncertainty: UncertaintySection = UncertaintySection()
     reference: ReferenceSection = ReferenceSection()
     areas: AreasSection | None = None
+    flags: FlagsSection | None = None
+    retention: RetentionSection = RetentionSection()
     service: ServiceSection = ServiceSection()
 
     @model_validator(mode="after")
@@ -296,6 +319,7 @@ class Site(SiteFile):
             range_sigma_m=given.range_sigma_m,
             angle_resolution_rad=math.radians(given.angle_resolution_deg),
             inclination_sigma_rad=math.radians(given.inclination_sigma_deg),
+            inclination_range_rad=math.radians(given.inclination_range_deg),
             range_max_m=given.range_max_m,
         )
 
@@ -307,28 +331,31 @@ class Site(SiteFile):
 
     @property
     def science_hash(self) -> str:
-        """Identify every setting that changes a number in the store (16 hex digits).
+        """Identify the settings that change numbers of every epoch (16 hex digits).
 
-        Where things lie and how long the service waits is left out.
+        What an epoch names itself is left out: its SOP, the air it was measured in, the flag on it.
         """
         told = self.model_dump(
             mode="json",
-            exclude={
-                "path": True,
-                "service": True,
-                "station": True,
-                "areas": True,  # their series is made anew from the epochs
-                "scans": {"inbox", "settle_s", "expected_every_s", "polling", "timeout_s", "name"},
-                "sop": True,  # an epoch names the SOP it was made with
-                "weather": {"file", "wait_s"},
-                "inclination": {"wait_s", "required", "suffix"},
-                "map": {"pop"},
+            include={
+                "scans": {"frame", "point_time"},
+                "scanner": True,
+                "map": {"crs", "origin", "vertical_datum"},
+                "grid": True,
+                "inclination": {"filter", "cutoff_hz", "mode"},
+                "weather": {"max_age_s"},
+                "air": True,
+                "adjustment": True,
+                "uncertainty": True,
+                "reference": True,
             },
         )
         if self.map.pop:
             told["pop"] = _sha256(self.map.pop)
         if isinstance(self.adjustment.stable, Path):
             told["adjustment"]["stable"] = _sha256(self.adjustment.stable)
+        if isinstance(self.reference.scans, Path):
+            told["reference"]["scans"] = _sha256(self.reference.scans)
         return hashlib.sha256(json.dumps(told, sort_keys=True).encode()).hexdigest()[:16]
 
 
@@ -364,7 +391,7 @@ def read_site(path: str | Path) -> Site:
         given = tomllib.loads(path.read_text(encoding="utf-8"))
     except OSError as error:
         raise ConfigError(f"{path}: cannot be read: {error.strerror}") from error
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as error:
         raise ConfigError(f"{path}: not valid TOML: {error}") from error
     try:
         site = Site.model_validate({**given, "path": path})
@@ -408,6 +435,8 @@ def _must_exist(site: Site) -> list[tuple[str, Path]]:
         files.append(("adjustment.stable", site.adjustment.stable))
     if site.areas:
         files.append(("areas.file", site.areas.file))
+    if site.flags:
+        files.append(("flags.file", site.flags.file))
     return files
 
 

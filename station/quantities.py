@@ -48,6 +48,7 @@ class Scanner:
     range_sigma_m: float  # of one shot
     angle_resolution_rad: float  # full width of one encoder step
     inclination_sigma_rad: float  # of one sample of the inclination log
+    inclination_range_rad: float  # farthest lean its sensor tells, either way
     range_max_m: float
 
 
@@ -227,6 +228,7 @@ class Reference:
     variance_factor: Floats32  # (ny, nx) of the cells' random variance as scans show it, against the modelled
     stable: Bools  # (ny, nx) found steep and without change
     habits: Habits  # of the station, as its scans show them
+    seen: Floats32  # (ny, nx) share of its scans that saw the cell; NaN where unknown
 
     @classmethod
     def given(cls, grid: Grid, version: str, elevation_m: Floats, stable: Bools | None = None) -> Reference:
@@ -244,4 +246,5 @@ class Reference:
             variance_factor=np.ones(grid.shape, np.float32),
             stable=np.zeros(grid.shape, bool) if stable is None else stable,
             habits=Habits(),
+            seen=np.full(grid.shape, np.nan, np.float32),
         )

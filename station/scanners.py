@@ -4,7 +4,8 @@ from __future__ import annotations
 
 # Published values: Voordendag et al. (2023), section 2.2 (VZ-6000); Hartzell et al. (2015), Table 1
 # (VZ-4000, LMS-Z390i). The papers give no range noise and no aperture for the VZ-6000, and nothing for the
-# VZ-400i: there the maker's data sheets stand in (RIEGL: 10 mm and 3 mm precision; 0.35 mrad, 1.55 µm).
+# VZ-400i: there the maker's data sheets stand in (RIEGL: 10 mm and 3 mm precision; 0.35 mrad, 1.55 µm), and
+# for how far the inclination sensors reach.
 SCANNERS: dict[str, dict[str, float]] = {
     "riegl-vz-6000": {
         "wavelength_um": 1.064,
@@ -13,6 +14,7 @@ SCANNERS: dict[str, dict[str, float]] = {
         "range_sigma_m": 0.010,
         "angle_resolution_deg": 0.0005,
         "inclination_sigma_deg": 0.008,
+        "inclination_range_deg": 10.0,
         "range_max_m": 6000.0,
     },
     "riegl-vz-4000": {
@@ -22,6 +24,7 @@ SCANNERS: dict[str, dict[str, float]] = {
         "range_sigma_m": 0.010,
         "angle_resolution_deg": 0.0005,
         "inclination_sigma_deg": 0.008,
+        "inclination_range_deg": 10.0,
         "range_max_m": 4000.0,
     },
     "riegl-vz-400i": {
@@ -31,6 +34,7 @@ SCANNERS: dict[str, dict[str, float]] = {
         "range_sigma_m": 0.003,
         "angle_resolution_deg": 0.0005,
         "inclination_sigma_deg": 0.008,
+        "inclination_range_deg": 10.0,
         "range_max_m": 800.0,
     },
     "riegl-lms-z390i": {
@@ -40,6 +44,7 @@ SCANNERS: dict[str, dict[str, float]] = {
         "range_sigma_m": 0.004,
         "angle_resolution_deg": 0.001,
         "inclination_sigma_deg": 0.008,
+        "inclination_range_deg": 10.0,
         "range_max_m": 400.0,
     },
 }

@@ -101,3 +101,24 @@ def test_areas_change_no_epoch(tmp_path):
     site = read(tmp_path, f'{GOOD}[areas]\nfile = "areas.geojson"\n')
     assert site.areas.file == tmp_path / "areas.geojson"
     assert site.science_hash == read(tmp_path, GOOD).science_hash
+
+
+def test_only_what_changes_numbers_of_every_epoch_changes_the_hash(tmp_path):
+    """Whatever an epoch names itself, and whatever keeps house, leaves it alone."""
+    columns = 'columns = {{ temperature_c = "{}", humidity_pct = "H", pressure_hpa = "P" }}'
+    weather = f'[weather]\nfile = "w.dat"\n{columns}\n'
+    (tmp_path / "flags.csv").write_text("from,to,reason\n")
+    one = read(tmp_path, GOOD + weather.format("T")).science_hash
+    for more in (
+        weather.format("T2"),  # other air: the epochs it changes tell by their own
+        weather.format("T") + '[flags]\nfile = "flags.csv"\n',
+        weather.format("T") + '[retention]\nraw = "delete"\n',
+        weather.format("T") + "[service]\nmemory_gb = 3\n",
+    ):
+        assert read(tmp_path, GOOD + more).science_hash == one
+    for more in (
+        weather.format("T") + "max_age_s = 60\n",
+        weather.format("T") + "[reference]\nscans = 3\n",
+        weather.format("T") + "[inclination]\ncutoff_hz = 0.1\n",
+    ):
+        assert read(tmp_path, GOOD + more).science_hash != one

@@ -10,7 +10,7 @@ import station
 from station.archive.aggregate import Aggregates
 from station.config import read_site
 from station.quantities import Quality
-from station.service import tasks
+from station.service import references, tasks, upkeep
 from station.service.inbox import Arrival
 from station.simulation.scenario import named
 from station.simulation.station import simulate
@@ -40,9 +40,9 @@ class Measured:
             log = log if self.site.inclination and log.is_file() else None
             status = path.stat()
             arrivals.append(Arrival(path.name, path, log, status.st_size, status.st_mtime_ns))
-        tasks.build_reference(self.site, arrivals[:REFERENCE], "1", lambda: None)
+        references.build_reference(self.site, arrivals[:REFERENCE], "1", lambda: None)
         self.outcomes = [tasks.process(self.site, arrival, lambda: None) for arrival in arrivals[first:]]
-        tasks.publish(self.site, lambda: None)
+        upkeep.publish(self.site, lambda: None)
         self.series = station.open(self.site.station.data).load()
         truth = xr.open_dataset(folder / "truth.nc").load()
         before = truth.change[:REFERENCE].mean("time")
@@ -237,5 +237,57 @@ def test_scenarios_a_station_must_stand(tmp_path, name):
     error, sigma, _ = measured.boxes()
     assert np.sqrt(np.mean(error**2)) < 0.04
     assert np.sqrt(np.mean((error / sigma) ** 2)) < 1.6
-    if name == "moved":
-        assert "moved?" in measured.outcomes[-1].reason
+    reasons = {"moved": "moved?", "fog": "of what scans usually see, nothing beyond 1"}
+    if name in reasons:
+        assert any(reasons[name] in outcome.reason for outcome in measured.outcomes)
+        assert {outcome.verdict for outcome in measured.outcomes} == {"good", "degraded"}
+    else:
+        assert not any("see" in outcome.reason for outcome in measured.outcomes)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("method", ["joint", "none"])
+def test_a_log_five_seconds_late_is_held_by_sigma(tmp_path, method):
+    """Too little to be told from a wave of 0.035°, and too little to matter."""
+    folder = tmp_path / "station"
+    simulate(folder, CALM)
+    for path in sorted((folder / "inbox").glob("*-incl.txt"))[REFERENCE:]:
+        head, *rows = path.read_text().splitlines()
+        late = (f"{float(row.split(',')[0]) + 5:.4f},{row.split(',', 1)[1]}" for row in rows)
+        path.write_text("\n".join([head, *late]) + "\n")
+    measured = Measured(folder, *([FILTERED] if method == "none" else []))
+    error, sigma, _ = measured.boxes()
+    assert np.sqrt(np.mean((error / sigma) ** 2)) < 1.3
+    assert {outcome.verdict for outcome in measured.outcomes} == {"good"}
+
+
+def cut_short(folder):
+    """Leave the last scan's first 70 % of the sweep."""
+    import laspy
+
+    path = max((folder / "inbox").glob("*.laz"))
+    scan = laspy.read(path)
+    time_s = np.asarray(scan.gps_time)
+    scan.points = scan.points[time_s < time_s.min() + 0.7 * np.ptp(time_s)]
+    scan.write(path)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("changes", "spoil", "verdict", "says"),
+    [
+        ({"fog_visibility_m": 700.0, "fog_hours": (3.0, 9.0)}, None, "unusable", "of what scans usually see"),
+        ({}, cut_short, "degraded", "partial sweep: nothing seen at azimuth"),
+        ({"moved_hour": 3.0, "moved_deg": 0.5, "moved_m": 0.05}, None, "degraded", "leans 0.4"),
+        ({"moved_hour": 3.0, "moved_deg": 3.0, "moved_m": 0.5}, None, "unusable", "moved, or another SOP?"),
+    ],
+    ids=["dense fog", "partial sweep", "knocked", "fallen"],
+)
+def test_what_befell_a_scan_is_its_verdict(tmp_path, changes, spoil, verdict, says):
+    folder = tmp_path / "station"
+    simulate(folder, replace(CALM, hours=REFERENCE + 1, **changes))
+    if spoil:
+        spoil(folder)
+    (outcome,) = Measured(folder).outcomes
+    assert outcome.verdict == verdict
+    assert says in outcome.reason

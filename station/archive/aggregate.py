@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import netCDF4
 import numpy as np
-import xarray as xr
 
 from station.archive.layout import Series, strings
 from station.archive.reference import read_reference
@@ -16,6 +15,9 @@ from station.errors import StoreError
 from station.quantities import Bools, Floats, Grid, Reference, Shared
 from station.science.shared import Sensitivities, against, aggregate_variance, basis, cell_sensitivities
 from station.science.terrain import smooth_gradient
+
+if TYPE_CHECKING:
+    import xarray as xr
 
 MARGIN_CELLS = 6  # that a smoothed gradient looks beyond a cell
 CHANGE, RANDOM = "elevation_change", "elevation_change_random_uncertainty"
@@ -113,6 +115,8 @@ class Aggregates:
         `point_count` is the sum. Shared errors are taken as one within a block. Rows and columns that fill
         no block are left out.
         """
+        import xarray as xr  # noqa: PLC0415 - the service does without
+
         grid = self._series.grid
         ny, nx = grid.ny // cells, grid.nx // cells
         if not ny or not nx:

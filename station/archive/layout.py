@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -59,7 +59,8 @@ def written_whole(path: Path) -> Iterator[Path]:
     except (OSError, RuntimeError) as error:  # the netCDF library loses the errno of a full disk
         raise StoreError(f"{path}: cannot be written: {error}") from error
     finally:
-        beside.unlink(missing_ok=True)
+        with suppress(OSError):  # where even that cannot be: the sweep takes it, in time
+            beside.unlink(missing_ok=True)
 
 
 def _sync_folders(folder: Path) -> None:
@@ -268,6 +269,11 @@ def text(values: Sequence[str], dim: str) -> np.ndarray[Any, Any]:
     length = TEXT_LENGTH[dim]
     told = np.array([value.encode("ascii", "replace")[:length] for value in values], dtype=f"S{length}")
     return netCDF4.stringtochar(told)
+
+
+def kept_of(value: str, dim: str) -> str:
+    """Return a string as it is read again: what `text` keeps of it."""
+    return value.encode("ascii", "replace")[: TEXT_LENGTH[dim]].decode()
 
 
 def strings(characters: np.ndarray[Any, Any]) -> list[str]:

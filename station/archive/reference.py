@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import json
 import os
-from dataclasses import asdict, fields
+from dataclasses import asdict, dataclass, fields
+from pathlib import Path
 from typing import Any
 
 import netCDF4
@@ -49,6 +51,7 @@ _ROWS = (
         "reference_stable", ("y", "x"), "i1", "ground found stable: steep and without change", None, None,
         flag_values=(0, 1), flag_meanings="other stable",
     ),
+    Variable("reference_seen", ("y", "x"), "f4", "share of the scans that saw the cell", "1", None, 3),
     Variable(
         "shared_parameter_noise_variance", ("parameter",), "f8",
         "variance of the lean of each group of scan lines beyond the parameter",
@@ -62,17 +65,75 @@ _ROWS = (
 )  # fmt: skip
 
 
-def write_reference(series: Series, reference: Reference) -> None:
+@dataclass(frozen=True)
+class Lineage:
+    """What a version of the reference was made from: `base` is the version whose moving ground it shares."""
+
+    base: str
+    science_hash: str = ""
+    replaces: tuple[str, ...] = ()  # versions of that base that nothing is to be measured from any more
+    made_from: tuple[dict[str, str], ...] = ()  # of each of its scans, what an epoch tells of its origin
+
+
+def path_of(series: Series, version: str) -> Path:
+    """Return the file of a version of the reference."""
+    return series.folder / f"reference_{version}.nc"
+
+
+def versions(series: Series) -> list[str]:
+    """Return the versions made by the station itself, oldest first."""
+    found = (path.stem.removeprefix("reference_") for path in series.folder.glob("reference_*.nc"))
+    return sorted((version for version in found if version.isdigit()), key=int)
+
+
+def current(series: Series) -> dict[str, Lineage]:
+    """Return the versions made by the station that epochs may be measured from, oldest first.
+
+    They share the moving ground of the newest, so that change counts from the same surface.
+    """
+    told = {version: read_lineage(series, version) for version in versions(series)}
+    if not told:
+        return {}
+    base = list(told.values())[-1].base
+    replaced = {version for lineage in told.values() for version in lineage.replaces}
+    return {
+        version: lineage
+        for version, lineage in told.items()
+        if lineage.base == base and version not in replaced
+    }
+
+
+def read_lineage(series: Series, version: str) -> Lineage:
+    """Return what a version was made from; raise StoreError where it cannot be read."""
+    path = path_of(series, version)
+    try:
+        with netCDF4.Dataset(path) as file:
+            known = set(file.ncattrs())
+            return Lineage(
+                base=str(file.base) if "base" in known else version,
+                science_hash=str(file.science_hash) if "science_hash" in known else "",
+                replaces=tuple(str(file.replaces).split()) if "replaces" in known else (),
+                made_from=tuple(json.loads(str(file.made_from))) if "made_from" in known else (),
+            )
+    except (OSError, RuntimeError, ValueError) as error:
+        raise StoreError(f"{path}: cannot be read: {error}") from error
+
+
+def write_reference(series: Series, reference: Reference, lineage: Lineage | None = None) -> None:
     """Write a version of the reference for good, and `reference.nc` as another name of the newest.
 
-    Raises StoreError where it cannot.
+    Without a lineage it stands for itself. Raises StoreError where it cannot.
     """
-    kept = series.folder / f"reference_{reference.version}.nc"
+    lineage = lineage or Lineage(reference.version)
+    kept = path_of(series, reference.version)
     with written_whole(kept) as beside, netCDF4.Dataset(beside, "w", clobber=False) as file:
         shared = reference.shared
         parameters = (shared.names, shared.units) if shared is not None else ((), ())
         lay_out(file, series, f"Reference surface of {series.name or series.station_id}", None, parameters)
         file.setncatts({"reference_version": reference.version, "scan_ids": " ".join(reference.scan_ids)})
+        file.setncatts({"base": lineage.base, "science_hash": lineage.science_hash})
+        file.setncatts({"replaces": " ".join(lineage.replaces)})
+        file.setncatts({"made_from": json.dumps(lineage.made_from)})
         file.setncatts({f"{HABIT}{name}": value for name, value in asdict(reference.habits).items()})
         values = {
             "reference_elevation": reference.elevation_m,
@@ -81,6 +142,7 @@ def write_reference(series: Series, reference: Reference) -> None:
             "reference_variance_factor": reference.variance_factor,
             "reference_intensity": reference.intensity,
             "reference_stable": reference.stable.astype(np.int8),
+            "reference_seen": reference.seen,
         }
         for row in _ROWS:
             if any(dim not in file.dimensions for dim in row.dims):
@@ -95,19 +157,50 @@ def write_reference(series: Series, reference: Reference) -> None:
             elif shared is not None:
                 noise = row.name == "shared_parameter_noise_variance"
                 variable[:] = shared.noise_variance if noise else shared.covariance
+    _name_newest(series, kept)
+
+
+def settle_reference(series: Series) -> None:
+    """Have `reference.nc` be the newest version, also where the power went between the two names.
+
+    Raises StoreError where it cannot.
+    """
+    newest = max(series.folder.glob("reference_*.nc"), key=_written_ns, default=None)
+    named = series.folder / "reference.nc"
+    if newest is not None and (not named.is_file() or _written_ns(named) < _written_ns(newest)):
+        _name_newest(series, newest)
+
+
+def _name_newest(series: Series, kept: Path) -> None:
     with written_whole(series.folder / "reference.nc") as beside:
         os.link(kept, beside)
 
 
+def _written_ns(path: Path) -> int:
+    return path.stat().st_mtime_ns
+
+
 def read_reference(series: Series, version: str | None = None) -> Reference | None:
     """Read the newest reference or a version; None where there is none; StoreError where it fits no grid."""
-    path = series.folder / ("reference.nc" if version is None else f"reference_{version}.nc")
+    path = series.folder / "reference.nc" if version is None else path_of(series, version)
     if not path.is_file():
         return None
     try:
         with netCDF4.Dataset(path) as file:
             return _read(file, series)
     except (OSError, RuntimeError, KeyError, IndexError) as error:
+        raise StoreError(f"{path}: cannot be read: {error}") from error
+
+
+def read_habits(series: Series) -> Habits:
+    """Read what the newest reference says of the station's habits; start values where there is none."""
+    path = series.folder / "reference.nc"
+    if not path.is_file():
+        return Habits()
+    try:
+        with netCDF4.Dataset(path) as file:
+            return _habits(file)
+    except (OSError, RuntimeError, AttributeError) as error:
         raise StoreError(f"{path}: cannot be read: {error}") from error
 
 
@@ -140,10 +233,13 @@ def _read(file: netCDF4.Dataset, series: Series) -> Reference:
         intensity=np.asarray(file["reference_intensity"][:].filled(np.nan), dtype=np.float32),
         variance_factor=np.asarray(file["reference_variance_factor"][:].filled(1.0), dtype=np.float32),
         stable=np.asarray(file["reference_stable"][:]) == 1,
-        habits=Habits(
-            **{field.name: float(file.getncattr(f"{HABIT}{field.name}")) for field in fields(Habits)}
-        ),
+        seen=np.asarray(file["reference_seen"][:].filled(np.nan), dtype=np.float32),
+        habits=_habits(file),
     )
+
+
+def _habits(file: netCDF4.Dataset) -> Habits:
+    return Habits(**{field.name: float(file.getncattr(f"{HABIT}{field.name}")) for field in fields(Habits)})
 
 
 def _squared(variable: netCDF4.Variable[Any]) -> Floats32:

@@ -6,20 +6,23 @@ import re
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import h5py
 import netCDF4
 import numpy as np
-import xarray as xr
 
 from station.archive.layout import Series, define, lay_out, put_raster, strings, text, written_whole
 from station.archive.variables import BY_NAME, TERMS, VARIABLES, VERDICTS
 from station.errors import StoreError
 from station.quantities import Grid, Measurement, Shared
 
+if TYPE_CHECKING:
+    import xarray as xr
+
 STAMP = "%Y%m%dT%H%M%SZ"
 JOINED = {"days": "%Y%m%d", "months": "%Y%m"}  # kinds of joined files, by how each names its time
+AIR = ("air_temperature", "air_pressure", "relative_humidity")  # variables, told where weather was known
 _EPOCH_NAME = re.compile(r"_(\d{8}T\d{6}Z)(?:_r(\d+))?\.nc$")
 
 
@@ -62,17 +65,18 @@ class Row:
     time_s: float
 
 
-def write_epoch(series: Series, epoch: Epoch) -> Stored:
+def write_epoch(series: Series, epoch: Epoch, newer_than: int = 0) -> Stored:
     """Write an epoch beside the series; raise StoreError where it cannot, and leave nothing then.
 
-    A second epoch of the same start is a new revision; no file is ever changed.
+    A second epoch of the same start is a new revision, also where the journal remembers one (`newer_than`)
+    whose file is lost; no file is ever changed.
     """
     start = datetime.fromtimestamp(epoch.start_s, UTC)
-    known = [one.revision for one in revisions(series, start)]
+    known = [0, *(one.revision for one in revisions(series, start))]
     for kind, stamp in JOINED.items():  # after the sweep an epoch may be there only
         for path in joined(series, kind, start.strftime(stamp)):
             known += [row.revision for row in rows_in(path) if row.start == start]
-    revision = 1 + max(known, default=0)
+    revision = 1 + max(newer_than, *known)
     tail = f"_r{revision}" if revision > 1 else ""
     path = epoch_folder(series, start) / f"{series.station_id}_{start.strftime(STAMP)}{tail}.nc"
     with written_whole(path) as beside, netCDF4.Dataset(beside, "w", clobber=False) as file:
@@ -188,6 +192,16 @@ def said(path: Path) -> dict[str, str]:
         raise StoreError(f"{path}: cannot be read: {error}") from error
 
 
+def air_in(path: Path) -> tuple[float, ...]:
+    """Return the air an epoch was measured in, () where it is not known; raise StoreError if unreadable."""
+    try:
+        with netCDF4.Dataset(path) as file:
+            found = [file[name][0] for name in AIR if name in file.variables]
+    except (OSError, RuntimeError) as error:
+        raise StoreError(f"{path}: cannot be read: {error}") from error
+    return () if len(found) < len(AIR) or np.ma.is_masked(found[0]) else tuple(map(float, found))
+
+
 def folder_of(site_or_folder: str | Path) -> Path:
     """Return the data folder of a site file, or the folder itself."""
     place = Path(site_or_folder)
@@ -218,6 +232,8 @@ def open_series(site_or_folder: str | Path) -> xr.Dataset:
 
     Raises StoreError where there is none, or where a file it points to is gone: that would read as missing.
     """
+    import xarray as xr  # noqa: PLC0415 - a fifth of the service's start, which does without
+
     place = folder_of(site_or_folder)
     path = place / "series.nc"
     if not path.is_file():

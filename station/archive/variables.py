@@ -173,6 +173,7 @@ VARIABLES: tuple[Variable, ...] = (
         flag_meanings=" ".join(VERDICTS),
     ),
     Variable("verdict_reason", ("time", "sentence"), "S1", "why the verdict is not good"),
+    Variable("flag", ("time", "sentence"), "S1", "why a person says that the epoch is not to be used"),
     Variable("platform_roll", ("time",), "f8", "mean roll of the scanner by its sensor", "degree"),
     Variable("platform_pitch", ("time",), "f8", "mean pitch of the scanner by its sensor", "degree"),
     Variable("tilt_residual", ("time",), "f8", "noise of the filtered inclination log", "degree"),

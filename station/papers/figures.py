@@ -11,7 +11,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from station.quantities import Air, Floats, Scanner
+from station.config import ScannerSection
+from station.quantities import Air, Floats
 from station.scanners import SCANNERS
 from station.science import air, beam, inclination, mobile, precision, sensitivity, uncertainty
 
@@ -113,7 +114,7 @@ def _density(range_m: float, incidence_deg: float, slope_deg: float) -> float:
 
 def _cell(range_m: float, incidence_deg: float, slope_deg: float, points: float) -> float:
     seen = _seen(range_m, incidence_deg, slope_deg)
-    scanner = Scanner("vz-6000", 1.064, _DIVERGENCE, 0.0, 0.01, 0.0, 0.0, 6000.0)
+    scanner = ScannerSection.model_validate({"model": "riegl-vz-6000"}).instrument
     variance_m2 = uncertainty.shot_variance_voordendag(*seen, np.array([0.0]), scanner)
     return math.sqrt(_one(variance_m2) / points)
 

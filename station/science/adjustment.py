@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy import linalg, sparse
 
-from station.quantities import Bools, Floats, Habits, Shared
+from station.quantities import Bools, Floats, Shared
 from station.science.patches import CHI2_MEDIAN, Kind, Patches
 from station.science.shared import GLOBAL, Basis, Sensitivities, by_knots, lines_from_knots
 
@@ -21,8 +21,6 @@ ROUNDS = 8
 SETTLED_M = 0.0001  # a round that moves the patches by less is the last
 ROUNDS_TRUSTING = 2  # until the scatter is known: else whole lines are left out that moving ground pulls away
 TRUSTED = 0.1  # weight of a patch that has not been left out
-MOST_REFUSED = 0.3  # of the stable ground, before an adjustment is doubted
-MOVED_SIGMAS = 4.0  # of what the station does from scan to scan
 TUKEY = 4.685  # 95 % efficient for normal errors
 SCATTER_M = (0.002, 0.02)  # least and most that stable patches differ by beyond their cells' random errors
 SCATTER_MOST_M = 1.0  # the same of moving ones
@@ -81,26 +79,6 @@ class Adjustment:
     def shared(self) -> Shared:
         """The same by knots, for the store."""
         return by_knots(self.of, self.estimate, self.covariance)
-
-
-def distrust(found: Adjustment, habits: Habits) -> list[str]:
-    """Say what speaks against an adjustment: nothing stable to hold on to, or unusual motion."""
-    reasons = []
-    if not len(found.stable_weight):
-        reasons.append("no stable ground seen")
-    elif found.refused > MOST_REFUSED:
-        reasons.append(f"stable ground disagrees with itself: {found.refused:.0%} of it left out")
-    tilt_rad = float(np.hypot(*found.estimate[:2]))
-    if tilt_rad > MOVED_SIGMAS * habits.tilt_rad:
-        reasons.append(f"scanner leans {np.degrees(tilt_rad):.3f} degree from its SOP: moved?")
-    for name, place, habit, unit in (
-        ("turned", slice(2, 3), habits.heading_rad, "rad"),
-        ("shifted", slice(3, 6), habits.translation_m, "m"),
-    ):
-        size = float(np.linalg.norm(found.estimate[place]))
-        if size > MOVED_SIGMAS * habit:
-            reasons.append(f"scanner {name} by {size:.2g} {unit} against its SOP: moved?")
-    return reasons
 
 
 def turned(felt: Sensitivities, assumed_rad: Floats) -> Floats:

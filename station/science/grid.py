@@ -120,9 +120,10 @@ class Stack:
         self.grid = grid
         self.count = np.zeros(grid.shape)
         self._residual, self._variance, self._within, self._freedom = (np.zeros(grid.shape) for _ in range(4))
-        self._bright, self._lit, self._steps, self._pairs = (
-            np.zeros(grid.shape, np.float32) for _ in range(4)
+        self._bright, self._lit, self._steps, self._pairs, self._seen = (
+            np.zeros(grid.shape, np.float32) for _ in range(5)
         )
+        self._scans = 0
         self._last: tuple[Floats32, Floats32] | None = None
 
     def add(
@@ -134,6 +135,8 @@ class Stack:
         """
         count = gridder.count.reshape(self.grid.shape).astype(np.float64)
         seen = count > 0
+        self._seen += seen
+        self._scans += 1
         self.count += count
         mean_m = gridder.mean_residual()
         if correction_m is not None:
@@ -166,6 +169,10 @@ class Stack:
         bright = np.full(self.grid.shape, np.nan, np.float32)
         np.divide(self._bright, self._lit, out=bright, where=self._lit > 0, casting="same_kind")
         return bright
+
+    def seen(self) -> Floats32:
+        """Share of the scans that saw each cell (ny, nx)."""
+        return self._seen / np.float32(max(self._scans, 1))
 
     def variance_factor(self, classes: Ints) -> Floats32:
         """Random variance that cells show from scan to scan against the modelled (ny, nx).

@@ -10,7 +10,6 @@ from scipy import ndimage, signal
 
 from station.quantities import Floats, HeadTrack, InclinationLog, Tilt
 
-SENSOR_RANGE_RAD = math.radians(15.0)  # beyond the ±10° of RIEGL's sensors it is a fault, not a lean
 SENSOR_STEP_RAD = math.radians(0.001)  # the log's last digit
 HAMPEL_HALF_WIDTH = 7  # samples
 HAMPEL_SIGMAS = 5.0
@@ -21,17 +20,23 @@ GENTLE_CUTOFF_HZ = 0.82 / 61
 BLACKMAN_CUTOFF = 0.82  # -3 dB frequency of an N-sample Blackman window times N, EQUATIONS 2.8
 CYCLE_PRIOR_RAD = math.radians(0.05)  # largest cyclic error seen at Helheim, EQUATIONS 2.7
 OFFSET_PRIOR_S = 2.5  # clocks differ by up to 5 s, taken as two sigma: Voordendag et al. (2023), section 3.1
+OFFSET_LARGEST_S = 600.0  # one sigma of a clock that nobody sets
+OFFSET_SIGMAS = 5.0  # of what is thought of clocks, before a log refutes it
+OFFSET_ROUNDS = 4
+OFFSET_STEP_S = 10.0
+# What a mount moves within two scans, that of the wave and this one, with its drift: EQUATIONS 6.3, 6.4.
+MOTION_RAD, MOTION_S = math.radians(0.003), 300.0
 
 
-def clean(log: InclinationLog) -> tuple[InclinationLog, int]:
+def clean(log: InclinationLog, range_rad: float) -> tuple[InclinationLog, int]:
     """Return the log without what no sensor can have meant, and how many rows that was.
 
-    Goes: not a number, beyond the sensor's range, time not increasing, spikes (Hampel: five robust sigmas
-    from the median of the fifteen neighbours).
+    Goes: not a number, at the end of the sensor's range or beyond, time not increasing, spikes (Hampel: five
+    robust sigmas from the median of the fifteen neighbours).
     """
     columns = np.stack([log.time_s, log.roll_rad, log.pitch_rad])
     columns = columns[:, np.all(np.isfinite(columns), axis=0)]
-    columns = columns[:, np.all(np.abs(columns[1:]) <= SENSOR_RANGE_RAD, axis=0)]
+    columns = columns[:, np.all(np.abs(columns[1:]) < range_rad - SENSOR_STEP_RAD / 2, axis=0)]
     if columns.shape[1]:
         columns = columns[:, np.diff(np.maximum.accumulate(columns[0]), prepend=-np.inf) > 0]
     if columns.shape[1] > 2 * HAMPEL_HALF_WIDTH:
@@ -42,6 +47,12 @@ def clean(log: InclinationLog) -> tuple[InclinationLog, int]:
         columns = columns[:, ~np.any(spike, axis=0)]
     kept = InclinationLog(columns[0], columns[1], columns[2])
     return kept, len(log.time_s) - len(kept.time_s)
+
+
+def pegged(log: InclinationLog, range_rad: float) -> float:
+    """Share of an uncleaned log's rows that lie at the end of the sensor's range or beyond."""
+    lean_rad = np.maximum(np.abs(log.roll_rad), np.abs(log.pitch_rad))
+    return float(np.mean(lean_rad >= range_rad - SENSOR_STEP_RAD / 2)) if len(lean_rad) else 0.0
 
 
 @dataclass(frozen=True)
@@ -92,34 +103,53 @@ def clock_offset(log: InclinationLog, track: HeadTrack, zero: Cycle, sigma_rad: 
     """How late the log's clock is against the scan's, and its uncertainty [s].
 
     The known wave is fitted to the log with free mean, amplitude and phase; phase over head speed is time.
-    A prior of ±5 s (two sigma) draws it to nought where the wave is too small to tell.
+    What the mount moves in earnest looks like phase too, and is part of the uncertainty. That clocks agree to
+    5 s (two sigma) draws it to nought where the wave is too small to tell, unless the log refutes it.
     Source: EQUATIONS 2.10.
     """
-    inside = (log.time_s >= track.time_s[0]) & (log.time_s <= track.time_s[-1])
-    time_s = log.time_s[inside]
-    if len(time_s) < 60:
-        return 0.0, OFFSET_PRIOR_S
+    late_s, sigma_s = 0.0, OFFSET_LARGEST_S
+    for _ in range(OFFSET_ROUNDS):
+        time_s = log.time_s - late_s
+        inside = (time_s >= track.time_s[0]) & (time_s <= track.time_s[-1])
+        if np.count_nonzero(inside) < 60:
+            return 0.0, OFFSET_PRIOR_S
+        more_s, sigma_s = _later(
+            time_s[inside], log.roll_rad[inside], log.pitch_rad[inside], track, zero, sigma_rad
+        )
+        late_s += more_s
+    if abs(late_s) > OFFSET_SIGMAS * math.hypot(sigma_s, OFFSET_PRIOR_S):
+        return late_s, sigma_s
+    worth = OFFSET_PRIOR_S**2 / (OFFSET_PRIOR_S**2 + sigma_s**2)
+    return late_s * worth, sigma_s * math.sqrt(worth)
+
+
+def _later(
+    time_s: Floats, roll_rad: Floats, pitch_rad: Floats, track: HeadTrack, zero: Cycle, sigma_rad: float
+) -> tuple[float, float]:
+    """How much later than thought a log is by its wave, and the uncertainty [s]."""
+    part = ((time_s - time_s[0]) / OFFSET_STEP_S).astype(np.int64)
+    _, part = np.unique(part, return_inverse=True)
+    count = np.bincount(part)
     azimuth_rad = head_azimuth(track, time_s)
     speed_rad_s = np.gradient(azimuth_rad, time_s)
-    one = np.ones_like(time_s)
-    nought = np.zeros_like(time_s)
-    rows = []
-    for lean_rad, wave, mean in (
-        (log.roll_rad[inside], zero.roll_rad, (one, nought)),
-        (log.pitch_rad[inside], zero.pitch_rad, (nought, one)),
-    ):
-        cos, sin = np.cos(azimuth_rad), np.sin(azimuth_rad)
+    cos, sin = np.cos(azimuth_rad), np.sin(azimuth_rad)
+    middle_s = np.bincount(part, time_s) / count
+    moved = MOTION_RAD**2 * np.exp(-np.abs(np.subtract.outer(middle_s, middle_s)) / MOTION_S)
+    root = np.linalg.cholesky(moved + np.diag(sigma_rad**2 / count))
+    # Amplitude changes by ±20 % between scans, EQUATIONS 2.7.
+    normal = np.diag([1 / OFFSET_LARGEST_S**2, 1 / 0.2**2, 0.0, 0.0])
+    right = np.zeros(4)
+    for axis, (lean_rad, wave) in enumerate(((roll_rad, zero.roll_rad), (pitch_rad, zero.pitch_rad))):
         shape = wave[1] * cos + wave[2] * sin
         late = (wave[1] * sin - wave[2] * cos) * speed_rad_s
-        rows.append(np.stack([late, shape, *mean, lean_rad - wave[0] - shape], axis=-1))
-    table = np.concatenate(rows) / sigma_rad
-    design, wanted = table[:, :4], table[:, 4]
-    normal = design.T @ design
-    normal[0, 0] += 1 / OFFSET_PRIOR_S**2
-    normal[1, 1] += 1 / 0.2**2  # amplitude changes by ±20 % between scans, EQUATIONS 2.7
-    covariance = np.linalg.pinv(normal, hermitian=True)
-    estimate = covariance @ (design.T @ wanted)
-    return float(np.clip(estimate[0], -10.0, 10.0)), float(math.sqrt(covariance[0, 0]))
+        mean = [np.full_like(time_s, axis == other) for other in (0, 1)]
+        columns = [late, shape, *mean, lean_rad - wave[0] - shape]
+        means = np.stack([np.bincount(part, column) / count for column in columns], axis=-1)
+        white = np.linalg.solve(root, means)
+        normal += white[:, :4].T @ white[:, :4]
+        right += white[:, :4].T @ white[:, 4]
+    covariance = np.linalg.inv(normal)
+    return float((covariance @ right)[0]), float(math.sqrt(covariance[0, 0]))
 
 
 def blackman(samples: int) -> Floats:
@@ -180,6 +210,7 @@ class Lean:
     memory_s: float
     cutoff_hz: float
     offset_s: float
+    offset_sigma_s: float
     gap_s: float
 
 
@@ -205,11 +236,11 @@ def relative_lean(
     before the filter does its work, so that the filter's ends have little left to spoil.
     Source: EQUATIONS 2.5, 2.8-2.10; absolute lean and SOP together would apply it twice.
     """
-    offset_s = 0.0
+    offset_s, offset_sigma_s = 0.0, OFFSET_PRIOR_S
     azimuth_rad = np.zeros_like(log.time_s)
     time_s = log.time_s
     if track is not None:
-        offset_s, _ = clock_offset(log, track, zero, sigma_rad)
+        offset_s, offset_sigma_s = clock_offset(log, track, zero, sigma_rad)
         time_s = log.time_s - offset_s
         azimuth_rad = head_azimuth(track, time_s)
     zero_roll, zero_pitch = zero.at(azimuth_rad)
@@ -236,5 +267,6 @@ def relative_lean(
         memory_s=step_s / float(np.sum(weights**2)),
         cutoff_hz=BLACKMAN_CUTOFF / (len(weights) * step_s),
         offset_s=offset_s,
+        offset_sigma_s=offset_sigma_s,
         gap_s=float(np.max(np.diff(time_s))),
     )

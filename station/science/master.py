@@ -67,6 +67,7 @@ def master(
         variance_factor=factor,
         stable=stable,
         habits=habits,
+        seen=stack.seen(),
     )
 
 
@@ -89,6 +90,7 @@ def improved(base: Reference, stack: Stack, position_m: Position, version: str, 
         variance_factor=factor,
         stable=stable,
         habits=habits,
+        seen=stack.seen(),
     )
 
 

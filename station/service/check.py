@@ -11,11 +11,15 @@ from pathlib import Path
 
 from station.config import Site, read_site
 from station.errors import NotReadyError, ScanError, StationError
+from station.readers.flags import read_flags
 from station.readers.scan import suffixes
 from station.readers.weather import air_at, read_weather
 from station.service import child
 from station.service.gather import frame_of
-from station.service.once import arrival_of
+from station.service.integrity import prove
+from station.service.journal import Journal
+from station.service.lock import in_use
+from station.service.places import arrival_of
 from station.service.tasks import areas_of, polygons, rehearse, series_of
 
 Finding = dict[str, str]  # level (ok, warning, fault), what, says
@@ -31,10 +35,30 @@ def check(site_path: Path) -> list[Finding]:
         *_pose(site),
         *_polygons(site),
         *_folders(site),
+        *_flags(site),
         *_clock(),
         *_weather(site),
         *_newest_scan(site),
     ]
+
+
+def check_store(site_path: Path) -> list[Finding]:
+    """Prove the store against the journal and the checksums, also beside a running service.
+
+    Raises ConfigError where the site file cannot be read, StoreError where the journal cannot.
+    """
+    site = read_site(site_path)
+    found = _proved(site)
+    if in_use(site.station.data) and any(level != "ok" for level, *_ in found):
+        again = _proved(site)  # what the service was at meanwhile is no finding
+        found = [one for one in again if one[0] == "ok" or one in found]
+    return [_finding(level, what, says) for level, what, says in found]
+
+
+def _proved(site: Site) -> list[tuple[str, str, str]]:
+    with Journal(site.station.data / "journal.sqlite", read_only=True) as journal:
+        entries, known = journal.rows(), journal.files()
+    return child.run(prove, site, entries, known, memory_gb=site.service.memory_gb, timeout_s=math.inf)
 
 
 def _finding(level: str, what: str, says: str) -> Finding:
@@ -91,6 +115,9 @@ def _folders(site: Site) -> Iterator[Finding]:
         yield _finding("fault", "inbox", f"{inbox}: may not be read")
     else:
         yield _finding("ok", "inbox", f"{inbox}: {len(_scans(site))} scans")
+    if site.retention.raw != "leave" and not os.access(inbox, os.W_OK):
+        says = f"{inbox}: may not be written, but retention.raw is {site.retention.raw!r}"
+        yield _finding("warning", "retention", says)
     place = next(parent for parent in (data, *data.parents) if parent.exists())
     if not os.access(place, os.W_OK | os.X_OK):
         yield _finding("fault", "data", f"{place}: may not be written")
@@ -101,6 +128,16 @@ def _folders(site: Site) -> Iterator[Finding]:
     )
     says = f"{data}: {free / 1e9:.1f} GB free; a day of hourly epochs takes up to {need / 1e9:.2f} GB"
     yield _finding("ok" if free > need else "warning", "data", says)
+
+
+def _flags(site: Site) -> Iterator[Finding]:
+    """Tell how many bad intervals a person has noted."""
+    if site.flags is None:
+        return
+    try:
+        yield _finding("ok", "flags", f"{site.flags.file}: {len(read_flags(site.flags.file))} intervals")
+    except StationError as error:
+        yield _finding("fault", "flags", str(error))
 
 
 def _clock() -> Iterator[Finding]:

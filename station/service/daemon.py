@@ -159,6 +159,7 @@ class Daemon:
         try:
             worker.take(arrival)
         except StationError:
+            self._is_recovered = False  # it may have been broken off between file and journal
             raise
         except Exception as bug:  # the one place: a bug that one scan wakes must not keep the others out
             log.exception(logfmt(scan=arrival.name, verdict="later", reason="a bug: please report it"))
@@ -217,6 +218,7 @@ class Daemon:
         else:
             self._let_go()
             self._site, self._parts, self._refused_site = site, parts, ""
+            self._due.add(Wake.SWEEP)  # which tells how many epochs another setting made
             log.info(logfmt(reload="done", station=site.station.id))
         self._heart.ready()
 

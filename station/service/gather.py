@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import math
 from dataclasses import asdict, dataclass
 from datetime import datetime, timedelta
 from pathlib import Path
@@ -16,7 +17,7 @@ from station.config import Origin, Site, SopSection
 from station.errors import ConfigError, NotReadyError, ScanError
 from station.pipeline import Pose, Setup, Told
 from station.quantities import Air, Habits, HeadTrack, InclinationLog, Shared
-from station.readers.inclination import read_inclination
+from station.readers.inclination import in_week_of, read_inclination
 from station.readers.scan import ScanReader, open_scan
 from station.readers.sop import read_matrix, sop_for
 from station.readers.weather import air_at, read_weather
@@ -24,8 +25,11 @@ from station.science import inclination, pose, prior, shared
 from station.science.air import air_correction, standard_air
 from station.science.inclination import LEVEL, Cycle, Lean
 
-MOST_OF_THE_SCAN = 0.8  # of its time a log must cover to be the scan's log
+MOST_OF_THE_SCAN = 0.97  # of its time a log covers, unless it is late or short
 FEWEST_ROWS = 20  # of a log that is worth filtering
+PEGGED_MOST = 0.1  # of a log, at the end of its sensor's range
+LATE_S = 4.0  # of a log's clock, and so many sigmas, before it is told
+LATE_SIGMAS = 3.0
 
 
 @dataclass(frozen=True)
@@ -75,11 +79,11 @@ def gather(
     if track is None and site.scans.point_time == "auto":
         lacking.append("no time per point: one mean lean for the whole scan")
     log = _log(site, log_path, track, lacking)
-    zero = _kept_zero(site, sop_id)
+    zero = kept_zero(site, sop_id)
     if zero is None:
         zero = _zero_lean(site, sop, reader, log, track, lacking)
-        if zero is not None and keep_zero:
-            _keep_zero(site, sop_id, zero)
+        if zero is not None and keep_zero and zero != LEVEL:  # absolute: nothing that the SOP holds
+            write_zero(site, sop_id, zero)
     lean = _lean(site, log, track, zero, lacking)
     air, weather_known = _air(site, start + (end - start) / 2, frame.position_m[2], lacking)
     rotation = frame.to_local[:3, :3]
@@ -137,8 +141,9 @@ def setup_of(
 
 
 def sop_identity(sop: SopSection) -> str:
-    """Return a name that changes with the SOP's content."""
-    return f"{sop.file.stem}-{hashlib.sha256(sop.file.read_bytes()).hexdigest()[:8]}"
+    """Return a name that changes with the SOP's content, and with the scan it is said to be solved from."""
+    told = sop.file.read_bytes() + (f"\n{sop.scan}".encode() if sop.scan else b"")
+    return f"{sop.file.stem}-{hashlib.sha256(told).hexdigest()[:8]}"
 
 
 def frame_of(site: Site, sop: SopSection) -> pose.Frame:
@@ -190,12 +195,32 @@ def _log(site: Site, path: Path | None, track: HeadTrack | None, lacking: list[s
     if site.inclination is None:
         return None
     if path is None:
-        lacking.append("inclination log missing")
+        if site.inclination.required:
+            lacking.append("inclination log missing")
         return None
     try:
-        log, dropped = inclination.clean(read_inclination(path))
+        log = _clean(site, read_inclination(path), lacking)
     except ScanError as error:
         lacking.append(f"inclination log unusable: {error}")
+        return None
+    if log is None or track is None:
+        return log
+    log = in_week_of(log, float(track.time_s[0]))
+    return log if _covers(log, track, lacking) else None
+
+
+def _clean(site: Site, told: InclinationLog, lacking: list[str]) -> InclinationLog | None:
+    """Return the good rows of a log, None where too few are or the sensor was out of its range."""
+    assert site.inclination is not None  # noqa: S101 - the caller's case
+    range_rad = site.instrument.inclination_range_rad
+    log, dropped = inclination.clean(told, range_rad)
+    pegged = inclination.pegged(told, range_rad)
+    if pegged > PEGGED_MOST:
+        if site.inclination.required:
+            lacking.append(
+                f"lean out of the inclination sensor's range of {math.degrees(range_rad):g} degree in"
+                f" {pegged:.0%} of its log, which is not used"
+            )
         return None
     rows = len(log.time_s)
     if rows < FEWEST_ROWS:
@@ -203,7 +228,7 @@ def _log(site: Site, path: Path | None, track: HeadTrack | None, lacking: list[s
         return None
     if dropped > 0.1 * (dropped + rows):
         lacking.append(f"inclination log bad: {dropped} of {dropped + rows} rows dropped")
-    return log if track is None or _covers(log, track, lacking) else None
+    return log
 
 
 def _covers(log: InclinationLog, track: HeadTrack, lacking: list[str]) -> bool:
@@ -236,6 +261,10 @@ def _lean(
     lean = inclination.relative_lean(log, track, zero, sigma_rad, cutoff_hz, filtered=filtered)
     if lean.gap_s > 2 * lean.memory_s:
         lacking.append(f"inclination log has a gap of {lean.gap_s:.0f} s")
+    if abs(lean.offset_s) > max(LATE_S, LATE_SIGMAS * lean.offset_sigma_s):
+        lacking.append(
+            f"clock of the inclination log {lean.offset_s:+.1f} s off, known to {lean.offset_sigma_s:.1f} s"
+        )
     if track is None:
         return inclination.without_time(lean)
     return lean
@@ -245,7 +274,7 @@ def _zero_file(site: Site, sop_id: str) -> Path:
     return site.station.data / "lean_zero" / f"{sop_id}.json"
 
 
-def _kept_zero(site: Site, sop_id: str) -> Cycle | None:
+def kept_zero(site: Site, sop_id: str) -> Cycle | None:
     """Return the lean an SOP holds, as found when it was first needed."""
     if site.inclination is None or site.inclination.mode == "absolute":
         return None
@@ -256,7 +285,8 @@ def _kept_zero(site: Site, sop_id: str) -> Cycle | None:
     return Cycle(tuple(told["roll_rad"]), tuple(told["pitch_rad"]))
 
 
-def _keep_zero(site: Site, sop_id: str, zero: Cycle) -> None:
+def write_zero(site: Site, sop_id: str, zero: Cycle) -> None:
+    """Keep the lean that an SOP holds."""
     path = _zero_file(site, sop_id)
     with written_whole(path) as beside:
         beside.write_text(json.dumps(asdict(zero)))
@@ -296,7 +326,8 @@ def _log_of(site: Site, stem: str) -> tuple[InclinationLog | None, HeadTrack | N
         return None, None
     with open_scan(scans[0], range_max_m=site.scanner.range_max_m) as reader:
         track = reader.head_track()
-    return inclination.clean(read_inclination(log_path))[0], track
+    log, _ = inclination.clean(read_inclination(log_path), site.instrument.inclination_range_rad)
+    return log, track
 
 
 def _fit(log: InclinationLog, track: HeadTrack | None, sigma_rad: float) -> Cycle:

@@ -10,7 +10,7 @@ import time
 from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Any
 
-from station.errors import NotReadyError, StoreError
+from station.errors import NotReadyError, StationError, StoreError
 from station.readers.scan import suffixes
 from station.service.inbox import is_scan, list_folder, quoted
 from station.service.journal import Entry, Journal, State
@@ -161,6 +161,8 @@ def status(site: Site) -> Status:
         "waiting": waiting,
         "set_aside": set_aside,
         "last": _last(last) if last else None,
+        "moved": _moved(site),
+        "stale": _stale(site),
         "series": str(data / "series.nc") if (data / "series.nc").exists() else None,
         "disk_free_gb": round(shutil.disk_usage(data).free / 1e9, 2) if data.is_dir() else None,
         "faults": [
@@ -180,9 +182,14 @@ def describe(found: Status) -> str:
         words = " ".join(f"{key}={value}" for key, value in last["figures"].items() if value is not None)
         reason = f" ({last['reason']})" if last["reason"] else ""
         lines.append(f"last     {last['scan']} of {last['start']}: {last['verdict']}{reason} {words}")
+    if stale := found["stale"]:
+        lines.append(
+            f"stale    {stale} epochs made with another SOP, setting, flag or reference: station reprocess"
+        )
     free = found["disk_free_gb"]
     lines.append(f"disk     {f'{free:.2f} GB free' if free is not None else 'no data folder yet'}")
     lines.append(f"series   {found['series'] or 'none yet'}")
+    lines += [f"moved    {found['moved']}"] if found["moved"] else []
     lines += [f"fault    {fault}" for fault in found["faults"]]
     for one in found["waiting"]:
         then = f", next try {one['next_try']}" if one["next_try"] else ""
@@ -216,6 +223,27 @@ def _last(entry: Entry) -> Status:
         "reference": entry.reference,
         "figures": figures,
     }
+
+
+def _moved(site: Site) -> str:
+    from station.service.moved import moved  # noqa: PLC0415 - a status without series needs none of it
+
+    try:
+        return moved(site) if (site.station.data / "series.nc").is_file() else ""
+    except StoreError as error:
+        return str(error)
+
+
+def _stale(site: Site) -> int | None:
+    """Return how many epochs today's settings would make otherwise; None where that cannot be told now."""
+    if not (site.station.data / "series.nc").is_file():
+        return 0
+    from station.service.stale import count_by_settings  # noqa: PLC0415 - a second of imports
+
+    try:
+        return count_by_settings(site)
+    except StationError:
+        return None
 
 
 def _room_fault(site: Site) -> str:

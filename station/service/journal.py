@@ -9,12 +9,13 @@ from __future__ import annotations
 import json
 import sqlite3
 import time
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, fields
 from enum import StrEnum
 from typing import TYPE_CHECKING, NamedTuple, Self
 
 from station.errors import StoreError
+from station.service.journal_file import explain, open_to_read, open_to_write
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Mapping
@@ -23,29 +24,7 @@ if TYPE_CHECKING:
 FIRST_PAUSE_S = 30.0  # before a scan that was not ready is tried again; doubled each time
 LONGEST_PAUSE_S = 3600.0
 
-_SCHEMA = """
-CREATE TABLE IF NOT EXISTS scan (
-    name TEXT PRIMARY KEY,
-    size INTEGER NOT NULL,
-    mtime_ns INTEGER NOT NULL,
-    state TEXT NOT NULL CHECK (state IN ('waiting', 'stored', 'set_aside', 'later')),
-    waits_for TEXT NOT NULL DEFAULT '',
-    reason TEXT NOT NULL DEFAULT '',
-    sha256 TEXT,
-    outcome TEXT CHECK (outcome IN ('stored', 'set_aside')),
-    verdict TEXT,
-    epoch TEXT,
-    start_utc_s REAL,
-    revision INTEGER,
-    reference TEXT,
-    figures TEXT NOT NULL DEFAULT '{}',
-    attempts INTEGER NOT NULL DEFAULT 0,
-    next_try_utc_s REAL,
-    seen_utc_s REAL NOT NULL,
-    changed_utc_s REAL NOT NULL
-) STRICT;
-CREATE INDEX IF NOT EXISTS scan_by_sha256 ON scan (sha256);
-"""
+_OF_EPOCH = ("sha256", "log_sha256", "verdict", "reason", "epoch", "start_utc_s", "revision", "reference")
 
 
 class State(StrEnum):
@@ -61,9 +40,9 @@ class State(StrEnum):
 class Entry:
     """One row of the journal.
 
-    `waits_for` says why it is not done yet. `sha256`, `outcome` and `reason` are of the content that was
-    last judged; `epoch` (relative to the data folder), `start_utc_s`, `revision`, `reference` and `figures`
-    of the content that was last stored: they stay when a worse file comes under the same name.
+    `waits_for` says why it is not done yet. `sha256`, `log_sha256`, `outcome` and `reason` are of the content
+    that was last judged; `epoch` (relative to the data folder), `start_utc_s`, `revision`, `reference` and
+    `figures` of the content that was last stored: they stay when a worse file comes under the same name.
     """
 
     name: str
@@ -73,6 +52,7 @@ class Entry:
     waits_for: str
     reason: str
     sha256: str | None
+    log_sha256: str
     outcome: State | None
     verdict: str | None
     epoch: str | None
@@ -112,9 +92,9 @@ class Journal:
         self._notes = path.parent / "set_aside"
         self._now_s = now_s
         try:
-            self._rows = _open_to_read(path) if read_only else _open_to_write(path)
+            self._rows = open_to_read(path) if read_only else open_to_write(path)
         except sqlite3.Error as error:
-            raise StoreError(_explain(path, error)) from error
+            raise StoreError(explain(path, error)) from error
 
     def close(self) -> None:
         """Let go of the file."""
@@ -176,14 +156,22 @@ class Journal:
         reference: str | None = None,
         reason: str = "",
         figures: Mapping[str, float | str] | None = None,
+        log_sha256: str = "",
+        epoch_sha256: str = "",
     ) -> None:
-        """Note that a scan is in the store; `figures` are what `station status` shows of it."""
+        """Note that a scan is in the store, and the checksum of its epoch.
+
+        `figures` are what `station status` shows of it.
+        """
         with self._commit():
+            if epoch_sha256:
+                self._note_file(epoch, epoch_sha256)
             self._change(
                 name,
                 state=State.STORED,
                 outcome=State.STORED,
                 sha256=sha256,
+                log_sha256=log_sha256,
                 verdict=verdict,
                 waits_for="",
                 reason=reason,
@@ -195,9 +183,10 @@ class Journal:
                 attempts=0,
                 next_try_utc_s=None,
             )
-        self._note(name).unlink(missing_ok=True)
+        with suppress(OSError):  # it is stored all the same
+            self._note(name).unlink(missing_ok=True)
 
-    def set_aside(self, name: str, reason: str, *, sha256: str | None = None) -> None:
+    def set_aside(self, name: str, reason: str, *, sha256: str | None = None, log_sha256: str = "") -> None:
         """Note that a scan cannot be used, and why, here and in `set_aside/<name>.txt`."""
         try:
             self._notes.mkdir(exist_ok=True)
@@ -210,6 +199,7 @@ class Journal:
                 state=State.SET_ASIDE,
                 outcome=State.SET_ASIDE,
                 sha256=sha256,
+                log_sha256=log_sha256,
                 waits_for="",
                 reason=reason,
                 attempts=0,
@@ -250,15 +240,53 @@ class Journal:
                 [(now_s, name) for name in names],
             )
 
+    def adopt(self, entries: Iterable[Entry]) -> None:
+        """Take in rows made of epochs that the journal did not know; older ones are brought up to them."""
+        marks = ", ".join("?" for _ in fields(Entry))
+        brought = ", ".join(f"{column} = excluded.{column}" for column in _OF_EPOCH)
+        listed = [
+            [json.dumps(value) if key == "figures" else value for key, value in vars(entry).items()]
+            for entry in entries
+        ]
+        with self._commit():
+            self._rows.executemany(
+                f"INSERT INTO scan ({_COLUMNS}) VALUES ({marks})"  # noqa: S608 - own words
+                f" ON CONFLICT (name) DO UPDATE SET {brought}"
+                " WHERE epoch IS NULL OR excluded.revision > revision",
+                listed,
+            )
+
+    # ---- checksums of the store's files, by their place in the data folder
+
+    def note_files(self, checksums: Mapping[str, str]) -> None:
+        """Note the SHA-256 of files that never change from now on."""
+        with self._commit():
+            for path, sha256 in checksums.items():
+                self._note_file(path, sha256)
+
+    def forget_files(self, paths: Iterable[str]) -> None:
+        """Forget files that were deleted or put out of the way."""
+        with self._commit():
+            self._rows.executemany("DELETE FROM file WHERE path = ?", [(path,) for path in paths])
+
+    def files(self) -> dict[str, str]:
+        """Return the SHA-256 of every file by its place."""
+        with self._faults():
+            return dict(self._rows.execute("SELECT path, sha256 FROM file ORDER BY path").fetchall())
+
+    def _note_file(self, path: str, sha256: str) -> None:
+        self._rows.execute("INSERT OR REPLACE INTO file (path, sha256) VALUES (?, ?)", (path, sha256))
+
     # ---- what everyone may ask
 
     def entry(self, name: str) -> Entry | None:
         """Return the row of one name."""
         return next(iter(self._select("WHERE name = ?", name)), None)
 
-    def stored_as(self, sha256: str) -> Entry | None:
-        """Return the stored row with this content, whatever its name."""
-        return next(iter(self._select("WHERE sha256 = ? AND state = 'stored' LIMIT 1", sha256)), None)
+    def others_stored(self, name: str, size: int) -> dict[str, str]:
+        """Return the names of other scans that are stored and of this size, by their SHA-256."""
+        found = self._select("WHERE size = ? AND outcome = 'stored' AND name != ?", size, name)
+        return {row.sha256: row.name for row in found if row.sha256}
 
     def glimpses(self) -> dict[str, Glimpse]:
         """Return a glimpse of every row by its name; years of hourly scans take a tenth of a second."""
@@ -330,39 +358,7 @@ class Journal:
         try:
             yield
         except sqlite3.Error as error:
-            raise StoreError(_explain(self._path, error)) from error
-
-
-def _open_to_write(path: Path) -> sqlite3.Connection:
-    rows = sqlite3.connect(path, isolation_level=None, timeout=20.0)
-    try:
-        rows.execute("PRAGMA journal_mode = WAL")
-        rows.execute("PRAGMA synchronous = FULL")
-        rows.executescript(_SCHEMA)
-    except sqlite3.Error:
-        rows.close()
-        raise
-    return rows
-
-
-def _open_to_read(path: Path) -> sqlite3.Connection:
-    """Open without leaving a file behind: a reader of another user must not own the writer's side files."""
-    if not path.exists():
-        empty = sqlite3.connect(":memory:", isolation_level=None)
-        empty.executescript(_SCHEMA)
-        return empty
-    side = path.with_name(path.name + "-wal")
-    quiet = not side.exists() or side.stat().st_size == 0
-    mode = "immutable=1" if quiet else "mode=ro"
-    return sqlite3.connect(f"{path.absolute().as_uri()}?{mode}", uri=True, isolation_level=None, timeout=20.0)
-
-
-def _explain(path: Path, error: sqlite3.Error) -> str:
-    if isinstance(error, sqlite3.OperationalError):
-        return f"{path}: the journal cannot be used: {error}: is the disk full, or the folder another user's?"
-    return (
-        f"{path}: the journal is damaged: {error}: move it and its -wal away, it is made anew from the epochs"
-    )
+            raise StoreError(explain(self._path, error)) from error
 
 
 def _entry(row: tuple[object, ...]) -> Entry:

@@ -10,6 +10,7 @@ from station.errors import NotReadyError, ScanError
 from station.service.inbox import Arrival
 from station.service.journal import Entry, Journal, State
 from station.service.lock import only_writer
+from station.service.places import arrival_of
 from station.service.worker import Worker
 
 Tell = Callable[[Entry], None]
@@ -39,16 +40,6 @@ def process_scans(site: Site, scans: Sequence[Path], tell: Tell) -> int:
     if State.SET_ASIDE in states:
         return ScanError.exit_status
     return NotReadyError.exit_status if State.LATER in states else 0
-
-
-def arrival_of(site: Site, path: Path) -> Arrival:
-    """Return a scan with its inclination log, if that lies beside it."""
-    log = None
-    if site.inclination is not None:
-        beside = path.with_name(f"{path.stem}{site.inclination.suffix}")
-        log = beside.absolute() if beside.is_file() else None
-    status = path.lstat()
-    return Arrival(path.name, path.absolute(), log, status.st_size, status.st_mtime_ns)
 
 
 def one_line(entry: Entry) -> str:

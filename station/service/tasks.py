@@ -5,54 +5,45 @@ Its last argument is `progress()`, which tells the parent that it is alive.
 
 from __future__ import annotations
 
-import hashlib
 import math
-import os
-import stat
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from pathlib import Path
 
 import numpy as np
 
 from station import __version__
-from station.archive import join, store
-from station.archive.aggregate import Aggregates
-from station.archive.areas import update_areas
-from station.archive.layout import Series
-from station.archive.reference import read_reference, write_reference
-from station.archive.series import build_series
+from station.archive import store
+from station.archive.layout import Series, kept_of
+from station.archive.reference import current, read_reference, write_reference
 from station.config import Site
-from station.errors import NotReadyError, ScanError, StoreError
+from station.errors import ScanError
 from station.pipeline import (
     Told,
-    corrections,
     gridder_for,
     level,
     measure,
     stable_figures,
     survey,
 )
-from station.quantities import Bools, Habits, Measurement, Quality, Reference
+from station.quantities import Bools, Measurement, Quality, Reference
+from station.readers.flags import flag_on, read_flags
 from station.readers.polygons import mask, read_polygons
 from station.readers.raster import read_geotiff
-from station.readers.scan import ScanReader, open_scan, utc_interval
-from station.science import ground
-from station.science.adjustment import Adjustment, distrust
-from station.science.grid import Gridder, Stack
-from station.science.master import improved, master
-from station.science.prior import learned
+from station.readers.scan import ScanReader, open_scan, require_begun, utc_interval
+from station.science import ground, verdict
+from station.science.adjustment import Adjustment
+from station.science.grid import Gridder
 from station.science.terrain import nodes_for
+from station.service.content import held_still, sha256_of
 from station.service.gather import Gathered, gather
 from station.service.inbox import Arrival
 
 Progress = Callable[[], None]
 MOST_REFUSED = 0.6  # of the stable ground; then the filtered log alone is safer
-MOST_SOURCES = 400  # of the series: past the limit of open files some readers return wrong data
-REFERENCE_PASSES = 3  # a third improves the second by a tenth, a fourth the third by nothing measurable
 
 
 @dataclass(frozen=True)
@@ -67,6 +58,36 @@ class Outcome:
     reason: str
     reference: str | None
     figures: dict[str, float | str]
+    log_sha256: str
+    epoch_sha256: str  # of the file
+
+
+@dataclass(frozen=True)
+class Past:
+    """What the journal knows of a scan from before."""
+
+    reference: str | None = None  # version it was measured from
+    revision: int = 0
+    content: tuple[str, str] | None = None  # SHA-256 of the scan and log that were judged under its name
+    stored: Mapping[str, str] = field(default_factory=dict)  # names of other scans stored, by their SHA-256
+    patient: bool = False  # it may wait a while for its weather
+
+
+@dataclass(frozen=True)
+class Same:
+    """A scan whose bytes were judged before, under `name`."""
+
+    name: str
+    sha256: str
+
+
+@dataclass(frozen=True)
+class Refused:
+    """A scan that cannot be used."""
+
+    reason: str
+    sha256: str
+    log_sha256: str
 
 
 def series_of(site: Site) -> Series:
@@ -82,26 +103,52 @@ def series_of(site: Site) -> Series:
     )
 
 
+def attend(site: Site, arrival: Arrival, past: Past, progress: Progress) -> Outcome | Same | Refused:
+    """Measure a scan as it arrives, unless its bytes were judged before; raises as `process`."""
+    sha256 = sha256_of(arrival.path) if past.content or past.stored else ""
+    if past.content == (sha256, sha256_of_log(arrival)):
+        return Same(arrival.name, sha256)
+    if sha256 in past.stored:
+        return Same(past.stored[sha256], sha256)
+    progress()
+    return redo(site, arrival, past, progress)
+
+
+def redo(site: Site, arrival: Arrival, past: Past, progress: Progress) -> Outcome | Refused:
+    """Measure a scan, whatever is known of it, from the version of the reference it was measured from."""
+    try:
+        return process(site, arrival, progress, patient=past.patient, past=past)
+    except ScanError as error:
+        is_file = arrival.path.is_file() and not arrival.path.is_symlink()
+        return Refused(
+            str(error), sha256_of(arrival.path) if is_file else "", sha256_of_log(arrival) if is_file else ""
+        )
+
+
 def process(
     site: Site,
     arrival: Arrival,
     progress: Progress,
     *,
     patient: bool = False,
+    past: Past = Past(),
 ) -> Outcome:
     """Measure a scan and store its epoch, unless just this is stored.
 
-    Raises ScanError where the scan cannot be used; NotReadyError where it changes meanwhile, or `patient` and
-    still without weather shortly after its arrival.
+    Raises ScanError where the scan cannot be used; NotReadyError where it changes meanwhile, begins in the
+    future, or `patient` and still without weather shortly after its arrival.
     """
     began_s = time.monotonic()
     series = series_of(site)
-    with _held_still(arrival.path) as scan_sha256:
+    with held_still(arrival.path) as scan_sha256:
         progress()
         wait_s = site.weather.wait_s if patient and site.weather else 0.0
         young = time.time() - arrival.mtime_ns * 1e-9 < wait_s
-        epoch = _measure(site, arrival, scan_sha256, progress, rehearsal=False, wait_for_weather=young)
-    written = _same_as(series, epoch) or store.write_epoch(series, epoch)
+        reference = reference_of(site, past.reference)
+        epoch = _measure(
+            site, arrival, scan_sha256, reference, progress, rehearsal=False, wait_for_weather=young
+        )
+    written = _same_as(series, epoch) or store.write_epoch(series, epoch, newer_than=past.revision)
     return Outcome(
         start_utc_s=epoch.start_s,
         sha256=scan_sha256,
@@ -111,25 +158,23 @@ def process(
         reason=epoch.verdict_reason,
         reference=epoch.provenance["reference_version"] or None,
         figures=_figures(epoch, time.monotonic() - began_s),
+        log_sha256=epoch.provenance["log_sha256"],
+        epoch_sha256=sha256_of(written.path),
     )
-
-
-def process_patiently(site: Site, arrival: Arrival, progress: Progress) -> Outcome:
-    """Process a scan that may wait a while for its weather."""
-    return process(site, arrival, progress, patient=True)
 
 
 def open_only(site: Site, arrival: Arrival, progress: Progress) -> None:
     """Raise ScanError where a scan's headers say that it cannot be used."""
     progress()
-    with _opened(site, arrival.path) as reader:
+    with opened(site, arrival.path) as reader:
         utc_interval(reader, site.scans.name)
 
 
 def rehearse(site: Site, arrival: Arrival, progress: Progress) -> tuple[str, str, dict[str, float | str]]:
     """Measure a scan without storing anything: verdict, reason, figures."""
     began_s = time.monotonic()
-    epoch = _measure(site, arrival, "", progress, rehearsal=True, wait_for_weather=False)
+    reference = None if isinstance(site.reference.scans, Path) else reference_of(site)
+    epoch = _measure(site, arrival, "", reference, progress, rehearsal=True, wait_for_weather=False)
     return epoch.verdict, epoch.verdict_reason, _figures(epoch, time.monotonic() - began_s)
 
 
@@ -137,13 +182,15 @@ def _measure(
     site: Site,
     arrival: Arrival,
     scan_sha256: str,
+    reference: Reference | None,
     progress: Progress,
     *,
     rehearsal: bool,
     wait_for_weather: bool,
 ) -> store.Epoch:
-    with _opened(site, arrival.path) as reader:
+    with opened(site, arrival.path) as reader:
         start, end, _ = utc_interval(reader, site.scans.name)
+        require_begun(start, time.time())
         gathered = gather(
             site,
             reader,
@@ -153,34 +200,45 @@ def _measure(
             keep_zero=not rehearsal,
             wait_for_weather=wait_for_weather,
         )
-        reference = None if rehearsal and isinstance(site.reference.scans, Path) else reference_of(site)
         gridder = gridder_for(gathered.setup, reference)
         survey(gridder, reader.blocks(), gathered.setup, gathered.pose, progress)
     if not gridder.count.any():
         raise ScanError("no point falls on the grid: wrong scans.frame, SOP, CRS or units?")
     progress()
-    levelled = _level(site, gridder, gathered, reference)
-    unknown, lacking = gathered.unknown, list(gathered.lacking)
-    if levelled is not None and reference is not None:
-        lacking += distrust(levelled[1], reference.habits)
+    levelled = levelled_to(site, gridder, gathered, reference)
+    flag = flag_of(site, start.timestamp(), end.timestamp())
+    unknown, found = gathered.unknown, levelled[1] if levelled else None
+    if levelled is not None:
         if levelled[1].refused > MOST_REFUSED:
             levelled = None
         else:
             unknown = levelled[1].shared()
     measured = measure(gridder, gathered.setup, unknown, reference, levelled)
     progress()
+    numbers = _numbers(measured, gathered, reader.header.point_count, levelled)
+    word, reason = verdict.judge(
+        flag,
+        gathered.lacking,
+        measured,
+        reference,
+        (gathered.setup.position_m, gathered.setup.axis) if gathered.setup.position_m else None,
+        found,
+        numbers.get("stable_z_std"),
+        None if levelled or reference is None else stable_ground(site, reference),
+    )
     return store.Epoch(
         start_s=start.timestamp(),
         end_s=end.timestamp(),
         scan_id=arrival.path.stem,
         measurement=measured,
         shared=unknown,
-        verdict="degraded" if lacking else "good",
-        verdict_reason="; ".join(lacking),
-        numbers=_numbers(measured, gathered, reader.header.point_count, levelled),
+        verdict=word,
+        verdict_reason=reason,
+        numbers=numbers,
         provenance={
             "scan_sha256": scan_sha256,
-            "log_sha256": _sha256(arrival.log) if arrival.log else "",
+            "log_sha256": sha256_of_log(arrival),
+            "flag": flag,
             "science_hash": site.science_hash,
             "reference_version": reference.version if reference else "",
             "adjustment": "joint" if levelled else "none",
@@ -190,7 +248,7 @@ def _measure(
     )
 
 
-def _level(
+def levelled_to(
     site: Site, gridder: Gridder, gathered: Gathered, reference: Reference | None
 ) -> tuple[Told, Adjustment, Bools] | None:
     """Adjust a scan to the reference, where the site asks for it and there is one to adjust to."""
@@ -223,81 +281,41 @@ def _same_as(series: Series, epoch: store.Epoch) -> store.Stored | None:
     if not held:
         return None
     said = store.said(held[-1].path)
-    same = all(said.get(key) == value for key, value in epoch.provenance.items() if key in said)
-    return held[-1] if same and said.get("scan_id") == epoch.scan_id else None
+    told = {
+        **epoch.provenance,
+        "scan_id": epoch.scan_id,
+        "verdict": epoch.verdict,
+        "verdict_reason": kept_of(epoch.verdict_reason, "sentence"),
+    }
+    same = all(said.get(key) == value for key, value in told.items() if key in said)
+    return held[-1] if same and store.air_in(held[-1].path) == air_of(epoch.numbers) else None
 
 
-def build_reference(site: Site, arrivals: list[Arrival], version: str, progress: Progress) -> str:
-    """Make the master surface from scans, adjusted together, and store it; return its version.
+def air_of(numbers: Mapping[str, float]) -> tuple[float, ...]:
+    """Return the air an epoch was measured in, () where it is not known."""
+    found = tuple(numbers[name] for name in store.AIR if name in numbers)
+    return found if len(found) == len(store.AIR) else ()
 
-    Thrice over the scans: their plain means, then twice their residuals to what there is, each scan adjusted
-    to it. What the scans show of the station's habits is learned on the way.
+
+def flag_of(site: Site, start_utc_s: float, end_utc_s: float) -> str:
+    """Return why a person says that a scan is not to be used, as the store keeps it; '' where nobody does."""
+    reason = flag_on(read_flags(site.flags.file), start_utc_s, end_utc_s) if site.flags else ""
+    return kept_of(reason, "sentence")
+
+
+def reference_of(site: Site, version: str | None = None) -> Reference | None:
+    """Return the master surface: a version where epochs may still be measured from it, else the newest.
+
+    One given as a file is taken into the store at first use.
     """
     series = series_of(site)
-    scan_ids = tuple(arrival.path.stem for arrival in arrivals)
-    surface: Reference | None = None
-    for _ in range(REFERENCE_PASSES):
-        stack = Stack(series.grid)
-        laid = [_lay_on(stack, site, arrival, surface, progress) for arrival in arrivals]
-        habits = _learned(surface.habits if surface else Habits(), laid)
-        unknown = [one.unknown for one, _ in laid]
-        surface = master(stack, surface, unknown, laid[0][0].setup.position_m, version, scan_ids, habits)
-    if surface is not None:
-        write_reference(series, surface)
-    return version
-
-
-def improve_reference(site: Site, arrivals: list[Arrival], version: str, progress: Progress) -> str:
-    """Store a version of the reference that knows stable ground and the station's habits from more scans."""
-    series = series_of(site)
-    base = reference_of(site)
-    if base is None:
-        raise StoreError(f"{series.folder}: no reference to improve")
-    stack = Stack(series.grid)
-    laid = [_lay_on(stack, site, arrival, base, progress) for arrival in arrivals]
-    habits = _learned(base.habits, laid)
-    position_m = laid[0][0].setup.position_m
-    if position_m is None:
-        raise StoreError(f"{series.folder}: a reference without the scanner's place cannot be improved")
-    write_reference(series, improved(base, stack, position_m, version, habits))
-    return version
-
-
-def _learned(habits: Habits, laid: list[tuple[Gathered, Adjustment | None]]) -> Habits:
-    """Return what adjusted scans show of the station's habits."""
-    found = [
-        (g.told.lines, a.estimate, a.covariance) for g, a in laid if g.told is not None and a is not None
-    ]
-    told = laid[0][0].told
-    return habits if told is None else learned(habits, told.of, found)
-
-
-def _lay_on(
-    stack: Stack, site: Site, arrival: Arrival, surface: Reference | None, progress: Progress
-) -> tuple[Gathered, Adjustment | None]:
-    """Add a scan to a stack, adjusted to the surface there is. Its own grid goes at once."""
-    with _opened(site, arrival.path) as reader:
-        start, end, _ = utc_interval(reader, site.scans.name)
-        gathered = gather(site, reader, arrival.log, start, end)
-        gridder = gridder_for(gathered.setup, surface)
-        survey(gridder, reader.blocks(), gathered.setup, gathered.pose, progress)
-    levelled = _level(site, gridder, gathered, surface)
-    correction_m = None
-    if levelled is not None and surface is not None:
-        correction_m = corrections(gridder, gathered.setup, levelled[0], surface, levelled[1])
-    stack.add(gridder, correction_m, surface.roughness_m2 if surface else None)
-    progress()
-    return gathered, levelled[1] if levelled else None
-
-
-def reference_of(site: Site) -> Reference | None:
-    """Return the master surface; one given as a file is taken into the store at first use."""
-    series = series_of(site)
-    held = read_reference(series)
     given = site.reference.scans
     if not isinstance(given, Path):
-        return held
-    version = f"{given.stem}-{_sha256(given)[:8]}"
+        made = current(series)
+        newest = list(made)[-1] if made else None
+        return read_reference(series, version if version in made else newest)
+    held = read_reference(series)
+    version = version_of_given(given)
     if held is None or held.version != version:
         elevation_m = nodes_for(read_geotiff(given, series.grid, series.crs))
         steep = ground.steep(elevation_m, series.grid.cell_m)
@@ -306,17 +324,9 @@ def reference_of(site: Site) -> Reference | None:
     return held
 
 
-def publish(site: Site, progress: Progress) -> None:
-    """Build `series.nc` anew over the epochs that exist, and `areas.nc` after it.
-
-    Epochs are joined first where they are too many files.
-    """
-    series = series_of(site)
-    if len(store.sources(series.path)) > MOST_SOURCES:
-        join.join_closed(series, datetime.now(UTC), progress)
-    build_series(series)
-    progress()
-    update_areas(series, areas_of(site), Aggregates(series), progress)
+def version_of_given(file: Path) -> str:
+    """Name the version of a master surface that is given as a file."""
+    return f"{file.stem}-{sha256_of(file)[:8]}"
 
 
 def areas_of(site: Site) -> dict[str, Bools]:
@@ -327,59 +337,24 @@ def areas_of(site: Site) -> dict[str, Bools]:
     return {name: mask(polygon, site.grid_cells) for name, polygon in found.items()}
 
 
-def join_epochs(site: Site, progress: Progress) -> int:
-    """Join closed days and months; return how many files that made."""
-    series = series_of(site)
-    return join.join_closed(series, datetime.now(UTC), progress) if store.rows(series) else 0
-
-
-def sweep_store(site: Site, progress: Progress) -> int:
-    """Delete what the series has not named for two days; return how many files went."""
-    progress()
-    return len(join.sweep(series_of(site), datetime.now(UTC)))
-
-
 @contextmanager
-def _opened(site: Site, path: Path) -> Iterator[ScanReader]:
+def opened(site: Site, path: Path) -> Iterator[ScanReader]:
+    """Open a scan as the site says; raise ScanError or NotReadyError where it cannot be used."""
     range_max_m = site.scanner.range_max_m if site.scans.frame == "scanner" else None
     with open_scan(path, range_max_m=range_max_m) as reader:
         yield reader
 
 
-@contextmanager
-def _held_still(path: Path) -> Iterator[str]:
-    """Give the SHA-256 of a regular file; raise NotReadyError if it changed meanwhile."""
-    before = _fingerprint(path)
-    yield _sha256(path)
-    if _fingerprint(path) != before:
-        raise NotReadyError("the file changed while it was read")
-
-
-def _fingerprint(path: Path) -> tuple[int, int, int]:
-    try:
-        status = path.lstat()
-    except FileNotFoundError as error:
-        raise NotReadyError("the file is gone") from error
-    except OSError as error:
-        raise NotReadyError(f"the file cannot be looked at: {error.strerror}") from error
-    if not stat.S_ISREG(status.st_mode):
-        raise ScanError("not a regular file: links, pipes and devices are refused")
-    return status.st_ino, status.st_size, status.st_mtime_ns
-
-
-def _sha256(path: Path) -> str:
-    try:
-        with os.fdopen(os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK), "rb") as file:
-            return hashlib.file_digest(file, "sha256").hexdigest()
-    except OSError as error:
-        raise NotReadyError(f"{path.name} cannot be read: {error.strerror}") from error
+def sha256_of_log(arrival: Arrival) -> str:
+    """Return the SHA-256 of a scan's inclination log, '' where there is none."""
+    return sha256_of(arrival.log) if arrival.log else ""
 
 
 def _numbers(
     measured: Measurement, gathered: Gathered, points: int, levelled: tuple[Told, Adjustment, Bools] | None
 ) -> dict[str, float]:
     """Return what the store keeps once per scan."""
-    lean, air, setup = gathered.lean, gathered.air, gathered.setup
+    lean, setup = gathered.lean, gathered.setup
     told = {
         "point_total": float(points),
         "coverage": float(np.mean(measured.surface.count > 0)),
@@ -394,11 +369,15 @@ def _numbers(
         told["platform_pitch"] = math.degrees(lean.mean_pitch_rad)
         told["tilt_residual"] = math.degrees(lean.noise_rad)
         told["log_offset"] = lean.offset_s
-    if air is not None:
-        told["air_temperature"] = air.temperature_c
-        told["air_pressure"] = air.pressure_hpa
-        told["relative_humidity"] = air.humidity_pct
-    return told
+    return told | numbers_of_air(gathered)
+
+
+def numbers_of_air(gathered: Gathered) -> dict[str, float]:
+    """Return the air of a scan by the names of the variables that keep it; nothing where it is not known."""
+    air = gathered.air
+    if air is None:
+        return {}
+    return dict(zip(store.AIR, (air.temperature_c, air.pressure_hpa, air.humidity_pct), strict=True))
 
 
 def _figures(epoch: store.Epoch, seconds: float) -> dict[str, float | str]:

@@ -3,34 +3,48 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable
-from datetime import UTC, datetime
+import math
+import time
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import TypeVar
 
+from station.archive.reference import current
+from station.archive.store import series_in
 from station.config import Site
-from station.errors import NotReadyError, ScanError
+from station.errors import ConfigError, NotReadyError, ScanError, StoreError
 from station.service import child
 from station.service.inbox import Arrival
+from station.service.integrity import (
+    holds_epochs,
+    is_reference,
+    lost,
+    quarantine,
+    restore_zeros,
+    seal,
+    unknown,
+    unopened,
+    verify,
+)
 from station.service.journal import Entry, Journal, State
 from station.service.logs import logfmt
-from station.service.tasks import (
-    Outcome,
-    Progress,
+from station.service.moved import moved_by
+from station.service.places import find_scan
+from station.service.references import (
     build_reference,
     improve_reference,
-    join_epochs,
-    open_only,
-    process,
-    process_patiently,
-    publish,
-    sweep_store,
+    next_version,
+    number_due,
+    scans_due,
 )
+from station.service.retention import due_to_go, retire
+from station.service.stale import count_by_settings, late
+from station.service.tasks import Outcome, Past, Progress, Refused, Same, attend, open_only, series_of
+from station.service.upkeep import join_epochs, publish, sweep_store
 
 log = logging.getLogger("station")
 T = TypeVar("T")
-IMPROVED_EVERY = 4  # a version is due at four times the scans of the one before
-IMPROVED_MOST = 32  # scans that are read for it
+VERIFIED_EVERY_S = 3600.0  # at most, all checksums, when the store makes trouble
 
 
 class Worker:
@@ -45,13 +59,20 @@ class Worker:
         should_stop: Callable[[], bool] = lambda: False,
         patient: bool = False,
     ) -> None:
-        """`patient`: scans may wait a while for their weather, as in the service."""
+        """`patient`: as in the service, scans may wait for weather, and one only touched is not done again.
+
+        Raises ConfigError where the store is of another grid.
+        """
+        _require_same_grid(site)
         self._site = site
+        self._series = series_of(site)
         self._journal = journal
         self._on_progress = on_progress
         self._should_stop = should_stop
         self._patient = patient
         self._taken: dict[str, Arrival] = {}
+        self._verified_s = -math.inf
+        self._told_stale = 0
 
     def take(self, arrival: Arrival) -> bool:
         """Measure and store a scan, and say so in the journal and in one log line; tell whether it is stored.
@@ -59,146 +80,294 @@ class Worker:
         Raises StoreError where the store cannot be written; the scan stays waiting then.
         """
         self._taken[arrival.name] = arrival
+        entry = self._journal.entry(arrival.name)
+        past = Past(
+            reference=entry.reference if entry else None,
+            revision=(entry.revision if entry else None) or 0,
+            content=_judged(entry) if self._patient else None,
+            stored=self._journal.others_stored(arrival.name, arrival.size),
+            patient=self._patient,
+        )
         try:
-            outcome = self._run(process_patiently if self._patient else process, arrival)
+            outcome = self._mending(attend, arrival, past)
         except ScanError as error:
-            self._set_aside(arrival, error)
-            return False
+            return self._set_aside(arrival, str(error))
         except NotReadyError as error:
             pause_s = self._journal.later(arrival.name, str(error))
             log.info("%s", logfmt(scan=arrival.name, verdict="later", reason=error, retry_s=round(pause_s)))
             return False
-        self._run(publish)
-        self._journal.stored(
-            arrival.name,
-            sha256=outcome.sha256,
-            verdict=outcome.verdict,
-            epoch=outcome.epoch,
-            start_utc_s=outcome.start_utc_s,
-            revision=outcome.revision,
-            reference=outcome.reference,
-            reason=outcome.reason,
-            figures=outcome.figures,
-        )
+        if isinstance(outcome, Refused):
+            return self._set_aside(arrival, outcome.reason, outcome.sha256, outcome.log_sha256)
+        if isinstance(outcome, Same):
+            return self._note_same(arrival, outcome)
+        self._mending(publish)
+        remember(self._journal, arrival.name, outcome)
         _say(arrival.name, outcome)
+        if self._site.adjusts and (moved := self.run(moved_by, outcome.start_utc_s)):
+            log.warning("%s", logfmt(scan=arrival.name, moved=moved))
         self._make_reference_when_due()
         return True
 
     def glance(self, arrival: Arrival) -> None:
         """Set a scan aside at once if its headers are broken, rather than after waiting for its log."""
         try:
-            self._run(open_only, arrival)
+            self.run(open_only, arrival)
         except ScanError as error:
-            self._set_aside(arrival, error)
+            self._set_aside(arrival, str(error))
         except NotReadyError:
             return
 
     def recover(self) -> None:
-        """Make journal and files agree: epochs without their journal row are redone, the series is rebuilt.
+        """Make journal and files agree: checksums are completed, lost rows made anew, the series is rebuilt.
 
-        An epoch written just before a power cut is found by `process` as the same and not stored twice.
+        Epochs that are lost or damaged are redone where their scan is still in the inbox. One written just
+        before a power cut is found by `tasks.process` as the same and not stored twice. A reference that was
+        due is made now: what comes next is to be measured from it, as without the cut.
         """
-        data = self._site.station.data
-        lost = [row.name for row in self._journal.rows(State.STORED) if row.epoch and not self._is_there(row)]
-        for name in lost:
-            log.warning("%s", logfmt(scan=name, reason="its epoch is missing from the store: done again"))
-        self._journal.again(lost)
-        if any(path for kind in ("epochs", "days", "months") for path in (data / kind).glob("**/*.nc")):
-            self._run(publish)
+        self._put_aside(self.run(unopened))
+        self.seal()
+        self._adopt()
+        self._have_lost_done_again()
+        if holds_epochs(self._series):
+            self._mending(publish)
+        self._make_reference_when_due()
+
+    def seal(self) -> None:
+        """Note the checksums of files that have none; put aside those that cannot be read."""
+        found = self.run(seal, self._journal.files())
+        self._put_aside(found.damaged)
+        self._journal.note_files(found.fresh)
+
+    def prove(self) -> None:
+        """Prove every file against its checksum and put aside those that are damaged."""
+        damaged = self.run(verify, self._journal.files()).damaged
+        self._put_aside(damaged)
+        for name in filter(is_reference, damaged):  # a new version is made instead
+            quarantine(self._series, [name])
+            self._journal.forget_files([name])
 
     def join_closed(self) -> None:
         """Join closed days and months."""
-        self._run(join_epochs)
+        self._mending(join_epochs)
+        self.seal()
 
     def sweep(self) -> None:
-        """Delete what no longer serves."""
-        self._run(sweep_store)
+        """Delete what no longer serves, redo what came late, tell what is stale, let raw scans go."""
+        self._journal.forget_files(self._mending(sweep_store))
+        came = self._mending(late, self._journal.rows(State.STORED))
+        names = [name for name in came if (self._site.scans.inbox / name).is_file()]
+        for name in names:
+            log.info("%s", logfmt(scan=name, reason="its log or weather came: done again"))
+        self._journal.again(names)
+        self._tell_stale()
+        self._let_raw_scans_go()
 
-    def _set_aside(self, arrival: Arrival, error: ScanError) -> None:
-        self._journal.set_aside(arrival.name, str(error))
-        log.warning("%s", logfmt(scan=arrival.name, verdict="set_aside", reason=error))
+    def _mending(self, task: Callable[..., T], *args: object) -> T:
+        """Run a task; where the store is found damaged, put the damaged files aside and run it once more."""
+        try:
+            return self.run(task, *args)
+        except StoreError:
+            if not self._mend():
+                raise
+            return self.run(task, *args)
 
-    def _is_there(self, row: Entry) -> bool:
-        """Tell whether a stored epoch still is: as itself, or joined into its day or month."""
-        data = self._site.station.data
-        start = datetime.fromtimestamp(row.start_utc_s or 0.0, UTC)
-        if (data / str(row.epoch)).is_file():
-            return True
-        days = (data / "days" / start.strftime("%Y/%m")).glob(f"*_{start:%Y%m%d}_r*.nc")
-        months = (data / "months" / start.strftime("%Y")).glob(f"*_{start:%Y%m}_r*.nc")
-        return any(days) or any(months)
+    def _mend(self) -> bool:
+        """Put damaged files aside and have their epochs done again; tell whether there were any."""
+        damaged = self.run(unopened)
+        if not damaged and time.monotonic() > self._verified_s + VERIFIED_EVERY_S:
+            self._verified_s = time.monotonic()
+            damaged = self.run(verify, self._journal.files()).damaged
+        self._put_aside(damaged)
+        if damaged:
+            self._have_lost_done_again()
+        return not all(map(is_reference, damaged))
+
+    def _put_aside(self, damaged: Iterable[str]) -> None:
+        for name in damaged:
+            if is_reference(name):
+                log.error("%s", logfmt(file=name, reason="damaged: restore it, or station reprocess"))
+                continue
+            quarantine(self._series, [name])
+            self._journal.forget_files([name])
+            log.error(
+                "%s", logfmt(file=name, reason="damaged: left out of the series, kept as *.damaged beside it")
+            )
+
+    def _adopt(self) -> None:
+        """Make rows for epochs that the journal does not know: it was lost, or older than the store."""
+        found = self.run(unknown, self._journal.rows())
+        if found:
+            log.warning("%s", logfmt(journal="made anew", epochs=len(found), reason="it knew not of them"))
+        self._journal.adopt(found)
+        self.run(restore_zeros)
+
+    def _have_lost_done_again(self) -> None:
+        for name in self.run(lost, self._journal.rows(State.STORED)):
+            if (self._site.scans.inbox / name).is_file():
+                log.warning("%s", logfmt(scan=name, reason="its epoch is missing from the store: done again"))
+                self._journal.again([name])
+            else:
+                says = "its epoch is missing from the store, and the scan from the inbox: station reprocess"
+                log.error("%s", logfmt(scan=name, reason=says))
+
+    def _set_aside(
+        self, arrival: Arrival, reason: str, sha256: str | None = None, log_sha256: str = ""
+    ) -> bool:
+        self._journal.set_aside(arrival.name, reason, sha256=sha256, log_sha256=log_sha256)
+        log.warning("%s", logfmt(scan=arrival.name, verdict="set_aside", reason=reason))
+        return False
+
+    def _note_same(self, arrival: Arrival, same: Same) -> bool:
+        """Put a scan back where it was, or aside if it is another's copy; tell whether it is stored."""
+        if same.name != arrival.name:
+            return self._set_aside(arrival, f"the same bytes as {same.name}, which is stored", same.sha256)
+        self._journal.same_again(arrival.name, same.sha256)
+        log.info("%s", logfmt(scan=arrival.name, verdict="same", reason="the bytes are those done before"))
+        entry = self._journal.entry(arrival.name)
+        return entry is not None and entry.state is State.STORED
+
+    def _tell_stale(self) -> None:
+        """Say, when the number changes, how many epochs were made with another SOP or setting."""
+        count = self.run(_count_stale)
+        if count and count != self._told_stale:
+            says = "made with another SOP, setting, flag or reference: station reprocess"
+            log.warning("%s", logfmt(epochs=count, reason=says))
+        self._told_stale = count
+
+    def _let_raw_scans_go(self) -> None:
+        """Move or delete raw scans as `[retention]` says, each proved by its own child."""
+        for name in due_to_go(self._site, self._journal.rows(State.STORED), self._kept_for_reference()):
+            if self._should_stop():
+                return
+            entry = self._journal.entry(name)
+            try:
+                done = self.run(retire, entry, self._journal.files())
+            except ScanError as error:
+                log.warning("%s", logfmt(scan=name, retention="kept", reason=error))
+            except NotReadyError as error:  # it would be so for the others too
+                log.warning("%s", logfmt(scan=name, retention="waits", reason=error))
+                return
+            else:
+                log.info("%s", logfmt(scan=name, retention=done))
+
+    def _kept_for_reference(self) -> set[str]:
+        return set(scans_due(self._site, self._usable(), len(current(self._series))))
+
+    def _usable(self) -> list[str]:
+        """Return the scans that a reference may be made of, by their time."""
+        usable = [row for row in self._journal.rows(State.STORED) if row.verdict == "good"]
+        return [row.name for row in sorted(usable, key=lambda row: row.start_utc_s or 0.0)]
 
     def _make_reference_when_due(self) -> None:
-        """Build the master surface once enough usable scans are stored; make a better one of ever more.
-
-        All epochs are measured from the first. Later versions change it on stable ground only, so that
-        epochs measured from an older one stay as they are.
-        """
-        wanted = self._site.reference.scans
-        if isinstance(wanted, Path):
+        """Build the master surface once enough usable scans are stored; make a better one of ever more."""
+        wanted, usable = self._site.reference.scans, self._usable()
+        made = current(self._series)
+        if made and not isinstance(wanted, Path):
+            self._have_bare_done_again()
+        chosen = scans_due(self._site, usable, len(made))
+        if isinstance(wanted, Path) or not chosen or len(usable) < number_due(self._site, len(made)):
             return
-        usable = [row for row in self._journal.rows(State.STORED) if row.verdict == "good"]
-        usable.sort(key=lambda row: row.start_utc_s or 0.0)
-        version = self._versions() + 1
-        due = wanted * IMPROVED_EVERY ** (version - 1)
-        if len(usable) < due or (version > 1 and not self._site.adjusts):
-            return
-        chosen = usable[:wanted]
-        if version > 1:
-            step = max(1, due // IMPROVED_MOST)
-            chosen = usable[:due][::step][:IMPROVED_MOST]
-        arrivals = [self._arrival(row.name) for row in chosen]
-        missing = [arrival.name for arrival in arrivals if not arrival.path.is_file()]
-        if missing and version == 1:
-            log.warning("%s", logfmt(reference="waiting", reason=f"no longer there: {', '.join(missing)}"))
-            return
-        arrivals = [arrival for arrival in arrivals if arrival.path.is_file()]
-        if len(arrivals) < wanted:
+        arrivals = [self._arrival(name) for name in chosen]
+        there = [arrival for arrival in arrivals if arrival is not None]
+        if len(there) < (wanted if made else len(chosen)):
+            gone = [name for name, arrival in zip(chosen, arrivals, strict=True) if arrival is None]
+            if not made:
+                log.warning("%s", logfmt(reference="waiting", reason=f"no longer there: {', '.join(gone)}"))
             return
         try:
-            made = self._run(build_reference if version == 1 else improve_reference, arrivals, str(version))
+            version = next_version(self._series, (row.reference for row in self._journal.rows()))
+            if made:
+                self.run(improve_reference, there, version, list(made)[-1], ())
+            else:
+                self.run(build_reference, there, version)
         except (ScanError, NotReadyError) as error:
             log.warning("%s", logfmt(reference="failed", reason=error))
             return
-        log.info("%s", logfmt(reference=made, scans=len(arrivals)))
-        if version == 1:
-            others = (row.name for row in self._journal.rows(State.STORED) if row.reference != made)
+        self.seal()
+        log.info("%s", logfmt(reference=version, scans=len(there)))
+        if not made:
+            others = (row.name for row in self._journal.rows(State.STORED) if row.reference != version)
             self._journal.again(others)
 
-    def _versions(self) -> int:
-        """Return the newest version of the reference, nought where there is none."""
-        found = self._site.station.data.glob("reference_*.nc")
-        numbers = (path.stem.removeprefix("reference_") for path in found)
-        return max((int(number) for number in numbers if number.isdigit()), default=0)
+    def _have_bare_done_again(self) -> None:
+        """Redo what is stored without change: the power went between the reference and its first use."""
+        bare = [row.name for row in self._journal.rows(State.STORED) if not row.reference]
+        inbox = self._site.scans.inbox
+        self._journal.again(name for name in bare if name in self._taken or (inbox / name).is_file())
 
-    def _arrival(self, name: str) -> Arrival:
-        """Find a scan again: where it was taken from, or in the inbox."""
-        if name in self._taken:
-            return self._taken[name]
-        path = self._site.scans.inbox / name
-        log_path = None
-        if self._site.inclination is not None:
-            beside = path.with_name(f"{path.stem}{self._site.inclination.suffix}")
-            log_path = beside if beside.is_file() else None
-        status = path.stat() if path.is_file() else None
-        return Arrival(
-            name=name,
-            path=path,
-            log=log_path,
-            size=status.st_size if status else 0,
-            mtime_ns=status.st_mtime_ns if status else 0,
-        )
+    def _arrival(self, name: str) -> Arrival | None:
+        """Find a scan again: where it was taken from, in the inbox or in the archive."""
+        taken = self._taken.get(name)
+        if taken is not None and taken.path.is_file():
+            return taken
+        entry = self._journal.entry(name)
+        return find_scan(self._site, name, entry.start_utc_s if entry else None)
 
-    def _run(self, task: Callable[..., T], *args: object) -> T:
+    def run(self, task: Callable[..., T], *args: object) -> T:
+        """Run a task of this site in a child: at most `timeout_s` a scan, one without scans for ever."""
+        listed = [one for arg in args for one in (arg if isinstance(arg, list) else [arg])]
+        scans = sum(isinstance(one, Arrival) for one in listed)
         return child.run(
             task,
             self._site,
             *args,
             memory_gb=self._site.service.memory_gb,
-            timeout_s=self._site.scans.timeout_s,
+            timeout_s=self._site.scans.timeout_s * scans if scans else math.inf,
             on_progress=self._on_progress,
             should_stop=self._should_stop,
         )
+
+
+def _judged(entry: Entry | None) -> tuple[str, str] | None:
+    """Return the checksums of the scan and log that were judged under a name; None where none were."""
+    if entry is None or entry.outcome is None or not entry.sha256:
+        return None
+    return entry.sha256, entry.log_sha256
+
+
+def remember(journal: Journal, name: str, outcome: Outcome) -> None:
+    """Note in the journal what a scan gave."""
+    journal.stored(
+        name,
+        sha256=outcome.sha256,
+        verdict=outcome.verdict,
+        epoch=outcome.epoch,
+        start_utc_s=outcome.start_utc_s,
+        revision=outcome.revision,
+        reference=outcome.reference,
+        reason=outcome.reason,
+        figures=outcome.figures,
+        log_sha256=outcome.log_sha256,
+        epoch_sha256=outcome.epoch_sha256,
+    )
+
+
+def _require_same_grid(site: Site) -> None:
+    """Raise ConfigError where what is stored lies on another grid: a series has one."""
+    try:
+        held = series_in(site.station.data).grid
+    except StoreError:  # nothing yet, or to be made anew
+        return
+    given = site.grid_cells
+    off_m = max(
+        abs(one - other)
+        for one, other in (
+            (held.west_m, given.west_m),
+            (held.north_m, given.north_m),
+            (held.cell_m * held.nx, given.cell_m * given.nx),
+        )
+    )
+    if held.shape != given.shape or off_m > 1e-3 * given.cell_m:
+        raise ConfigError(
+            f"[grid] is not that of {site.station.data}: {held.nx} x {held.ny} cells of {held.cell_m:.6g} m"
+            f" from west {held.west_m:.10g}, north {held.north_m:.10g}: restore it, or give station.data a"
+            " new folder"
+        )
+
+
+def _count_stale(site: Site, progress: Progress) -> int:
+    progress()
+    return count_by_settings(site)
 
 
 def _say(name: str, outcome: Outcome) -> None:

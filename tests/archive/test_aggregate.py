@@ -86,6 +86,7 @@ def reference():
         variance_factor=flat + 1,
         stable=flat > 0,
         habits=Habits(),
+        seen=flat + 1,
     )
 
 

@@ -10,8 +10,9 @@ from scipy.spatial.transform import Rotation
 
 from station.quantities import Habits
 from station.science import adjustment, prior, shared
-from station.science.adjustment import LineLog, adjust, distrust
+from station.science.adjustment import LineLog, adjust
 from station.science.patches import Kind, Patches
+from station.science.verdict import distrust
 
 HABITS = Habits()
 FIRST_DEG, WIDE_DEG = 20, 40  # the sector that is looked at

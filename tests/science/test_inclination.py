@@ -12,6 +12,7 @@ from station.science.inclination import LEVEL, Cycle
 
 STEP = math.radians(0.001)
 NOISE = math.radians(0.008)
+RANGE = math.radians(10.0)
 TRACK = HeadTrack(np.linspace(0.0, 920.0, 200), np.radians(np.linspace(10.0, 130.0, 200)))
 WAVE = Cycle((0.001, math.radians(0.04), 0.0), (-0.002, 0.0, math.radians(0.03)))
 
@@ -29,14 +30,14 @@ def test_cleaning_drops_what_no_sensor_meant():
     time_s = np.arange(100.0)
     time_s[50] = 49.0  # a duplicate
     time_s[60] = 10.0  # back in time
-    kept, dropped = inclination.clean(log_of(roll, np.zeros(100), time_s))
+    kept, dropped = inclination.clean(log_of(roll, np.zeros(100), time_s), RANGE)
     assert dropped == 5
     assert np.all(np.diff(kept.time_s) > 0)
     assert np.all(kept.roll_rad == 0.01)
 
 
 def test_cleaning_survives_an_empty_log():
-    kept, dropped = inclination.clean(log_of(np.array([math.nan]), np.zeros(1)))
+    kept, dropped = inclination.clean(log_of(np.array([math.nan]), np.zeros(1)), RANGE)
     assert (len(kept.time_s), dropped) == (0, 1)
 
 
@@ -92,8 +93,54 @@ def test_clock_offset_of_a_leaning_mount():
     roll, pitch = wave.at(inclination.head_azimuth(TRACK, time_s))
     late = log_of(roll + rng.normal(0, NOISE, 920), pitch + rng.normal(0, NOISE, 920), time_s + 3.3)
     offset_s, sigma_s = inclination.clock_offset(late, TRACK, wave, NOISE)
-    assert offset_s == pytest.approx(3.3, abs=0.1)
-    assert sigma_s < 0.1
+    assert offset_s == pytest.approx(3.3, abs=0.2)
+    assert sigma_s < 0.3  # the mount may move meanwhile
+
+
+def test_a_clock_a_minute_off_is_found_though_nobody_expects_it():
+    rng = np.random.default_rng(5)
+    wave = Cycle((0.0, math.radians(5), 0.0), (0.0, 0.0, math.radians(5)))
+    time_s = np.arange(-80.0, 1000.0)
+    roll, pitch = wave.at(inclination.head_azimuth(TRACK, time_s))
+    noise = rng.normal(0, NOISE, (2, len(time_s)))
+    offset_s, sigma_s = inclination.clock_offset(
+        log_of(roll + noise[0], pitch + noise[1], time_s + 60), TRACK, wave, NOISE
+    )
+    assert offset_s == pytest.approx(60, abs=0.4)
+    assert sigma_s < 0.3
+
+
+def test_clock_offset_sigma_holds_while_the_mount_moves():
+    """A wave of 0.5°, and a mount that wanders by 0.0018° in the scan of the SOP and in this: z of one."""
+    rng = np.random.default_rng(6)
+    wave = Cycle((0.0, math.radians(0.5), 0.0), (0.0, 0.0, math.radians(0.5)))
+    time_s = np.arange(0.0, 920.0)
+    azimuth_rad = inclination.head_azimuth(TRACK, time_s)
+
+    def wandering():
+        kick = rng.normal(0, math.radians(0.0018) * math.sqrt(2 / 300), (2, 920))
+        wander = signal.lfilter([1], [1, -math.exp(-1 / 300)], kick, axis=1)
+        return wander + rng.normal(0, NOISE, (2, 920))
+
+    z = []
+    for _ in range(60):
+        still = np.stack(wave.at(azimuth_rad))
+        zero = inclination.fit_cycle(log_of(*(still + wandering()), time_s), TRACK, NOISE)
+        late_s = rng.uniform(-5, 5)
+        log = log_of(*(still + wandering()), time_s + late_s)
+        offset_s, sigma_s = inclination.clock_offset(log, TRACK, zero, NOISE)
+        z.append((offset_s - late_s) / sigma_s)
+    assert 0.5 < np.sqrt(np.mean(np.square(z))) < 1.3
+
+
+def test_a_sensor_at_the_end_of_its_range_tells_nothing():
+    roll = np.full(100, math.radians(3.0))
+    roll[40:] = RANGE
+    log = log_of(roll, np.zeros(100))
+    assert inclination.pegged(log, RANGE) == pytest.approx(0.6)
+    kept, dropped = inclination.clean(log, RANGE)
+    assert (len(kept.time_s), dropped) == (40, 60)
+    assert inclination.pegged(log_of(np.full(50, math.nan), np.zeros(50)), RANGE) == 0.0
 
 
 def test_clock_offset_stays_at_nought_where_nothing_tells():
@@ -101,7 +148,7 @@ def test_clock_offset_stays_at_nought_where_nothing_tells():
     log = log_of(*rng.normal(0, NOISE, (2, 900)))
     offset_s, sigma_s = inclination.clock_offset(log, TRACK, LEVEL, NOISE)
     assert offset_s == pytest.approx(0.0, abs=1e-9)
-    assert sigma_s == pytest.approx(2.5)
+    assert sigma_s == pytest.approx(2.5, rel=1e-3)
 
 
 def test_lean_the_sop_holds_is_not_applied_again():
@@ -131,7 +178,7 @@ def test_drift_comes_through_and_noise_does_not():
 def test_real_log(shared_data):
     table = np.loadtxt(shared_data / "riegl" / "140123_202748-incl.txt", delimiter=",", skiprows=1)
     log = InclinationLog(table[:, 0], *np.radians(table[:, 1:].T))
-    kept, dropped = inclination.clean(log)
+    kept, dropped = inclination.clean(log, RANGE)
     assert dropped == 0
     lean = inclination.relative_lean(kept, None, LEVEL, NOISE)
     assert math.degrees(lean.mean_roll_rad) == pytest.approx(-0.2868, abs=0.001)

@@ -72,3 +72,17 @@ def test_cells_that_vary_more_than_modelled_are_told_so():
     factor = improved(made, stack, POSITION, "2", Habits()).variance_factor
     assert 6 < np.median(factor[restless]) < 10  # nine, steps beyond six sigma cut
     assert 0.8 < np.median(factor[~restless]) < 1.5
+
+
+def test_the_usual_view_is_the_share_of_scans_that_saw_a_cell():
+    made, _ = base()
+    stack = Stack(GRID)
+    cell = np.arange(GRID.nx * GRID.ny)
+    for scan in range(8):
+        gridder = Gridder(GRID, made, POSITION[2])
+        seen = cell[: len(cell) // 2] if scan < 6 else cell
+        gridder.add(seen, np.zeros(len(seen)), np.full(len(seen), NOISE_M**2), None)
+        stack.add(gridder)
+    better = improved(made, stack, POSITION, "2", Habits())
+    assert np.unique(better.seen[:25]).tolist() == [1.0]
+    assert np.unique(better.seen[25:]).tolist() == [0.25]

@@ -89,7 +89,7 @@ def test_without_a_track_the_head_turns_at_its_usual_speed():
 
 def lean_of(time_s, roll_rad, pitch_rad, noise_rad=1e-4):
     told = Tilt(time_s, roll_rad, pitch_rad)
-    return Lean(told, told, 0.0, 0.0, noise_rad, noise_rad / 5, 20.0, 0.02, 0.0, 1.0)
+    return Lean(told, told, 0.0, 0.0, noise_rad, noise_rad / 5, 20.0, 0.02, 0.0, 2.5, 1.0)
 
 
 def risen(head_rad, roll_rad, pitch_rad):

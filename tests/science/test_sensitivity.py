@@ -1,6 +1,7 @@
 """Shares of a variance against numbers from the literature, dense algebra and simulation."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -124,9 +125,9 @@ def test_shares_of_cells_against_dense_algebra():
     told = cell_shares(felt, random_m2, unknown)
     assert sum(told.values()) == pytest.approx(np.ones(len(felt)), abs=1e-5)
     effect, covariance = dense(felt), unknown.covariance
-    total = np.einsum("ni,ij,nj->n", effect, covariance, effect) + random_m2 + (felt.variance(unknown) - felt.variance(
-        Shared(unknown.names, unknown.units, unknown.estimate, covariance, 0 * unknown.noise_variance)
-    ))  # fmt: skip
+    knots = replace(unknown, noise_variance=0 * unknown.noise_variance)
+    own_m2 = random_m2 + felt.variance(unknown) - felt.variance(knots)
+    total = np.einsum("ni,ij,nj->n", effect, covariance, effect) + own_m2
     for group in ("tilt", "refraction", "range"):
         of = members(unknown.names, group)
         wanted = np.einsum("ni,ij,nj->n", effect[:, of], covariance[of], effect) / total

@@ -4,7 +4,7 @@ import json
 
 import pytest
 
-from station.config import read_site
+from station.config import FlagsSection, RetentionSection, read_site
 from station.service import check
 from station.simulation.station import simulate, tiny
 
@@ -52,3 +52,26 @@ def test_a_broken_file_is_a_fault_that_names_it(folder):
         areas.write_text(before)
     assert one["level"] == "fault"
     assert "areas.geojson" in one["says"]
+
+
+def test_flags_are_counted_and_a_row_that_is_none_is_named(folder, tmp_path):
+    site = read_site(folder / "site.toml")
+    flags = tmp_path / "flags.csv"
+    flagged = site.model_copy(update={"flags": FlagsSection(file=flags)})
+    flags.write_text("from,to,reason\n2026-01-01,2026-01-02,rime\n")
+    (one,) = check._flags(flagged)
+    assert (one["level"], one["says"]) == ("ok", f"{flags}: 1 intervals")
+    flags.write_text("from,to,reason\nyesterday,2026-01-02,rime\n")
+    (one,) = check._flags(flagged)
+    assert one["level"] == "fault"
+    assert "line 2" in one["says"]
+
+
+def test_an_inbox_that_lets_nothing_go_is_told(folder, monkeypatch):
+    site = read_site(folder / "site.toml")
+    moving = site.model_copy(update={"retention": RetentionSection(raw="delete")})
+    monkeypatch.setattr(
+        check.os, "access", lambda path, mode: mode != check.os.W_OK or path != site.scans.inbox
+    )
+    assert [one["what"] for one in check._folders(moving) if one["level"] == "warning"] == ["retention"]
+    assert not [one for one in check._folders(site) if one["level"] == "warning"]

@@ -9,6 +9,7 @@ import sqlite3
 import subprocess
 import sys
 import time
+from dataclasses import replace
 
 import pytest
 
@@ -47,8 +48,9 @@ def test_a_new_scan_waits_and_ends_stored(journal):
     assert entry.waits_for == ""
     assert journal.counts() == {"waiting": 0, "stored": 1, "set_aside": 0, "later": 0}
     assert journal.last_stored() == entry
-    assert journal.stored_as("aa") == entry
-    assert journal.stored_as("bb") is None
+    assert journal.others_stored("another.laz", 10) == {"aa": NAME}
+    assert journal.others_stored(NAME, 10) == {}
+    assert journal.others_stored("another.laz", 11) == {}
 
 
 def test_the_same_sight_again_changes_nothing(journal):
@@ -160,6 +162,41 @@ def test_a_failed_change_leaves_nothing_half_done(journal):
     journal.seen([("b.laz", 1, 1, "")])
 
 
+def test_a_journal_of_an_older_version_is_brought_up_to_date(tmp_path):
+    path = tmp_path / "journal.sqlite"
+    with Journal(path) as journal:
+        store(journal)
+    old = sqlite3.connect(path)
+    old.executescript("ALTER TABLE scan DROP COLUMN log_sha256; DROP TABLE file")
+    old.close()
+    with Journal(path) as journal:
+        assert (journal.entry(NAME).sha256, journal.entry(NAME).log_sha256) == ("aa", "")
+        assert journal.files() == {}
+
+
+def test_a_checksum_is_noted_with_its_epoch_or_not_at_all(journal):
+    store(journal, epoch_sha256="ee")
+    journal.note_files({"days/a.nc": "dd"})
+    assert journal.files() == {"days/a.nc": "dd", "epochs/a.nc": "ee"}
+    with pytest.raises(StoreError):
+        store(journal, epoch="epochs/b.nc", epoch_sha256="ff", start_utc_s="no number")
+    assert journal.files() == {"days/a.nc": "dd", "epochs/a.nc": "ee"}
+    assert journal.entry(NAME).epoch == "epochs/a.nc"
+    journal.forget_files(["epochs/a.nc"])
+    assert journal.files() == {"days/a.nc": "dd"}
+
+
+def test_rows_made_of_epochs_bring_older_ones_up_to_date_and_leave_newer_ones(journal):
+    store(journal, revision=2)
+    known = journal.entry(NAME)
+    journal.adopt([replace(known, revision=1, epoch="epochs/old.nc")])
+    assert journal.entry(NAME) == known
+    newer = replace(known, revision=3, epoch="epochs/new.nc", sha256="bb", figures={})
+    journal.adopt([newer, replace(newer, name="other.laz")])
+    assert (journal.entry(NAME).epoch, journal.entry(NAME).sha256) == ("epochs/new.nc", "bb")
+    assert journal.entry("other.laz") == replace(newer, name="other.laz")
+
+
 def test_one_writer_a_data_folder(tmp_path):
     assert not in_use(tmp_path)
     with only_writer(tmp_path):
@@ -204,3 +241,17 @@ def test_what_was_acknowledged_survives_twenty_kills(tmp_path):
     check = sqlite3.connect(path)
     assert check.execute("PRAGMA integrity_check").fetchall() == [("ok",)]
     check.close()
+
+
+@pytest.mark.parametrize("content", [b"", None])
+def test_a_journal_that_has_only_just_begun_is_empty_to_its_readers(tmp_path, content):
+    """As a service leaves it that was killed in its first moment: without a table, or without a byte."""
+    path = tmp_path / "journal.sqlite"
+    if content is None:
+        rows = sqlite3.connect(path)
+        rows.execute("PRAGMA journal_mode = WAL")
+        rows.close()
+    else:
+        path.write_bytes(content)
+    with Journal(path, read_only=True) as reader:
+        assert reader.rows() == []

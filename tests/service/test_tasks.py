@@ -1,24 +1,29 @@
 """What a scan gets that lacks something: a verdict with reasons, a larger sigma, or a place aside."""
 
 import os
+import re
 import shutil
 from dataclasses import replace
 
+import laspy
 import netCDF4
 import numpy as np
 import pytest
 
 from station.config import read_site
 from station.errors import ConfigError, NotReadyError, ScanError
-from station.service import tasks
-from station.service.once import arrival_of
+from station.service import references, tasks
+from station.service.places import arrival_of
+from station.simulation.motion import sensor_faults
 from station.simulation.station import simulate, tiny
+
+SCENARIO = replace(tiny(hours=2), avalanche_m=0.0, melt_m_per_h=0.0)
 
 
 @pytest.fixture(scope="module")
 def made(tmp_path_factory):
     folder = tmp_path_factory.mktemp("made") / "station"
-    simulate(folder, replace(tiny(hours=2), avalanche_m=0.0, melt_m_per_h=0.0))
+    simulate(folder, SCENARIO)
     return folder
 
 
@@ -83,8 +88,16 @@ def change_log(folder, change):
             "another time",
         ),
         (lambda rows: ["?"] * len(rows), "inclination log unusable"),
+        (
+            lambda rows: [f"{float(r.split(',')[0]) + 30},{r.split(',', 1)[1]}" for r in rows],
+            "inclination log covers",
+        ),
+        (
+            lambda rows: [f"{row.split(',')[0]},10.0,-1.3" if n % 3 else row for n, row in enumerate(rows)],
+            "lean out of the inclination sensor's range of 10 degree in 67% of its log",
+        ),
     ],
-    ids=["short", "gap", "bad rows", "few", "other time", "unreadable"],
+    ids=["short", "gap", "bad rows", "few", "other time", "unreadable", "half a minute late", "pegged"],
 )
 def test_a_poor_log(folder, change, says):
     change_log(folder, change)
@@ -104,6 +117,36 @@ def test_spikes_in_the_log_do_no_harm(folder):
     assert spiked.figures["sigma_median_m"] == pytest.approx(good.figures["sigma_median_m"], rel=0.05)
 
 
+def test_a_station_that_asks_for_no_log_lacks_none(folder):
+    """Nor one whose mount leans farther than the sensor reaches, as at Mammoth Mountain."""
+    change_log(folder, lambda rows: [f"{row.split(',')[0]},-10.0,10.0" for row in rows])
+    outcome, _ = processed(folder, ("required = true", "required = false"))
+    assert outcome.verdict == "good"
+    log_of(folder).unlink()
+    outcome, _ = processed(folder)
+    assert outcome.verdict == "good"
+
+
+def test_a_clock_that_is_off_is_told_where_the_mount_tells_it(folder):
+    """Waves of 4° as a leaning mount shows them: the clock of the second log is 6 s late."""
+    turn = np.radians(np.linspace(97, 245, 10_000))
+    for scan, late_s in ((0, 0.0), (1, 6.0)):
+        path = log_of(folder, scan)
+        head, *rows = path.read_text().splitlines()
+        time_s, roll, pitch = np.array([[float(v) for v in row.split(",")] for row in rows]).T
+        share = (time_s - time_s[0] - 6) / 300  # the log begins 6 s before the scan
+        azimuth_rad = np.interp(share, np.linspace(0, 1, len(turn)), turn)
+        roll, pitch = roll + 4 * np.cos(azimuth_rad), pitch + 4 * np.sin(azimuth_rad)
+        rows = [f"{t + late_s:.4f},{r:.3f},{p:.3f}" for t, r, p in zip(time_s, roll, pitch, strict=True)]
+        path.write_text("\n".join([head, *rows]) + "\n")
+    outcome, _ = processed(folder)
+    assert outcome.verdict == "degraded"
+    told = re.search(r"clock of the inclination log ([+-][\d.]+) s off, known to ([\d.]+) s", outcome.reason)
+    clocks = [sensor_faults(SCENARIO, scan).clock_s for scan in (0, 1)]
+    assert float(told[1]) == pytest.approx(6 + clocks[1] - clocks[0], abs=0.6)
+    assert float(told[2]) < 0.5
+
+
 def test_no_weather_and_waiting_for_it(folder):
     (folder / "weather.dat").unlink()
     outcome, without = processed(folder)
@@ -115,6 +158,32 @@ def test_no_weather_and_waiting_for_it(folder):
     for path in (folder / "inbox").iterdir():
         os.utime(path, (1.7e9, 1.7e9))  # it came long ago
     assert processed(folder, patient=True)[0].verdict == "degraded"
+
+
+@pytest.mark.parametrize(
+    ("keep", "verdict", "says"),
+    [
+        (lambda away_m, _: away_m < 400, "degraded", "nothing beyond 400 m: fog"),
+        (lambda away_m, _: away_m < 125, "unusable", "of what scans usually see"),
+        (lambda _, share: share < 0.6, "degraded", "partial sweep: nothing seen at azimuth"),
+    ],
+    ids=["fog", "dense fog", "partial sweep"],
+)
+def test_a_scan_that_sees_less_than_the_reference_did(folder, keep, verdict, says):
+    site = read_site(folder / "site.toml")
+    first, path = sorted(site.scans.inbox.glob("*.laz"))
+    references.build_reference(site, [arrival_of(site, first)], "1", lambda: None)
+    full, _ = processed(folder)
+    assert (full.verdict, full.reason) == ("good", "")
+    scan = laspy.read(path)
+    share = (np.asarray(scan.gps_time) - scan.gps_time.min()) / np.ptp(scan.gps_time)
+    scan.points = scan.points[keep(np.hypot(scan.x, scan.y), share)]
+    scan.write(path)
+    outcome, _ = processed(folder)
+    assert outcome.verdict == verdict
+    assert says in outcome.reason
+    assert outcome.reason.count(";") == 0
+    assert outcome.epoch  # whatever the verdict, what is there is stored
 
 
 def test_points_without_time_get_the_mean_lean(folder):
