@@ -58,7 +58,7 @@ def test_published_budget_of_a_cell():
 
     assert SCANNERS["riegl-vz-6000"]["beam_divergence_mrad"] == 0.12
     given = ScannerSection.model_validate({"model": "riegl-vz-6000"})
-    vz6000 = Scanner("vz", 1.064, given.beam_divergence_mrad * 1e-3, 0.0, 0.01, 0.0, 0.0, 6000.0)
+    vz6000 = Scanner("vz", 1.064, given.beam_divergence_mrad * 1e-3, 0.0, 0.01, 0.0, 0.0, 0.0, 6000.0)
     seen = array(3421.0), np.cos(np.radians(array(65.0))), np.cos(np.radians(array(25.0)))
     point_m2 = uncertainty.shot_variance_voordendag(*seen, array(0.0), vz6000)[0]
     assert math.sqrt(point_m2) == pytest.approx(math.sqrt(0.4777**2 + 0.137**2 + 0.01**2), abs=1e-3)

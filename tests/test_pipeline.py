@@ -16,7 +16,7 @@ from station.science.pose import frame_by_origin, frame_in_local_map
 from station.science.prior import covariance_without_adjustment, lines_of
 from station.science.shared import basis
 
-VZ6000 = Scanner("vz", 1.064, 0.12e-3, 0.0, 0.010, math.radians(0.0005), math.radians(0.008), 6000.0)
+VZ6000 = Scanner("vz", 1.064, 0.12e-3, 0.0, 0.010, *np.radians((0.0005, 0.008, 10.0)), 6000.0)
 GRID = Grid(west_m=1500.0, north_m=600.0, cell_m=4.0, nx=150, ny=300)
 SCANNER = (0.0, 0.0, 3245.0)
 SLOPE = (0.25, -0.1)

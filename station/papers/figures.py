@@ -11,8 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from station.config import ScannerSection
-from station.quantities import Air, Floats
+from station.quantities import Air, Floats, Scanner
 from station.scanners import SCANNERS
 from station.science import air, beam, inclination, mobile, precision, sensitivity, uncertainty
 
@@ -114,7 +113,17 @@ def _density(range_m: float, incidence_deg: float, slope_deg: float) -> float:
 
 def _cell(range_m: float, incidence_deg: float, slope_deg: float, points: float) -> float:
     seen = _seen(range_m, incidence_deg, slope_deg)
-    scanner = ScannerSection.model_validate({"model": "riegl-vz-6000"}).instrument
+    scanner = Scanner(
+        model="riegl-vz-6000",
+        wavelength_um=_V["wavelength_um"],
+        beam_divergence_rad=_DIVERGENCE,
+        exit_diameter_m=_V["exit_diameter_m"],
+        range_sigma_m=_V["range_sigma_m"],
+        angle_resolution_rad=math.radians(_V["angle_resolution_deg"]),
+        inclination_sigma_rad=math.radians(_V["inclination_sigma_deg"]),
+        inclination_range_rad=math.radians(_V["inclination_range_deg"]),
+        range_max_m=_V["range_max_m"],
+    )
     variance_m2 = uncertainty.shot_variance_voordendag(*seen, np.array([0.0]), scanner)
     return math.sqrt(_one(variance_m2) / points)
 
