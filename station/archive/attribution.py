@@ -15,13 +15,14 @@ from station.archive.layout import Series, define, lay_out, put_raster, written_
 from station.archive.store import Row, said
 from station.archive.variables import Variable
 from station.errors import StoreError
-from station.quantities import Bools, Floats, Reference, Shared
+from station.quantities import Bools, Floats, Ints, Reference, Shared
 from station.science import terrain
 from station.science.calibration import range_bands
 from station.science.moved import Moved
-from station.science.sensitivity import INPUTS, apart, cell_shares, sobol, sum_shares
+from station.science.sensitivity import INPUTS, apart, cell_shares, sobol, some, sum_shares
 from station.science.shared import Sensitivities, against
 
+LOOKED_AT = 100_000  # cells at once
 SIMULATED_CELLS = 100  # of an area: its shares do not depend on every one
 SIMULATED_DRAWS = 64  # of each repetition
 
@@ -47,10 +48,9 @@ class Attribution:
     reference: Reference
     position_m: tuple[float, float, float]
 
-    @cached_property
-    def shares(self) -> dict[str, Floats]:
-        """Share of each input in the variance of each cell (n,)."""
-        return cell_shares(self.felt, self.random_m2, self.unknown)
+    def shares(self, of: Ints | slice) -> dict[str, Floats]:
+        """Share of each input in the variance of the chosen of the cells."""
+        return cell_shares(some(self.felt, of), self.random_m2[of], self.unknown)
 
     @cached_property
     def range_m(self) -> Floats:
@@ -61,13 +61,14 @@ class Attribution:
 
     def by_range(self) -> list[dict[str, Any]]:
         """Return the mean share of each input over single cells, by band of range."""
-        sigma_m = np.sqrt(self.felt.variance(self.unknown) + self.random_m2)
         told = []
         for low_m, high_m in range_bands(self.range_m):
-            inside = (self.range_m >= low_m) & (self.range_m < high_m)
-            if inside.any():
-                shares = {name: float(values[inside].mean()) for name, values in self.shares.items()}
-                sigma = float(np.median(sigma_m[inside]))
+            inside = np.flatnonzero((self.range_m >= low_m) & (self.range_m < high_m))
+            inside = inside[:: 1 + len(inside) // LOOKED_AT]
+            if len(inside):
+                shares = {name: float(values.mean()) for name, values in self.shares(inside).items()}
+                shared_m2 = some(self.felt, inside).variance(self.unknown)
+                sigma = float(np.median(np.sqrt(shared_m2 + self.random_m2[inside])))
                 told.append({"cells": f"{low_m:g}-{high_m:g} m", "sigma_m": sigma, "part": shares})
         return told
 
@@ -91,17 +92,13 @@ class Attribution:
         return told | (self._simulated(np.flatnonzero(inside)) if simulate else {})
 
     def _simulated(self, inside: np.ndarray[Any, Any]) -> dict[str, Any]:
-        some = inside[np.linspace(0, len(inside) - 1, min(len(inside), SIMULATED_CELLS)).astype(np.int64)]
+        chosen = inside[np.linspace(0, len(inside) - 1, min(len(inside), SIMULATED_CELLS)).astype(np.int64)]
         grid = self.series.grid
-        row, column = (place[some] for place in np.nonzero(self.cells))
+        row, column = (place[chosen] for place in np.nonzero(self.cells))
         ground = terrain.ground(self.reference)
         height_m = ground.under(column + 0.5, row + 0.5)[0]
-        felt = self.felt
-        felt = Sensitivities(
-            felt.of, felt.globals_[:, some], felt.lean[some], felt.refraction[some], felt.passed[some]
-        )
-        weights = np.full(len(some), 1 / len(some))
-        random_m2 = self.random_m2[some]
+        felt, random_m2 = some(self.felt, chosen), self.random_m2[chosen]
+        weights = np.full(len(chosen), 1 / len(chosen))
         points = grid.x_m[column], grid.y_m[row], height_m
         moved = Moved(ground, self.position_m, points, weights, felt, self.unknown, random_m2)
         found = sobol(moved, moved.draw, moved.groups(), SIMULATED_DRAWS)
@@ -117,10 +114,14 @@ class Attribution:
             title = f"What makes the elevation change of {self.series.name or self.series.station_id} unsure"
             lay_out(file, self.series, title, None)
             file.setncattr("epoch_file", self.row.epoch_file)
+            maps = {row.name: np.full(self.cells.shape, np.nan, np.float32) for row in ROWS}
+            place = np.flatnonzero(self.cells)
+            for first in range(0, len(place), LOOKED_AT):
+                part = slice(first, first + LOOKED_AT)
+                for name, share in self.shares(part).items():
+                    maps[f"share_{name}"].ravel()[place[part]] = share
             for row in ROWS:
-                values = np.full(self.cells.shape, np.nan, np.float32)
-                values[self.cells] = self.shares[row.name.removeprefix("share_")]
-                put_raster(define(file, row, self.series, 1), None, values)
+                put_raster(define(file, row, self.series, 1), None, maps[row.name])
 
 
 def attribute(series: Series, epoch: int | str) -> Attribution:

@@ -17,7 +17,7 @@ from station.archive.layout import Series
 from station.archive.observed import some_epochs
 from station.archive.store import Row
 from station.quantities import Bools, Grid, Ints
-from station.science.calibration import Sums, means, renormalised
+from station.science.calibration import Felt, means, renormalised
 from station.science.shared import against
 from station.science.terrain import smooth_gradient
 from station.science.view import View
@@ -43,13 +43,13 @@ def box_statistics(series: Series, most: int, progress: Callable[[], None]) -> l
     if not cells.any():
         return []
     told: list[dict[str, Any]] = []
-    felt: tuple[tuple[object, ...], Sums, list[dict[str, float]]] | None = None
+    felt: tuple[tuple[object, ...], Felt, list[dict[str, float]]] | None = None
     for row in some:
         one = held._read(row, cells)  # noqa: SLF001 - the same room
         key = one.reference.version, one.scanner
         if felt is None or felt[0] != key:
             places = _places(series.grid, cells, weights, one)
-            felt = key, Sums(held._felt(one, cells)), places  # noqa: SLF001
+            felt = key, Felt(held._felt(one, cells)), places  # noqa: SLF001
         told += _of_epoch(row, one, of, weights, felt[1], felt[2])
         progress()
     return told
@@ -60,7 +60,7 @@ def _of_epoch(
     one: _Held,
     of: Ints,
     weights: sparse.csr_array,
-    felt: Sums,
+    felt: Felt,
     places: list[dict[str, float]],
 ) -> list[dict[str, Any]]:
     if one.unknown is None:
@@ -70,7 +70,7 @@ def _of_epoch(
     change_m = np.where(seen, one.change_m, 0.0)
     unknown = one.unknown if one.adjusted else against(one.unknown, one.reference.shared)
     mean_m = kept @ change_m
-    sigma_m = np.sqrt(felt.variance(kept, np.where(seen, one.random_m**2, 0.0), unknown))
+    sigma_m = np.sqrt(felt.sums(kept).variance(np.where(seen, one.random_m**2, 0.0), unknown))
     scatter_m = np.sqrt(kept @ np.where(seen, (change_m - mean_m[of]) ** 2, 0.0))
     with netCDF4.Dataset(row.path) as file:
         lean = {f"{name[9:]}_deg": float(np.ma.filled(file[name][row.index], np.nan)) for name in LEAN}

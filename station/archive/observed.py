@@ -130,14 +130,16 @@ class _Ground:
         self.edges_m = np.geomspace(grid.cell_m, max(reach_m / 2, 4 * grid.cell_m), LAGS + 1)
         self.pairs = calibration.pairs(x_m, y_m, self.edges_m, PAIRS, seed=1)
         self._held = Aggregates(series)
-        self._known: dict[tuple[str, tuple[float, ...]], calibration.Sums] = {}
+        self._known: dict[tuple[str, tuple[float, ...]], tuple[calibration.Felt, calibration.Sums]] = {}
 
-    def _felt(self, one: _Seen) -> calibration.Sums:
-        """Return what the cells feel, which is the same as long as scanner and reference are."""
+    def _felt(self, one: _Seen) -> tuple[calibration.Felt, calibration.Sums]:
+        """Return what cells and pairs of them feel: the same as long as scanner and reference are."""
         key = one.reference.version, one.scanner
         if key not in self._known:
             held = self._held._read(one.row, self.cells)  # noqa: SLF001
-            self._known = {key: calibration.Sums(self._held._felt(held, self.cells))}  # noqa: SLF001
+            felt = calibration.Felt(self._held._felt(held, self.cells))  # noqa: SLF001
+            apart = calibration.differences(*self.pairs[:2], len(self.band))
+            self._known = {key: (felt, felt.sums(apart))}
         return self._known[key]
 
     def _spread_out(self, one: _Seen) -> tuple[Bools, Floats, Floats]:
@@ -153,11 +155,13 @@ class _Ground:
 
     def fits(self, one: _Seen) -> Told:
         """Return how the errors of an epoch compare with their sigma, by scale and band."""
-        felt, (seen, change_m, random_m2) = self._felt(one), self._spread_out(one)
+        (felt, _), (seen, change_m, random_m2) = self._felt(one), self._spread_out(one)
         z_of = {"cell": (one.change_m / one.sigma_m, self.band[self.place[one.cell]])}
         for scale, (weights, band) in self.sums.items():
             kept, share = calibration.renormalised(weights, seen)
-            z = (kept @ change_m) / np.sqrt(np.maximum(felt.variance(kept, random_m2, one.unknown), 1e-18))
+            z = (kept @ change_m) / np.sqrt(
+                np.maximum(felt.sums(kept).variance(random_m2, one.unknown), 1e-18)
+            )
             z_of[scale] = np.where(share >= BLOCK_SHARE, z, np.nan), band[: len(z)]
         told = []
         for scale, (z, band) in z_of.items():
@@ -174,11 +178,11 @@ class _Ground:
     def lags(self, one: _Seen) -> Floats:
         """Return sums by distance (3, LAGS): half the squared differences, half their variance, how many."""
         first, second, lag = self.pairs
-        felt, (seen, change_m, random_m2) = self._felt(one), self._spread_out(one)
+        (_, apart), (seen, change_m, random_m2) = self._felt(one), self._spread_out(one)
         both = seen[first] & seen[second]
-        first, second, lag = first[both], second[both], lag[both]
-        stated_m2 = felt.variance(calibration.differences(first, second, len(seen)), random_m2, one.unknown)
-        observed_m2 = (change_m[first] - change_m[second]) ** 2
+        stated_m2 = apart.variance(random_m2, one.unknown)[both]
+        observed_m2 = (change_m[first] - change_m[second])[both] ** 2
+        lag = lag[both]
         return np.stack(
             [np.bincount(lag, w, LAGS) for w in (observed_m2 / 2, stated_m2 / 2, np.ones(len(lag)))]
         )

@@ -8,7 +8,7 @@ import numpy as np
 from scipy import sparse, stats
 
 from station.quantities import Bools, Floats, Ints, Shared
-from station.science.shared import GLOBAL, Sensitivities, _between, line_variances
+from station.science.shared import GLOBAL, Basis, Sensitivities, _between, line_variances
 
 LIMIT_95 = 1.959964  # of a normal variable
 NEAR_ONE = 1.1  # a factor within that of 1 is left alone
@@ -99,23 +99,36 @@ def means(of: Ints) -> sparse.csr_array:
     return sparse.csr_array((1 / count[of], (of, np.arange(len(of)))), shape=shape)
 
 
+@dataclass(frozen=True)
 class Sums:
-    """Variances of many weighted sums of the same cells; one at a time they are `aggregate_variance`."""
+    """Weighted sums (m,) of the same cells, many at once; one at a time they are `aggregate_variance`."""
+
+    weights: sparse.csr_array  # (m, n)
+    of: Basis
+    effect: Floats  # (m, p) of the shared parameters
+    own: Floats  # (m, lines) of what lines have of their own
+
+    def variance(self, random_m2: Floats, unknown: Shared) -> Floats:
+        """Variance of each sum [m²], with the random variance of each cell (n,).
+
+        Source: EQUATIONS 6.2.
+        """
+        shared_m2 = np.sum((self.effect @ unknown.covariance) * self.effect, axis=1)
+        shared_m2 += self.own**2 @ line_variances(self.of, unknown)
+        return np.asarray(self.weights.power(2) @ random_m2 + shared_m2)
+
+
+class Felt:
+    """What cells (n,) feel, as matrices, ready for many sums of them."""
 
     def __init__(self, felt: Sensitivities) -> None:
         self._of = felt.of
         self._design, self._lines = _matrices(felt)
-        self._left = _between(felt.of).left
 
-    def variance(self, weights: sparse.csr_array, random_m2: Floats, unknown: Shared) -> Floats:
-        """Variance of each weighted sum (m,) of cell heights [m²].
-
-        Source: EQUATIONS 6.2.
-        """
-        g = (weights @ self._design).toarray()
-        own = (weights @ self._lines).toarray() @ self._left
-        shared_m2 = np.sum((g @ unknown.covariance) * g, axis=1) + own**2 @ line_variances(self._of, unknown)
-        return np.asarray(weights.power(2) @ random_m2 + shared_m2)
+    def sums(self, weights: sparse.csr_array) -> Sums:
+        """Return weighted sums (m, n) of the cells."""
+        own = (weights @ self._lines).toarray() @ _between(self._of).left
+        return Sums(weights, self._of, (weights @ self._design).toarray(), own)
 
 
 def renormalised(weights: sparse.csr_array, seen: Bools) -> tuple[sparse.csr_array, Floats]:

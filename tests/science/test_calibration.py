@@ -93,7 +93,7 @@ def test_many_sums_at_once_are_each_alone():
             calibration.differences(np.array([3, 5]), np.array([70, 9]), 120),
         ]
     ).tocsr()  # fmt: skip
-    told = calibration.Sums(felt).variance(weights, random_m2, unknown)
+    told = calibration.Felt(felt).sums(weights).variance(random_m2, unknown)
     alone = [shared.aggregate_variance(row, random_m2, felt, unknown) for row in weights.toarray()]
     assert told == pytest.approx(alone, rel=1e-9)
 
