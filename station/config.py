@@ -265,6 +265,15 @@ class ServiceSection(Section):
     memory_gb: Annotated[float, Field(ge=0.5, le=1024)] = 5.0
 
 
+class ProductsSection(Section):
+    """What is made of every scan for people and other tools."""
+
+    page: bool = True
+    geotiff: bool = False
+    quicklook_width_px: Annotated[int, Field(ge=400, le=4000)] = 1200
+    change_limit_m: Positive | None = None
+
+
 class SiteFile(Section):
     """The whole file."""
 
@@ -284,6 +293,7 @@ class SiteFile(Section):
     flags: FlagsSection | None = None
     retention: RetentionSection = RetentionSection()
     service: ServiceSection = ServiceSection()
+    products: ProductsSection = ProductsSection()
 
     @model_validator(mode="after")
     def _chain_is_complete(self) -> SiteFile:

@@ -30,7 +30,15 @@ if TYPE_CHECKING:
 T = TypeVar("T")
 
 # Whatever of these cannot be imported is left out; the first brings nearly all of the rest.
-PRELOAD = ("station.service.tasks", "station.service.child", "laspy", "lazrs", "netCDF4", "scipy.signal")
+PRELOAD = (
+    "station.service.tasks",
+    "station.service.show",
+    "station.service.child",
+    "laspy",
+    "lazrs",
+    "netCDF4",
+    "scipy.signal",
+)
 # One scan is one core's work; and every further thread of a BLAS reserves address space against RLIMIT_AS.
 _ONE_THREAD = dict.fromkeys(("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "RAYON_NUM_THREADS"), "1")
 _TICK_S = 0.2

@@ -314,6 +314,12 @@ class Journal:
             return self._select("ORDER BY name")
         return self._select("WHERE state = ? ORDER BY name", state)
 
+    def seconds(self) -> dict[str, float]:
+        """Return how long each stored scan took [s], by its name; all of them in a twentieth of a second."""
+        told = "SELECT name, json_extract(figures, '$.seconds') FROM scan WHERE state = 'stored'"
+        with self._faults():
+            return {str(name): float(took) for name, took in self._rows.execute(told) if took is not None}
+
     def counts(self) -> dict[str, int]:
         """Return how many scans stand where; every state is named."""
         with self._faults():

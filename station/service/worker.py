@@ -12,7 +12,7 @@ from typing import TypeVar
 from station.archive.reference import current
 from station.archive.store import series_in
 from station.config import Site
-from station.errors import ConfigError, NotReadyError, ScanError, StoreError
+from station.errors import ConfigError, NotReadyError, ScanError, StationError, StoreError
 from station.service import child
 from station.service.inbox import Arrival
 from station.service.integrity import (
@@ -38,6 +38,7 @@ from station.service.references import (
     scans_due,
 )
 from station.service.retention import due_to_go, retire
+from station.service.show import show
 from station.service.stale import count_by_settings, late
 from station.service.tasks import Outcome, Past, Progress, Refused, Same, attend, open_only, series_of
 from station.service.upkeep import join_epochs, publish, sweep_store
@@ -105,6 +106,7 @@ class Worker:
         _say(arrival.name, outcome)
         if self._site.adjusts and (moved := self.run(moved_by, outcome.start_utc_s)):
             log.warning("%s", logfmt(scan=arrival.name, moved=moved))
+        self.show()
         self._make_reference_when_due()
         return True
 
@@ -215,7 +217,15 @@ class Worker:
     ) -> bool:
         self._journal.set_aside(arrival.name, reason, sha256=sha256, log_sha256=log_sha256)
         log.warning("%s", logfmt(scan=arrival.name, verdict="set_aside", reason=reason))
+        self.show()
         return False
+
+    def show(self) -> None:
+        """Bring the page up to what is stored; what fails there keeps no scan from the store."""
+        try:
+            self.run(show)
+        except (StationError, RuntimeError) as error:
+            log.warning("%s", logfmt(page="failed", reason=error))
 
     def _note_same(self, arrival: Arrival, same: Same) -> bool:
         """Put a scan back where it was, or aside if it is another's copy; tell whether it is stored."""

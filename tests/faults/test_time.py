@@ -27,6 +27,7 @@ def timed(station, name, first_s):
     These are seconds of the GPS week then; None: the scanner's, as they are.
     """
     scan = laspy.read(station.folder / harness.LATER / f"{harness.stem(0)}.laz")
+    scan.header.generating_software = name  # the same bytes under two names would be done once
     own_s = np.asarray(scan.gps_time)
     rows = (station.folder / harness.LATER / f"{harness.stem(0)}-incl.txt").read_text().splitlines()
     log = [row.split(",") for row in rows[1:]]
