@@ -373,6 +373,77 @@ def serve(
     show(folder, port)
 
 
+sop_app = typer.Typer(
+    help="Solve an SOP from points and planes; see what an SOP says.",
+    no_args_is_help=True,
+    rich_markup_mode=None,
+)
+app.add_typer(sop_app, name="sop")
+
+Crs = Annotated[
+    str | None,
+    typer.Option(metavar="EPSG", help="The map, where the SOP leads to one without a POP or origin."),
+]
+Given = {"exists": True, "dir_okay": False, "show_default": False}
+
+
+@sop_app.command()
+def solve(
+    features: Annotated[Path, typer.Argument(metavar="FEATURES", help="Table of features (CSV).", **Given)],
+    out: Annotated[Path, typer.Option(metavar="SOP", help="Where to write it.", show_default=False)],
+    start: Annotated[
+        Path | None,
+        typer.Option(metavar="SOP", help="Start from this; needed without three points.", **Given),
+    ] = None,
+    crs: Crs = None,
+    scanner: Annotated[
+        str | None,
+        typer.Option(metavar="MODEL", help="Add the noise of this scanner, such as riegl-vz-6000."),
+    ] = None,
+    *,
+    json_: Json = False,
+) -> None:
+    """Solve an SOP by least squares, with its covariance.
+
+    Each row of the table: x,y,z in the scan, ref_x,ref_y,ref_z outside, sigma [m], name; for a point on a
+    plane also normal_x,normal_y,normal_z.
+    """
+    from dataclasses import asdict
+
+    from station.service.sop import describe_solution, known_scanner, solve_sop
+
+    found = solve_sop(features, out, start, crs, None if scanner is None else known_scanner(scanner))
+    print(json.dumps(asdict(found), indent=2) if json_ else describe_solution(found))
+
+
+@sop_app.command()
+def show(
+    sop: Annotated[
+        list[Path], typer.Argument(metavar="SOP...", help="One or more, in their order.", **Given)
+    ],
+    pop: Annotated[
+        Path | None, typer.Option(metavar="POP", help="From the project to WGS84.", **Given)
+    ] = None,
+    crs: Crs = None,
+    *,
+    json_: Json = False,
+) -> None:
+    """Tell where SOPs put the scanner and how it leans there.
+
+    Of each but the first also how it differs from the one before.
+    """
+    from dataclasses import asdict
+
+    from station.service.sop import describe_chain, show_sop
+
+    chains = show_sop(sop, pop, crs)
+    print(
+        json.dumps([asdict(chain) for chain in chains], indent=2)
+        if json_
+        else "\n".join(describe_chain(chain) for chain in chains)
+    )
+
+
 @app.command()
 def calibrate(
     site: SiteArgument,

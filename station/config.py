@@ -94,6 +94,21 @@ class ScannerSection(Section):
             )
         return {**known, **given}
 
+    @property
+    def instrument(self) -> Scanner:
+        """The scanner as a quantity, angles in radians."""
+        return Scanner(
+            model=self.model,
+            wavelength_um=self.wavelength_um,
+            beam_divergence_rad=self.beam_divergence_mrad * 1e-3,
+            exit_diameter_m=self.exit_diameter_m,
+            range_sigma_m=self.range_sigma_m,
+            angle_resolution_rad=math.radians(self.angle_resolution_deg),
+            inclination_sigma_rad=math.radians(self.inclination_sigma_deg),
+            inclination_range_rad=math.radians(self.inclination_range_deg),
+            range_max_m=self.range_max_m,
+        )
+
 
 class SopSection(Section):
     """A scanner orientation and position, and from when it holds."""
@@ -320,18 +335,7 @@ class Site(SiteFile):
     @property
     def instrument(self) -> Scanner:
         """The scanner as a quantity, angles in radians."""
-        given = self.scanner
-        return Scanner(
-            model=given.model,
-            wavelength_um=given.wavelength_um,
-            beam_divergence_rad=given.beam_divergence_mrad * 1e-3,
-            exit_diameter_m=given.exit_diameter_m,
-            range_sigma_m=given.range_sigma_m,
-            angle_resolution_rad=math.radians(given.angle_resolution_deg),
-            inclination_sigma_rad=math.radians(given.inclination_sigma_deg),
-            inclination_range_rad=math.radians(given.inclination_range_deg),
-            range_max_m=given.range_max_m,
-        )
+        return self.scanner.instrument
 
     @property
     def adjusts(self) -> bool:

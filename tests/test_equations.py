@@ -45,7 +45,7 @@ def test_refraction_coefficients():
 
 def test_p7_68_percent_ellipse():
     """Of draws from the distribution 68.3 % lie within, against 39.35 % for the unscaled ellipse."""
-    circle = beam.horizontal_error(np.diag([1.0, 1.0, 4.0])[None])[0]
+    circle = beam.error_ellipse(np.diag([1.0, 1.0, 4.0])[None])[0][0]
     draws = np.random.default_rng(7).normal(size=(200_000, 2))
     assert np.mean(np.hypot(*draws.T) < circle) == pytest.approx(0.683, abs=0.004)
 
@@ -53,12 +53,11 @@ def test_p7_68_percent_ellipse():
 def test_published_budget_of_a_cell():
     """V-1 and V-2 by hand for box 5, and V-3 as the linear sum it is."""
     from station.config import ScannerSection
-    from station.quantities import Scanner
     from station.scanners import SCANNERS
 
     assert SCANNERS["riegl-vz-6000"]["beam_divergence_mrad"] == 0.12
     given = ScannerSection.model_validate({"model": "riegl-vz-6000"})
-    vz6000 = Scanner("vz", 1.064, given.beam_divergence_mrad * 1e-3, 0.0, 0.01, 0.0, 0.0, 0.0, 6000.0)
+    vz6000 = given.instrument
     seen = array(3421.0), np.cos(np.radians(array(65.0))), np.cos(np.radians(array(25.0)))
     point_m2 = uncertainty.shot_variance_voordendag(*seen, array(0.0), vz6000)[0]
     assert math.sqrt(point_m2) == pytest.approx(math.sqrt(0.4777**2 + 0.137**2 + 0.01**2), abs=1e-3)

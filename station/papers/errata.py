@@ -63,7 +63,11 @@ ERRATA = (
             "what the filter leaves, common to all points of its time: `shared`"),
     Erratum(HARTZELL, "Eq. 14, 21", "leaving out correlation is called conservative; common errors add up coherently,"
             " so that published volumes are 150 to 280 times too sure",
-            "Σ a² σ_r² + gᵀ C g: `shared.aggregate_variance`"),
+            "Σ a² σ_r² + gᵀ C g: `volume.variance`, `shared.aggregate_variance`"),
+    Erratum(HARTZELL, "Table 2", "Mammoth, mesh, gross: 0.00153 % and 0.00065 % should be 0.00059 % and 0.00052 %",
+            "sigmas in m³: `volume.mesh`, `volume.independent_variance`"),
+    Erratum(HARTZELL, "section 2.2", "the reference variance takes residuals for independent",
+            "as published: `registration.reference_variance`; the station's own adjustment holds what is shared"),
     Erratum(VOORDENDAG, "Eq. 2, 5", "a tilt that 23,000 shots share is divided by √n",
             'tilt as a shared parameter; the printed form with `model = "voordendag2023"`'),
     Erratum(VOORDENDAG, "Eq. 3", "a linear sum of a standard deviation and a bound",
