@@ -96,6 +96,13 @@ def _warmer(kelvin: float, *, range_m: float = 3414.0) -> float:
     return 1e3 * range_m * (_one(correction.range_scale(np.array([0.0]))) - 1)
 
 
+def _by_time_of_flight(kelvin: float, *, range_m: float = 3414.0) -> float:
+    """Range error of air so much warmer than assumed, from the time that the echo takes [mm]."""
+    real = Air(IHE.temperature_c + kelvin, IHE.pressure_hpa, IHE.humidity_pct)
+    echo_s = range_m / _one(air.slope_range(1.0, _refractivity()))
+    return 1e3 * (_one(air.slope_range(echo_s, _refractivity(real))) - range_m)
+
+
 def _heavier(hpa: float, range_m: float = 3414.0) -> float:
     real = Air(IHE.temperature_c, IHE.pressure_hpa + hpa, IHE.humidity_pct)
     correction = air.air_correction(real, IHE, _V["wavelength_um"])
@@ -176,6 +183,8 @@ VOORDENDAG_FIGURES = (
            lambda: _warmer(10), _LES),
     Figure(VOORDENDAG, "P6", "Eq. 10", "range error at 3414 m, 10 K colder all along", "mm", -42.4, -26.1, 0.2,
            lambda: _warmer(-10), _LES),
+    Figure(VOORDENDAG, "P6", "Eq. 6", "the same, warmer, from the time of flight", "mm", 21.0, 24.3, 0.2,
+           lambda: _by_time_of_flight(10), _LES),
     Figure(VOORDENDAG, "P6", "Eq. 10", "range error at 3414 m, 10 hPa more", "mm", None, -9.9, 0.1,
            lambda: _heavier(10), "said to be of no significant influence; it is 40 % of that of 10 K"),
     Figure(VOORDENDAG, "P6", "Eq. 10", "range error 500 m below the scanner, the same weather", "ppm", None, -5.1, 0.1,

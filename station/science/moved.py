@@ -8,11 +8,12 @@ import numpy as np
 
 from station.quantities import Bools, Floats, Shared
 from station.science.air import EARTH_RADIUS_M
-from station.science.pose import rotation_x, rotation_y, rotation_z
 from station.science.sensitivity import GROUPS, apart, members
 from station.science.shared import GLOBAL, Sensitivities, aggregate_variance
 from station.science.terrain import Ground
 from station.science.view import Points
+
+DRAWS_AT_ONCE = 500
 
 
 @dataclass(frozen=True)
@@ -33,7 +34,8 @@ class Moved:
 
     def __call__(self, inputs: Floats) -> Floats:
         """Return how far off the sum is (draws,), of inputs (p + 2, draws)."""
-        off = np.array([self.weights @ self._off(draw) for draw in inputs[:-2].T])
+        parts = np.array_split(inputs[:-2], inputs.shape[1] // DRAWS_AT_ONCE + 1, axis=1)
+        off = np.concatenate([self._off(part) @ self.weights for part in parts])
         silent = Shared(
             self.unknown.names, self.unknown.units, self.unknown.estimate, 0 * self.unknown.covariance,
             self.unknown.noise_variance,
@@ -59,15 +61,19 @@ class Moved:
         )
 
     def _off(self, parameters: Floats) -> Floats:
-        """Return how high the points (n,) appear above the ground if the scanner is off by this [m]."""
-        by_name = dict(zip((name for name, _ in GLOBAL), parameters, strict=False))
-        shift_m = [by_name[f"translation_{axis}"] for axis in ("east", "north", "up")]
-        offset_m = np.stack(
-            [axis - at - shift for axis, at, shift in zip(self.points, self.position_m, shift_m, strict=True)]
+        """Heights (draws, n) of the points above the ground if the scanner is off by this (p, draws) [m]."""
+        of = {name: parameters[at][:, None] for at, (name, _) in enumerate(GLOBAL)}
+        x_m, y_m, z_m = (
+            axis - at - of[f"translation_{name}"]
+            for axis, at, name in zip(self.points, self.position_m, ("east", "north", "up"), strict=True)
         )
-        x_m, y_m, z_m = self._turned(offset_m, by_name, parameters)
-        range_m = np.sqrt(x_m**2 + y_m**2 + z_m**2)
-        scale = 1 + by_name["range_bias"] / range_m + 1e-6 * by_name["range_scale"]
+        x_m, y_m = _turned(x_m, y_m, of["heading"])
+        z_m, x_m = _turned(z_m, x_m, -of["tilt_north"])
+        y_m, z_m = _turned(y_m, z_m, -of["tilt_east"])
+        flat_m = np.hypot(x_m, y_m)
+        farther_m, z_m = _turned(flat_m, z_m, self._upward(parameters, flat_m, of["refraction"]))
+        x_m, y_m = x_m * farther_m / flat_m, y_m * farther_m / flat_m
+        scale = 1 + of["range_bias"] / np.hypot(farther_m, z_m) + 1e-6 * of["range_scale"]
         east_m, north_m, up_m = (
             at + scale * axis for at, axis in zip(self.position_m, (x_m, y_m, z_m), strict=True)
         )
@@ -75,23 +81,20 @@ class Moved:
         column, row = (east_m - grid.west_m) / grid.cell_m, (grid.north_m - north_m) / grid.cell_m
         return np.asarray(up_m - self.ground.under(column, row)[0])
 
-    def _turned(self, offset_m: Floats, by_name: dict[str, float], parameters: Floats) -> Points:
-        """Turn the lines of sight back by what the scanner leans and turns more than assumed, and the air."""
-        turn = (
-            rotation_x(-by_name["tilt_east"])
-            @ rotation_y(-by_name["tilt_north"])
-            @ rotation_z(by_name["heading"])
-        )
-        x_m, y_m, z_m = turn @ offset_m
+    def _upward(self, parameters: Floats, flat_m: Floats, refraction: Floats) -> Floats:
+        """By how much lines of sight (draws, n) are turned up: the air, less the lean [rad]."""
         first, count = len(GLOBAL), self.felt.of.lean_count
         lean_rad, bend = (
-            knots[before] * (1 - share) + knots[after] * share
+            (knots[before] * (1 - share)[:, None] + knots[after] * share[:, None]).T
             for knots, (before, after, share) in (
                 (parameters[first : first + count], self.felt.lean_knot()),
                 (parameters[first + count :], self.felt.refraction_knot()),
             )
         )
-        flat_m = np.hypot(x_m, y_m)
-        up_rad = (by_name["refraction"] + bend) * flat_m / (2 * EARTH_RADIUS_M) - lean_rad
-        nearer = np.cos(up_rad) - z_m / flat_m * np.sin(up_rad)
-        return x_m * nearer, y_m * nearer, z_m * np.cos(up_rad) + flat_m * np.sin(up_rad)
+        return np.asarray((refraction + bend) * flat_m / (2 * EARTH_RADIUS_M) - lean_rad)
+
+
+def _turned(first: Floats, second: Floats, angle_rad: Floats) -> tuple[Floats, Floats]:
+    """Turn coordinates in their plane, from the first axis towards the second."""
+    sine, cosine = np.sin(angle_rad), np.cos(angle_rad)
+    return first * cosine - second * sine, first * sine + second * cosine

@@ -28,6 +28,7 @@ from station.science.precision import (
     is_rough,
     window_for,
 )
+from station.service import child
 from station.service.tasks import series_of
 
 Told = dict[str, Any]
@@ -43,20 +44,36 @@ def calibrate(site: Site, scans: Sequence[Path], most_epochs: int, progress: Pro
     """Return stated against observed sigma, boxes beside the lean, and the precision of ranges and angles.
 
     Ranges are of the newest of `scans`, angles of the two newest; where none is given, of those in the inbox.
-    Raises StoreError where there is neither a series nor a scan.
+    Raises StoreError where there is neither a series nor a scan, ScanError where a named scan cannot be read.
     """
     series = series_of(site)
+    memory_gb, timeout_s = site.service.memory_gb, site.scans.timeout_s
     told: Told = {}
     if series.path.is_file():
-        found = asdict(observe(series, most_epochs, progress))
-        found["epochs"] = [{k: v for k, v in row.items() if k != "z"} for row in found["epochs"]]
-        told |= found | {"boxes": box_statistics(series, most_epochs, progress)}
+        told |= child.run(
+            series_told, site, most_epochs, memory_gb=memory_gb, timeout_s=timeout_s, on_progress=progress
+        )
     chosen = sorted(scans)[-REPEATS:] or _newest(site)
     if site.scans.frame == "scanner" and chosen:
-        told["precision"] = _precision(site, chosen, progress)
+        try:
+            told["precision"] = child.run(
+                precision_of, site, chosen, memory_gb=memory_gb, timeout_s=timeout_s
+            )
+        except ScanError as error:
+            if scans:
+                raise
+            told["precision"] = {"scans": [path.name for path in chosen], "fault": str(error)}
     if not told:
         raise StoreError(f"{series.folder}: nothing is stored yet, and there is no scan to look at")
     return told
+
+
+def series_told(site: Site, most_epochs: int, progress: Progress) -> Told:
+    """Return what the series says: sigma on stable ground, and boxes; runs in a child process."""
+    series = series_of(site)
+    found = asdict(observe(series, most_epochs, progress))
+    found["epochs"] = [{k: v for k, v in row.items() if k != "z"} for row in found["epochs"]]
+    return found | {"boxes": box_statistics(series, most_epochs, progress)}
 
 
 def _newest(site: Site) -> list[Path]:
@@ -65,7 +82,8 @@ def _newest(site: Site) -> list[Path]:
     return found[-REPEATS:]
 
 
-def _precision(site: Site, scans: Sequence[Path], progress: Progress) -> Told:
+def precision_of(site: Site, scans: Sequence[Path], progress: Progress) -> Told:
+    """Return what the shots of one or two scans say of the scanner; runs in a child process."""
     shots = []
     for path in scans:
         shots.append(_shots(site, path))
@@ -184,6 +202,8 @@ def _number(value: float, width: int, digits: int = 2) -> str:
 
 def _measured(found: Told) -> list[str]:
     lines = [f"Precision of the scanner, from {' and '.join(found['scans'])}"]
+    if "fault" in found:
+        return [*lines, f"  {found['fault']}: name other scans"]
     if model := found["range"]:
         told = f"{model['typical_m'] * 1e3:.1f} mm ± {100 * model['typical_error']:.0f} %"
         if model["typical_error"] >= TRUSTED:

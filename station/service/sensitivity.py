@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from station.archive.aggregate import Aggregates
 from station.archive.attribution import attribute
 from station.config import Site
 from station.science.sensitivity import INPUTS
+from station.service import child
 from station.service.tasks import areas_of, series_of
 
 Told = dict[str, Any]
@@ -24,11 +27,20 @@ KINDS = {
 def sensitivity(site: Site, epoch: int | str, maps: Path | None) -> Told:
     """Return the shares of the inputs in the variance of an epoch's cells and areas, and write maps of them.
 
-    Raises StoreError where the store holds nothing of the kind, or maps cannot be written.
+    Raises StoreError where the store holds nothing of the kind, or maps cannot be written; IndexError where
+    the series has no such place.
     """
+    Aggregates(series_of(site)).row(epoch)
+    memory_gb, timeout_s = site.service.memory_gb, site.scans.timeout_s
+    return child.run(shares_of, site, epoch, maps, memory_gb=memory_gb, timeout_s=timeout_s)
+
+
+def shares_of(site: Site, epoch: int | str, maps: Path | None, progress: Callable[[], None]) -> Told:
+    """Return what `sensitivity` does; runs in a child process."""
     found = attribute(series_of(site), epoch)
     if maps is not None:
         found.write(maps)
+    progress()
     areas = {"everything": np.ones(site.grid_cells.shape, bool)} | areas_of(site)
     told = [found.of_area(name, cells) for name, cells in areas.items()]
     return {

@@ -12,7 +12,7 @@ from typer.testing import CliRunner
 
 from station import cli
 from station.config import read_site
-from station.errors import StationError
+from station.errors import ScanError, StationError
 from station.service.calibrate import calibrate, describe
 from station.service.once import process_scans
 from station.simulation.station import simulate, tiny
@@ -74,6 +74,12 @@ def test_calibrate_before_any_scan_was_processed_measures_the_scanner_alone(live
     assert set(told) == {"precision"}
     assert "Precision of the scanner, from " in describe(told)
     assert "nothing is stored yet" in str(run("sensitivity", tmp_path / "site.toml").exception)
+    newest = site.scans.inbox / "990101_000000.laz"
+    newest.write_bytes(b"LASF" + bytes(500))
+    assert "990101_000000.laz" in describe(calibrate(site, [], 10, lambda: None))
+    assert "name other scans" in describe(calibrate(site, [], 10, lambda: None))
+    with pytest.raises(ScanError):
+        calibrate(site, [newest], 10, lambda: None)
     for scan in site.scans.inbox.glob("*.laz"):
         scan.unlink()
     with pytest.raises(StationError, match="nothing is stored yet"):
