@@ -285,7 +285,8 @@ def describe_solution(told: Solution) -> str:
     times = math.sqrt(told.reference_variance)
     lines = [
         describe_chain(told.chain),
-        f"  one sigma about {_numbers(told.turn_sigma_deg, 4)} °, along {_numbers(told.shift_sigma_m, 4)} m",
+        f"  sigma of turns   {_numbers(told.turn_sigma_deg, 4)} ° about east, north, up",
+        f"  sigma of shifts  {_numbers(told.shift_sigma_m, 4)} m",
         f"  reference variance {told.reference_variance:.3g}: the features are off by {times:.2g} sigmas",
         "",
         "feature                 left [m]   sigmas",
