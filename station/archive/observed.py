@@ -13,7 +13,7 @@ from scipy import sparse
 from station.archive.aggregate import Aggregates
 from station.archive.layout import Series
 from station.archive.store import Row, rows, said
-from station.quantities import Bools, Floats, Ints, Quality, Reference, Shared
+from station.quantities import Bools, Floats, Floats32, Ints, Quality, Reference, Shared
 from station.science import calibration, ground
 from station.science.shared import against
 
@@ -32,9 +32,9 @@ class _Seen:
     row: Row
     scan_id: str
     cell: Ints
-    change_m: Floats
-    sigma_m: Floats
-    random_m2: Floats
+    change_m: Floats32
+    sigma_m: Floats32
+    random_m2: Floats32
     scanner: tuple[float, ...]
     unknown: Shared
     reference: Reference
@@ -98,10 +98,11 @@ def _read(series: Series, most: int, progress: Callable[[], None]) -> Iterator[_
         if of.unknown is None or scan_id in of.reference.scan_ids or not known.any():
             continue
         unknown = of.unknown if of.adjusted else against(of.unknown, of.reference.shared)
-        yield _Seen(
-            row, scan_id, np.flatnonzero(chosen)[known], of.change_m[known], sigma_m[chosen][known],
-            of.random_m[known] ** 2, of.scanner, unknown, of.reference,
-        )  # fmt: skip
+        change_m, stated_m, random_m = (
+            values[known].astype(np.float32) for values in (of.change_m, sigma_m[chosen], of.random_m)
+        )
+        cell = np.flatnonzero(chosen)[known]
+        yield _Seen(row, scan_id, cell, change_m, stated_m, random_m**2, of.scanner, unknown, of.reference)
 
 
 class _Ground:
@@ -156,7 +157,12 @@ class _Ground:
     def fits(self, one: _Seen) -> Told:
         """Return how the errors of an epoch compare with their sigma, by scale and band."""
         (felt, _), (seen, change_m, random_m2) = self._felt(one), self._spread_out(one)
-        z_of = {"cell": (one.change_m / one.sigma_m, self.band[self.place[one.cell]])}
+        z_of = {
+            "cell": (
+                np.asarray(one.change_m / one.sigma_m, dtype=np.float64),
+                self.band[self.place[one.cell]],
+            )
+        }
         for scale, (weights, band) in self.sums.items():
             kept, share = calibration.renormalised(weights, seen)
             z = (kept @ change_m) / np.sqrt(
@@ -196,7 +202,7 @@ def _one_epoch(one: _Seen, scale: str, band: str, z: Floats) -> dict[str, Any]:
     known = z[np.isfinite(z)]
     return {
         "time": one.row.start.strftime("%Y-%m-%dT%H:%M:%SZ"), "scan_id": one.scan_id,
-        "scale": scale, "band": band, "z": known, **asdict(calibration.fit(known)),
+        "scale": scale, "band": band, "z": known.astype(np.float32), **asdict(calibration.fit(known)),
     }  # fmt: skip
 
 

@@ -277,7 +277,7 @@ HARTZELL_FIGURES = (
            lambda: _widening(40, vertical=True), _DOUBLES),
     Figure(HARTZELL, "P9", "Table 2", "σ of the net volume, raster, Montezuma, of cells of 22.2 and 12.3 mm", "m³", 4.743,
            4.743, 0.05, lambda: _net_volume(0.5, (70, 80), 100, (0.0222, 0.0123)),
-           "of errors that are each point's own; what points share is 150 to 280 times as much"),
+           "from the cells' σ that it implies, each cell's own; what points share is 150 to 280 times as much"),
     Figure(HARTZELL, "P9", "Table 2", "σ of the net volume, raster, Mammoth, of cells of 2.6 and 1.6 mm", "m³", 0.0182,
            0.0182, 2e-4, lambda: _net_volume(0.25, (80, 112), 1, (0.0026, 0.0016)), "as above"),
     Figure(HARTZELL, "", "section 2.2", "σ of the inclination once filtered, of 0.006° a sample", "0.001°", 6.0, 0.79,

@@ -12,6 +12,7 @@ from station.science.shared import GLOBAL, Basis, Sensitivities, _between, line_
 
 LIMIT_95 = 1.959964  # of a normal variable
 NEAR_ONE = 1.1  # a factor within that of 1 is left alone
+LEAST = 1e-6  # a spread, of errors that are nought
 FEWEST = 20  # values that say anything of a spread
 FEWEST_EPOCHS = 8  # that say anything of how it will go on
 SCALES_M = (10.0, 100.0)
@@ -68,8 +69,10 @@ def scale(z_of_epochs: list[Floats]) -> Scale:
     if count < FEWEST_EPOCHS:
         return Scale(np.nan, np.nan, np.nan, advised=False)
     spread = _robust if np.mean([len(z) for z in known]) >= FEWEST else _rms
-    log = np.log(spread(np.concatenate(known)))
-    without = [np.log(spread(np.concatenate(known[:at] + known[at + 1 :]))) for at in range(count)]
+    log = np.log(max(spread(np.concatenate(known)), LEAST))
+    without = [
+        np.log(max(spread(np.concatenate(known[:at] + known[at + 1 :])), LEAST)) for at in range(count)
+    ]
     error = np.sqrt((count - 1) * np.var(without))
     reach = stats.t.ppf(0.975, count - 1) * error
     factor, low, high = (float(np.exp(one)) for one in (log, log - reach, log + reach))
