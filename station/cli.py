@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import sys
 from collections.abc import Callable, Iterable
 from datetime import UTC, datetime
@@ -441,6 +442,117 @@ def show(
         if json_
         else "\n".join(describe_chain(chain) for chain in chains)
     )
+
+
+@app.command()
+def calibrate(
+    site: SiteArgument,
+    scans: Annotated[
+        list[Path] | None,
+        typer.Argument(
+            metavar="[SCAN...]",
+            help="Scan files to take the precision of ranges and angles from; else the newest two.",
+            exists=True,
+            dir_okay=False,
+            show_default=False,
+        ),
+    ] = None,
+    out: Annotated[
+        Path | None, typer.Option(metavar="DIR", help="Write CSV tables and [scanner] keys there.")
+    ] = None,
+    epochs: Annotated[int, typer.Option(min=1, help="So many epochs at most, spread over the series.")] = 200,
+    *,
+    json_: Json = False,
+) -> None:
+    """Set the stated sigma against what stable ground shows.
+
+    By range and scale, over the life of the station; and measure the precision of ranges and angles.
+    """
+    from station.config import read_site
+    from station.service.calibrate import calibrate as measure
+    from station.service.calibrate import describe, write_tables
+
+    found = measure(read_site(site), scans or [], epochs, lambda: None)
+    print(json.dumps(_plain(found), indent=2) if json_ else describe(found))
+    for path in write_tables(found, out) if out else []:
+        print(path)
+
+
+@app.command()
+def sensitivity(
+    site: SiteArgument,
+    epoch: Annotated[
+        str, typer.Option(metavar="TIME", help="The epoch nearest to this time (UTC), or its place.")
+    ] = "-1",
+    maps: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="Write maps of the shares to this NetCDF file.")
+    ] = None,
+    *,
+    json_: Json = False,
+) -> None:
+    """Tell which input makes an epoch unsure.
+
+    Share of tilt, heading, translation, range, refraction, jitter and random errors in the variance of cells
+    and areas: exact, and by simulation.
+    """
+    from station.config import read_site
+    from station.service.sensitivity import describe
+    from station.service.sensitivity import sensitivity as attribute
+
+    try:
+        found = attribute(read_site(site), _epoch(epoch), maps)
+    except IndexError:
+        raise typer.BadParameter(f"the series has no epoch at place {epoch}") from None
+    print(json.dumps(_plain(found), indent=2) if json_ else describe(found))
+
+
+@app.command()
+def papers(
+    paper: Annotated[
+        str | None, typer.Argument(metavar="[PAPER]", help="One of them.", show_default=False)
+    ] = None,
+    pages: Annotated[
+        Path | None, typer.Option(metavar="DIR", help="Write a page for each paper there (Markdown).")
+    ] = None,
+) -> None:
+    """Compute the numbers of the four papers, beside what they print.
+
+    hartzell2015, voordendag2023, ozendi2016, leslar2014. Exits with 1 if one is not right.
+    """
+    from station.papers.errata import PAPERS
+    from station.papers.pages import results, table, write_pages
+
+    names = [one.key for one in PAPERS]
+    if paper is not None and paper not in names:
+        raise typer.BadParameter(f"choose from {', '.join(names)}")
+    found = results(paper)
+    print(table(found))
+    for path in write_pages(found, pages) if pages else []:
+        print(path)
+    if not all(one.good for one in found):
+        sys.exit(1)
+
+
+def _epoch(given: str) -> int | str:
+    """Take a whole number for a place in the series, anything else for a time."""
+    try:
+        return int(given)
+    except ValueError:
+        pass
+    try:
+        datetime.fromisoformat(given)
+    except ValueError:
+        raise typer.BadParameter(f"{given!r} is neither a time (2026-02-01T12:00) nor a place (-1)") from None
+    return given
+
+
+def _plain(found: object) -> object:
+    """Return the same without NaN, which JSON does not know."""
+    if isinstance(found, dict):
+        return {key: _plain(value) for key, value in found.items()}
+    if isinstance(found, list):
+        return [_plain(value) for value in found]
+    return None if isinstance(found, float) and not math.isfinite(found) else found
 
 
 @app.callback(invoke_without_command=True)

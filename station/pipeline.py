@@ -322,7 +322,7 @@ class _Judge:
         setup, unknown, surface = self.setup, self.unknown, self.result.surface
         shared_m2, terms = np.zeros_like(count), dict[str, Floats]()
         if setup.store_terms and setup.published_budget:
-            terms = budget.terms_voordendag(view, setup.scanner)
+            terms = budget.terms_voordendag(view, count, setup.scanner, setup.registration_sigma_m)
         if setup.position_m is None or unknown is None:
             return shared_m2, terms
         felt = _felt(view, shared.basis(setup.grid, setup.position_m, setup.axis))

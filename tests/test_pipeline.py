@@ -7,6 +7,7 @@ import pytest
 
 from station.pipeline import Pose, Setup, gridder_for, measure, survey
 from station.quantities import Air, Grid, Habits, Quality, Reference, Scanner, Shots, Tilt
+from station.science import budget
 from station.science.air import air_correction
 from station.science.grid import Stack
 from station.science.inclination import LEVEL
@@ -15,7 +16,7 @@ from station.science.pose import frame_by_origin, frame_in_local_map
 from station.science.prior import covariance_without_adjustment, lines_of
 from station.science.shared import basis
 
-VZ6000 = Scanner("vz", 1.064, 0.12e-3, 0.0, 0.010, math.radians(0.0005), math.radians(0.008), 6000.0)
+VZ6000 = Scanner("vz", 1.064, 0.12e-3, 0.0, 0.010, *np.radians((0.0005, 0.008, 10.0)), 6000.0)
 GRID = Grid(west_m=1500.0, north_m=600.0, cell_m=4.0, nx=150, ny=300)
 SCANNER = (0.0, 0.0, 3245.0)
 SLOPE = (0.25, -0.1)
@@ -124,8 +125,8 @@ def test_shared_errors_go_into_the_cell_and_its_terms():
     lines = lines_of(of, np.eye(3), None)
     unknown = covariance_without_adjustment(of, lines, None, LEVEL, Habits(), weather_known=True)
     measured, *_ = scanned(shots_at(*spots(50_000, 4)), truth(), unknown, store_terms=True)
-    ours = ("sigma_instrument", "sigma_atmosphere", "sigma_geometry")
-    total = np.sqrt(sum(np.square(measured.terms[name]) for name in ours))
+    total = np.sqrt(sum(np.square(measured.terms[name]) for name in budget.TERMS))
+    assert all(np.nanmedian(measured.terms[name]) > 0 for name in budget.TERMS if name != "sigma_raster")
     seen = np.isfinite(measured.uncertainty_m)
     assert measured.uncertainty_m[seen] == pytest.approx(total[seen], rel=1e-3)
     assert (measured.uncertainty_m > measured.random_uncertainty_m)[seen].all()
@@ -145,10 +146,15 @@ def test_published_budget_on_request():
         registration_sigma_m=0.02,
     )
     terms = measured.terms
-    point = np.sqrt(sum(np.square(terms[name]) for name in terms))
+    of_points = ("sigma_instrument", "sigma_atmosphere", "sigma_geometry")
+    point = np.sqrt(sum(np.square(terms[name]) for name in of_points))
     wanted = point / np.sqrt(measured.surface.count, where=measured.surface.count > 0, out=None) + 0.02
     seen = np.isfinite(measured.uncertainty_m)
     assert measured.uncertainty_m[seen] == pytest.approx(wanted[seen], rel=0.05)
+    assert (terms["sigma_raster"] + terms["sigma_registration"])[seen] == pytest.approx(
+        wanted[seen], rel=1e-5
+    )
+    assert (terms["sigma_registration"][seen] == np.float32(0.02)).all()
     x_m, y_m = np.meshgrid(GRID.x_m, GRID.y_m)
     range_m = np.sqrt(x_m**2 + y_m**2 + (height(x_m, y_m) - 3245) ** 2)
     assert terms["sigma_instrument"][seen] == pytest.approx(

@@ -109,9 +109,11 @@ VARIABLES: tuple[Variable, ...] = (
         flag_masks=tuple(int(flag) for flag in Quality),
         flag_meanings=" ".join(str(flag.name).lower() for flag in Quality),
     ),
+    Variable("sigma_registration", RASTER, "f4", "uncertainty from the registration", "m", None, 3),
     Variable("sigma_instrument", RASTER, "f4", "uncertainty from the instrument", "m", None, 3),
     Variable("sigma_atmosphere", RASTER, "f4", "uncertainty from the atmosphere", "m", None, 3),
     Variable("sigma_geometry", RASTER, "f4", "uncertainty from the scanning geometry", "m", None, 3),
+    Variable("sigma_raster", RASTER, "f4", "uncertainty from the points' place in the cell", "m", None, 3),
     Variable(
         "sigma_voordendag2023",
         RASTER,
@@ -226,9 +228,11 @@ VARIABLES: tuple[Variable, ...] = (
 BY_NAME = {variable.name: variable for variable in VARIABLES}
 TEXT_LENGTH = {"text": 64, "sentence": 256}
 TERMS = (
+    "sigma_registration",
     "sigma_instrument",
     "sigma_atmosphere",
     "sigma_geometry",
+    "sigma_raster",
     "sigma_voordendag2023",
     "sigma_hartzell2015",
 )

@@ -12,6 +12,7 @@ LAPSE_K_PER_M = 0.0065  # ICAO standard atmosphere, troposphere
 HYDROSTATIC_K_PER_M = 0.0341632  # g M / R of dry air, ICAO standard atmosphere
 EARTH_RADIUS_M = 6_371_000.0  # IUGG mean radius
 KELVIN = 273.15  # 0 °C
+LIGHT_M_PER_S = 299_792_458.0  # in vacuum, SI
 
 
 def vapour_pressure(temperature_c: Floats | float, humidity_pct: Floats | float) -> Floats:
@@ -44,6 +45,15 @@ def group_refractivity(
     kelvin = np.asarray(temperature_c) + KELVIN
     dry = KELVIN / 1013.25 * standard_group_refractivity(wavelength_um) * np.asarray(pressure_hpa) / kelvin
     return np.asarray(dry - 11.27 * np.asarray(vapour_hpa) / kelvin)
+
+
+def slope_range(echo_s: Floats | float, refractivity_ppm: Floats | float) -> Floats:
+    """Range [m] of an echo that came back after so many seconds, through air of one group refractivity.
+
+    The scanner's own step, for which it takes the air it was told of.
+    Source: Voordendag et al. (2023), Eq. 6, with the index of Eq. 9.
+    """
+    return np.asarray(LIGHT_M_PER_S / (1 + 1e-6 * np.asarray(refractivity_ppm)) * np.asarray(echo_s) / 2)
 
 
 def refractivity_above(air: Air, rise_m: Floats, wavelength_um: float) -> Floats:

@@ -1,17 +1,21 @@
-"""The budget of a scan's heights term by term: instrument, atmosphere, geometry."""
+"""The budget of a scan's heights by the five sources of Voordendag et al. (2023)."""
 
 from __future__ import annotations
-
-from dataclasses import replace
 
 import numpy as np
 
 from station.quantities import Floats, Scanner, Shared
 from station.science import uncertainty
+from station.science.sensitivity import only
 from station.science.shared import Sensitivities
 from station.science.view import View
 
-TERMS = ("sigma_instrument", "sigma_atmosphere", "sigma_geometry")
+TERMS = ("sigma_registration", "sigma_instrument", "sigma_atmosphere", "sigma_geometry", "sigma_raster")
+SHARED = {  # parameters by how their names begin
+    "sigma_registration": ("translation_", "heading"),
+    "sigma_instrument": ("tilt_", "lean_", "range_bias"),
+    "sigma_atmosphere": ("range_scale", "refraction"),
+}
 PUBLISHED = ("sigma_voordendag2023", "sigma_hartzell2015")
 
 
@@ -23,45 +27,44 @@ def terms(
     unknown: Shared,
     scanner: Scanner,
 ) -> dict[str, Floats]:
-    """Split the budget of a scan's own heights [m]: instrument, atmosphere, geometry.
+    """Split the budget of a scan's own heights [m]: registration, instrument, atmosphere, geometry, raster.
 
-    Their squares add up to the variance as long as no adjustment has tied the shared parameters together.
+    Lean and range noise are the instrument's, the beam's width is geometry. Their squares add up to the
+    variance as long as no adjustment has tied the shared parameters together.
     """
-    by_air = np.array([name.startswith(("range_scale", "refraction")) for name in unknown.names])
+    shared_m2 = {
+        name: felt.variance(only(unknown, np.array([one.startswith(begins) for one in unknown.names])))
+        for name, begins in SHARED.items()
+    }
     range_m2 = uncertainty.range_variance(view.cos_incidence, view.cos_slope, scanner.range_sigma_m)
     beam_m2 = uncertainty.angle_variance(
         view.range_m, view.cos_incidence, view.cos_slope, uncertainty.sigma_angle(scanner)
     )
-    air_m2, other_m2 = (
-        felt.variance(
-            replace(
-                unknown,
-                covariance=np.where(np.outer(of, of), unknown.covariance, 0.0),
-                noise_variance=np.where(of, unknown.noise_variance, 0.0),
-            )
-        )
-        for of in (by_air, ~by_air)
-    )
     return {
-        "sigma_instrument": np.sqrt(range_m2 / count + other_m2),
-        "sigma_atmosphere": np.sqrt(air_m2),
-        "sigma_geometry": np.sqrt(beam_m2 / count + sampling_m2),
+        "sigma_registration": np.sqrt(shared_m2["sigma_registration"]),
+        "sigma_instrument": np.sqrt(range_m2 / count + shared_m2["sigma_instrument"]),
+        "sigma_atmosphere": np.sqrt(shared_m2["sigma_atmosphere"]),
+        "sigma_geometry": np.sqrt(beam_m2 / count),
+        "sigma_raster": np.sqrt(sampling_m2),
     }
 
 
-def terms_voordendag(view: View, scanner: Scanner) -> dict[str, Floats]:
-    """Split the published budget [m], for one point as in the paper's figures."""
-    constant_m = np.full_like(view.range_m, uncertainty.SIGMA_ATMOSPHERE_VOORDENDAG_M)
+def terms_voordendag(
+    view: View, count: Floats, scanner: Scanner, sigma_registration_m: float
+) -> dict[str, Floats]:
+    """Split the published budget [m], for one point as in the paper's figures.
+
+    `sigma_raster` is that of a cell of `count` points, to which the registration is added.
+    """
+    rise = view.offset_m[2] / view.range_m
+    seen = view.range_m, view.cos_incidence, view.cos_slope
+    point_m2 = uncertainty.shot_variance_voordendag(*seen, rise, scanner)
     return {
+        "sigma_registration": np.full_like(view.range_m, sigma_registration_m),
         "sigma_instrument": uncertainty.sigma_instrument(view.range_m),
-        "sigma_atmosphere": constant_m,
-        "sigma_geometry": uncertainty.sigma_geometry(
-            view.range_m,
-            view.cos_incidence,
-            view.cos_slope,
-            view.offset_m[2] / view.range_m,
-            scanner.beam_divergence_rad,
-        ),
+        "sigma_atmosphere": np.full_like(view.range_m, uncertainty.SIGMA_ATMOSPHERE_VOORDENDAG_M),
+        "sigma_geometry": uncertainty.sigma_geometry(*seen, rise, scanner.beam_divergence_rad),
+        "sigma_raster": np.sqrt(point_m2 / count),
     }
 
 
