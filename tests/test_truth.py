@@ -87,6 +87,7 @@ def test_random_sigma_is_calibrated(tmp_path):
         assert np.nanstd(z[count == points]) == pytest.approx(1.0, abs=0.25)
 
 
+@pytest.mark.slow
 def test_filtered_inclination_takes_two_thirds_of_the_drift_away(tmp_path):
     """Tilt drift without sensor bias: far 100 m boxes with and without the log."""
     drifting = {"lean_drift_deg": 0.004, "lean_within_scan_deg": 0.0018, "log_noise_deg": 0.008}

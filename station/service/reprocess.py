@@ -148,7 +148,7 @@ class _Redoing:
     def _mend(self) -> None:
         """Make journal and store agree, and put damaged files aside, so that their epochs show as lost."""
         with self._console.status(_PROVING):
-            self._worker.recover()
+            self._worker.reconcile()
             self._worker.prove()
 
     def _look(self, between_s: tuple[float, float]) -> Plan:
@@ -276,7 +276,7 @@ class _Redoing:
         self._stop.clear()
         with self._console.status("publishing series.nc …"):
             self._worker.join_closed()
-            self._worker.recover()
+            self._worker.reconcile()
             self._worker.show()
 
     def _progress(self) -> Progress:

@@ -120,11 +120,18 @@ class Worker:
             return
 
     def recover(self) -> None:
+        """Reconcile after a start or a fault; make a reference that was due.
+
+        What comes next is to be measured from it, as without the cut.
+        """
+        self.reconcile()
+        self._make_reference_when_due()
+
+    def reconcile(self) -> None:
         """Make journal and files agree: checksums are completed, lost rows made anew, the series is rebuilt.
 
         Epochs that are lost or damaged are redone where their scan is still in the inbox. One written just
-        before a power cut is found by `tasks.process` as the same and not stored twice. A reference that was
-        due is made now: what comes next is to be measured from it, as without the cut.
+        before a power cut is found by `tasks.process` as the same and not stored twice.
         """
         self._put_aside(self.run(unopened))
         self.seal()
@@ -132,7 +139,6 @@ class Worker:
         self._have_lost_done_again()
         if holds_epochs(self._series):
             self._mending(publish)
-        self._make_reference_when_due()
 
     def seal(self) -> None:
         """Note the checksums of files that have none; put aside those that cannot be read."""

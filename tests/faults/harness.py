@@ -176,7 +176,8 @@ class Station:
         found = [self.pid]
         for pid in found:
             for task in Path(f"/proc/{pid}/task").glob("*/children"):
-                found += [int(one) for one in task.read_text().split()]
+                with suppress(OSError):  # the task has ended meanwhile
+                    found += [int(one) for one in task.read_text().split()]
         return found
 
     def limit_files(self, size):

@@ -254,6 +254,7 @@ def test_the_zero_of_an_sop_is_that_of_its_first_scan_in_whatever_order_they_are
     assert values(folder).lean_zero.values[3:].tolist() == [wanted.read_text()] * 2
 
 
+@pytest.mark.slow
 def test_another_setting_makes_the_reference_anew_and_everything_from_it(folder, tmp_path):
     other = ("min_points = 1", "min_points = 2")
     site = site_of(folder, other)
