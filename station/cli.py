@@ -202,6 +202,35 @@ def demo(
     sys.exit(run_demo(folder, hours))
 
 
+alarms = typer.Typer(no_args_is_help=True, add_completion=False)
+app.add_typer(alarms, name="alarms", help="Tell people what is wrong, or try whether they could be told.")
+
+
+@alarms.command("look")
+def alarms_look(site: SiteArgument) -> None:
+    """Ask the rules of [alarms], now, and tell what is new, still so or over.
+
+    Runs every few minutes by a timer, beside the service. Exits with 1 if a target could not be reached: it
+    is told the next time.
+    """
+    from station.config import read_site
+    from station.service.alarms import look
+
+    sys.exit(look(read_site(site), tell=print))
+
+
+@alarms.command("test")
+def alarms_test(site: SiteArgument) -> None:
+    """Send a test message by every target and say which failed.
+
+    Exits with 1 if one did.
+    """
+    from station.config import read_site
+    from station.service.alarms import test
+
+    sys.exit(test(read_site(site), print))
+
+
 @app.callback(invoke_without_command=True)
 def _version(
     version: Annotated[bool, typer.Option("--version", help="Print the version.", is_eager=True)] = False,

@@ -22,8 +22,8 @@ class Onsets:
 def threshold_sigmas(false_alarms_per_year: float, tests_per_year: float) -> float:
     """How many sigmas a difference must exceed so that so many tests a year give so few false alarms.
 
-    Two-sided and normal. By Boole's inequality the expected number of false alarms is at most the sum of their
-    chances, however much the tests depend on each other.
+    Two-sided and normal. By Boole's inequality the expected number of false alarms is at most the sum of
+    their chances, however much the tests depend on each other.
     """
     return float(-ndtri(min(false_alarms_per_year / tests_per_year, 1.0) / 2))
 

@@ -42,7 +42,7 @@ class Alarm:
 def alarms_of(site: Site, *, since_utc_s: float, judged_utc_s: float | None, now_s: float) -> list[Alarm]:
     """Return all that is to be told now.
 
-    `since_utc_s` is when someone first asked, `judged_utc_s` up to which epoch areas were judged the last time.
+    `since_utc_s` is when someone first asked, `judged_utc_s` up to which epoch areas were judged before.
     A rule that cannot be asked is an alarm itself.
     """
     rules = site.alarms or AlarmsSection()
@@ -80,9 +80,7 @@ def _service(site: Site, rules: AlarmsSection, since_utc_s: float, now_s: float)
     yield from _honesty(rules, newest)
 
 
-def _silence(
-    rules: AlarmsSection, recent: list[Entry], since_utc_s: float, now_s: float
-) -> Iterator[Alarm]:
+def _silence(rules: AlarmsSection, recent: list[Entry], since_utc_s: float, now_s: float) -> Iterator[Alarm]:
     from_s = now_s - rules.no_scan_h * 3600
     rows = [row for row in recent if row.changed_utc_s >= from_s]
     if not rules.no_scan_h or since_utc_s > from_s or any(row.state is State.STORED for row in rows):
@@ -95,9 +93,7 @@ def _silence(
     yield Alarm("no scan", f"no scan stored for {rules.no_scan_h:g} h: {why}")
 
 
-def _stall(
-    rules: AlarmsSection, recent: list[Entry], waiting: list[Entry], now_s: float
-) -> Iterator[Alarm]:
+def _stall(rules: AlarmsSection, recent: list[Entry], waiting: list[Entry], now_s: float) -> Iterator[Alarm]:
     from_s = now_s - rules.stalled_h * 3600
     stuck = [row for row in waiting if row.seen_utc_s < from_s and not row.waits_for]
     if rules.stalled_h and stuck and not any(row.changed_utc_s >= from_s for row in recent):
@@ -110,7 +106,9 @@ def _set_aside(rules: AlarmsSection, recent: list[Entry], now_s: float) -> Itera
     refused = [row for row in arrived if row.state is State.SET_ASIDE]
     share = len(refused) / len(arrived) if len(arrived) >= FEWEST_ARRIVED else 0.0
     if rules.set_aside_share and share >= rules.set_aside_share:
-        text = f"{len(refused)} of the last day's {len(arrived)} scans set aside, the last: {refused[-1].reason}"
+        text = (
+            f"{len(refused)} of the last day's {len(arrived)} scans set aside, the last: {refused[-1].reason}"
+        )
         yield Alarm("set aside", text)
 
 
@@ -145,7 +143,9 @@ def _changes(site: Site, rule: ChangeAlarm, judged_utc_s: float | None) -> Itera
     curves = read_curves(site, from_s)
     unknown = set(rule.areas) - {curve.name for curve in curves}
     if curves and unknown:
-        yield Alarm("areas", f"alarms.change names areas that areas.file has not: {', '.join(sorted(unknown))}")
+        yield Alarm(
+            "areas", f"alarms.change names areas that areas.file has not: {', '.join(sorted(unknown))}"
+        )
     watched = [curve for curve in curves if not rule.areas or curve.name in rule.areas]
     for curve in watched:
         told = judge(curve, rule, areas=len(watched), expected_every_s=site.scans.expected_every_s)

@@ -24,6 +24,7 @@ from station.service.jobs import Clockwork, Wake
 from station.service.journal import Journal, State
 from station.service.lock import only_writer
 from station.service.logs import log_to_stderr, logfmt
+from station.service.metrics import Metrics
 from station.service.watch import Ear
 
 if TYPE_CHECKING:
@@ -98,6 +99,7 @@ class Daemon:
         self._journal: Journal | None = None
         self._parts: tuple[Takes, Inbox, Ear, Clockwork] | None = None
         self._is_recovered = False
+        self._metrics = Metrics(lambda: self._site)
 
     def wake(self, wake: Wake) -> None:
         """Have the loop do something as soon as the running scan is done; from any thread or signal."""
@@ -113,7 +115,7 @@ class Daemon:
     def serve(self) -> None:
         """Be the loop."""
         self._await_clock()
-        with only_writer(self._site.station.data), self._closing:
+        with only_writer(self._site.station.data), self._metrics.serving(), self._closing:
             self._closing.callback(self._let_go)
             while not self._is_stopping():
                 try:
@@ -141,6 +143,7 @@ class Daemon:
         if Wake.EXPECTED in self._due:
             self._due.discard(Wake.EXPECTED)
             self._note_silence()
+            self._metrics.write()
         self._looked_s = time.monotonic()
         listing = inbox.look()
         self._note_new(listing.new)

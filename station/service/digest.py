@@ -13,6 +13,7 @@ import numpy as np
 
 from station.archive.layout import written_whole
 from station.config import Site
+from station.service.alarm_memory import firing
 from station.service.alarm_rules import DAY_S, TOLD_SIGMAS
 from station.service.area_series import Curve, read_curves
 from station.service.journal import Entry, Journal, State
@@ -43,7 +44,7 @@ def newest_digest(data: Path) -> Path | None:
 def digest(site: Site, day: date) -> str:
     """Say what arrived on a day (UTC), what became of it, how areas changed, how the station is.
 
-    At most 10 kB in UTF-8: what is most important comes first, the rest is cut and counted. Raises StoreError.
+    At most 10 kB in UTF-8: what is most important comes first, the rest is cut. Raises StoreError.
     """
     begin_s = datetime(day.year, day.month, day.day, tzinfo=UTC).timestamp()
     data = site.station.data
@@ -51,12 +52,12 @@ def digest(site: Site, day: date) -> str:
         rows = [row for row in journal.changed_since(begin_s) if row.seen_utc_s < begin_s + DAY_S]
         arrived = [row for row in rows if row.seen_utc_s >= begin_s]
         counts = journal.counts()
+    waits = counts[State.WAITING] + counts[State.LATER]
     lines = [
         f"{site.station.name or site.station.id} ({site.station.id}), {day:%Y-%m-%d} UTC",
         *_told(arrived),
         *_health(site, arrived),
-        f"all: {counts['stored']} stored, {counts['set_aside']} set aside,"
-        f" {counts['waiting'] + counts['later']} waiting",
+        f"all: {counts['stored']} stored, {counts['set_aside']} set aside, {waits} waiting",
         "",
         *_areas(read_curves(site, begin_s - 7 * DAY_S), begin_s),
     ]
@@ -94,8 +95,6 @@ def _health(site: Site, arrived: list[Entry]) -> Iterator[str]:
         if found:
             yield f"{words.format(median(found))} (median; {min(found):.4g} to {max(found):.4g})"
     yield f"disk {shutil.disk_usage(site.station.data).free / 1e9:.1f} GB free"
-    from station.service.alarms import firing  # noqa: PLC0415 - which sends what is written here
-
     yield from (f"alarm: {text[:MOST_LETTERS]}" for text in firing(site.station.data).values())
 
 

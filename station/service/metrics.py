@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 
 from station.config import Site
 from station.errors import ConfigError, StationError
+from station.service.alarm_memory import firing
 from station.service.journal import Journal
 from station.service.logs import logfmt
 
@@ -51,7 +52,7 @@ class Metrics:
         try:
             server, thread = start_http_server(int(port), host.strip("[]"), registry)
         except OSError as error:
-            raise ConfigError(f"service.metrics = {address!r}: cannot listen there: {error.strerror}") from error
+            raise ConfigError(f"service.metrics = {address!r}: cannot be had: {error.strerror}") from error
         try:
             yield
         finally:
@@ -102,8 +103,6 @@ class Metrics:
                 if (value := row.figures.get(figure)) is not None:
                     yield Gauge(name, words, float(value))
         yield Gauge("station_disk_free_bytes", "Room where the data folder is.", shutil.disk_usage(data).free)
-        from station.service.alarms import firing  # noqa: PLC0415 - a second of imports
-
         alarms = Gauge("station_alarm_firing", "Alarms that were told and last.", labels=["alarm"])
         for key in firing(data):
             alarms.add_metric([key], 1)
@@ -115,5 +114,5 @@ class Metrics:
         except ImportError as error:
             raise ConfigError("service.metrics needs: pip install 'tls-station[metrics]'") from error
         registry = CollectorRegistry()
-        registry.register(self)  # type: ignore[arg-type] # any object with collect()
+        registry.register(self)
         return registry

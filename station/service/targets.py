@@ -1,10 +1,11 @@
-"""Where messages go: apprise URLs, each a credential by its name, so that no secret stands in the site file."""
+"""Where messages go: apprise URLs, each a credential by its name; no secret stands in the site file."""
 
 from __future__ import annotations
 
 import logging
 import os
 import threading
+import time
 from pathlib import Path
 
 from station.errors import ConfigError
@@ -70,8 +71,10 @@ def send(messages: dict[str, tuple[str, str]], *, patience_s: float = PATIENCE_S
     ]
     for worker in workers:
         worker.start()
+    until_s = time.monotonic() + patience_s
     for worker in workers:
-        worker.join(patience_s / len(workers) if len(workers) > 1 else patience_s)
-    for target, why in failed.items():
+        worker.join(max(0.0, until_s - time.monotonic()))
+    lost = dict(failed)  # a late answer changes nothing any more
+    for target, why in lost.items():
         log.error(logfmt(target=target, reason=why))
-    return dict(failed)
+    return lost

@@ -14,6 +14,7 @@ from station.archive.store import series_in
 from station.config import Site
 from station.errors import ConfigError, NotReadyError, ScanError, StoreError
 from station.service import child
+from station.service.digest import write_digest, yesterday
 from station.service.inbox import Arrival
 from station.service.integrity import (
     holds_epochs,
@@ -145,9 +146,11 @@ class Worker:
             self._journal.forget_files([name])
 
     def join_closed(self) -> None:
-        """Join closed days and months."""
+        """Join closed days and months; sum up the day that is over."""
         self._mending(join_epochs)
         self.seal()
+        if self.run(write_digest, yesterday(time.time())):
+            log.info("%s", logfmt(digest="written"))
 
     def sweep(self) -> None:
         """Delete what no longer serves, redo what came late, tell what is stale, let raw scans go."""
