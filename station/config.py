@@ -463,7 +463,7 @@ def _absolute(site: Site, folder: Path) -> Site:
             elif isinstance(value, Section):
                 changed[key] = settle(value)
             elif isinstance(value, tuple):
-                changed[key] = tuple(settle(one) for one in value)
+                changed[key] = tuple(settle(one) if isinstance(one, Section) else one for one in value)
         return section.model_copy(update=changed)
 
     settled = settle(site)

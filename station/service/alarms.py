@@ -68,6 +68,7 @@ def test(site: Site, tell: Callable[[str], None]) -> int:
     names = tuple(dict.fromkeys(named))
     if not names:
         raise ConfigError(f"{site.path}: alarms.targets names none")
+    log_to_stderr()
     text = f"{site.station.name or site.station.id}: a test; alarms would come this way."
     failed = send(dict.fromkeys(names, (_title(site, "test"), text)))
     for name in names:
