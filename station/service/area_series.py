@@ -41,7 +41,7 @@ def read_curves(site: Site, from_utc_s: float) -> list[Curve]:
             newest = slice(int(np.searchsorted(file["time"][:], from_utc_s)), None)
             time_s = np.asarray(file["time"][newest], dtype=np.float64)
             named = strings(file["epoch_file"][newest])
-            names = strings(file["area_name"][:])
+            names = [name.tobytes().rstrip(b"\0").decode() for name in file["area_name"][:]]
             change_m, sigma_m = (
                 np.asarray(file[name][newest], dtype=np.float64)
                 for name in ("mean_change", "mean_change_uncertainty")

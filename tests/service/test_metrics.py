@@ -6,8 +6,10 @@ import json
 import shutil
 import socket
 import subprocess
+import sys
 import time
 import urllib.request
+from pathlib import Path
 
 import pytest
 from prometheus_client.parser import text_string_to_metric_families
@@ -27,7 +29,7 @@ def port():
 
 
 @pytest.fixture
-def station(make_site, port, tmp_path):
+def station(make_site, port):
     site = make_site(more=f'[service]\nmetrics = "127.0.0.1:{port}"\nmetrics_file = "station.prom"\n')
     data = site.station.data
     with Journal(data / "journal.sqlite") as journal:
@@ -134,10 +136,30 @@ def asked(url):
     while time.monotonic() < until_s:
         time.sleep(0.5)
         try:
-            with urllib.request.urlopen(url) as answer:
+            with urllib.request.urlopen(url) as answer:  # noqa: S310 - of this very test
                 result = json.load(answer)["data"]["result"]
         except OSError:
             continue
         if result:
             return {one["metric"]["state"]: float(one["value"][1]) for one in result}
     return None
+
+
+def test_the_running_service_serves_and_writes(station, port):
+    fake = Path(__file__).with_name("fake_service.py")
+    log = station.station.data / "log"
+    site = station.path.read_text().replace("expected_every_s = 3600.0", "expected_every_s = 1.0")
+    station.path.write_text(site)
+    with log.open("w") as file:
+        service = subprocess.Popen([sys.executable, fake, station.path, "0.2", "1"], stderr=file)
+    try:
+        until_s = time.monotonic() + 60
+        while not station.service.metrics_file.exists():
+            assert time.monotonic() < until_s, log.read_text()
+            time.sleep(0.1)
+        with urllib.request.urlopen(f"http://127.0.0.1:{port}/metrics") as answer:
+            heard = figures(answer.read().decode())
+        assert heard["station_scans", "stored"] == 3
+    finally:
+        service.terminate()
+        assert service.wait(30) == 0, log.read_text()
