@@ -8,13 +8,21 @@ from dataclasses import asdict, dataclass, field
 from datetime import UTC, datetime
 from pathlib import Path
 
-from station.archive.layout import written_whole
 from station.errors import StoreError
-from station.service.alarm_rules import Alarm
 
 FILE = "alarms.json"
 CALM_S = 3600.0  # without it before an alarm is over: one on the edge is not told each time
 ROOM_BYTES = 65536  # of the file, filled with blanks, so that it can be changed on a full disk
+
+
+@dataclass(frozen=True)
+class Alarm:
+    """Something to tell. The same `key` is the same alarm, whatever it says."""
+
+    key: str
+    text: str
+    size: float = 0.0  # told anew before its time when it has doubled
+    patience_s: float = 0.0  # how long it must last before it is told
 
 
 @dataclass
@@ -82,6 +90,8 @@ def recall(path: Path) -> Memory | None:
 
 def remember(path: Path, memory: Memory) -> None:
     """Write what is remembered, as far as there is any way; raise StoreError where there is none."""
+    from station.archive.layout import written_whole  # noqa: PLC0415 - half a second for those who only read
+
     text = json.dumps(asdict(memory), ensure_ascii=False, indent=1).encode().ljust(ROOM_BYTES)
     try:
         with written_whole(path) as beside:

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
 from datetime import UTC, datetime
 from statistics import median
 
@@ -16,6 +15,7 @@ import numpy as np
 from station.config import AlarmsSection, ChangeAlarm, Site
 from station.errors import StationError
 from station.science.onset import Onsets, onsets, threshold_sigmas
+from station.service.alarm_memory import Alarm
 from station.service.area_series import Curve, read_curves
 from station.service.journal import Entry, Journal, State
 from station.service.lock import in_use
@@ -27,16 +27,6 @@ FEWEST = 8  # of them, below which nothing is said
 FEWEST_ARRIVED = 4  # scans of a day, below which a share of them means nothing
 RESTART_S = 600.0  # an update or a reboot may take so long
 TOLD_SIGMAS = 1.959964  # people are told 95 %
-
-
-@dataclass(frozen=True)
-class Alarm:
-    """Something to tell. The same `key` is the same alarm, whatever it says."""
-
-    key: str
-    text: str
-    size: float = 0.0  # told anew before its time when it has doubled
-    patience_s: float = 0.0  # how long it must last before it is told
 
 
 def alarms_of(site: Site, *, since_utc_s: float, judged_utc_s: float | None, now_s: float) -> list[Alarm]:

@@ -88,6 +88,22 @@ def test_a_step_is_told_with_the_second_scan_after_it_and_for_as_long_as_it_is_w
     assert not onsets(time_s, change_m, sigma_m, sigmas=4.0, **(RULE | {"least_m": 0.5})).found.any()
 
 
+def test_a_step_of_six_sigmas_is_told_in_most_cases_and_of_three_in_few():
+    """By the second scan after it; what the README promises."""
+    rng = np.random.default_rng(13)
+    told = {}
+    for size in (3, 6, 8):
+        found = []
+        for _ in range(400):
+            time_s, change_m, sigma_m = errors(rng, 12, shared_m=0, daily_m=0, slow_m=0, random_m=0.01)
+            change_m[10:] += size * np.hypot(0.01, 0.01)
+            found.append(onsets(time_s, change_m, sigma_m, sigmas=4.117, **RULE).found[11])
+        told[size] = np.mean(found)
+    assert told[3] < 0.05
+    assert 0.85 < told[6] < 0.97
+    assert told[8] > 0.99
+
+
 @pytest.mark.parametrize("wrong", [20, 24, 25])
 def test_one_wrong_scan_is_no_change(wrong):
     """Off by 100 sigma: as the newest, or as the oldest that others are set against."""

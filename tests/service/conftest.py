@@ -7,6 +7,8 @@ import socket
 import threading
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 
+import h5py
+import numpy as np
 import pytest
 
 from station.config import read_site
@@ -97,5 +99,27 @@ def credentials(tmp_path, monkeypatch):
     def write(**urls):
         for name, url in urls.items():
             (folder / name).write_text(f"{url}\n")
+
+    return write
+
+
+def letters(words, width):
+    return np.array([word.encode() for word in words], f"S{width}").view("S1").reshape(len(words), width)
+
+
+@pytest.fixture
+def write_series(tmp_path):
+    """Give a way to write as much of series.nc and areas.nc as alarms read; change, sigma: (times, areas)."""
+
+    def write(time_s, change_m, sigma_m, names, verdicts=None):
+        for name in ("series.nc", "areas.nc"):
+            with h5py.File(tmp_path / "data" / name, "w") as file:
+                file["time"] = time_s
+                file["epoch_file"] = letters([f"e{one:.0f}.nc" for one in time_s], 64)
+                if name == "series.nc":
+                    file["verdict"] = np.zeros(len(time_s), "i1") if verdicts is None else verdicts
+                else:
+                    file["area_name"] = letters(names, max(len(name.encode()) for name in names))
+                    file["mean_change"], file["mean_change_uncertainty"] = change_m, sigma_m
 
     return write

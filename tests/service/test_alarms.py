@@ -5,13 +5,14 @@ from __future__ import annotations
 import time
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
 
 from station.config import read_site
 from station.errors import ConfigError, StoreError
-from station.service import alarm_memory, alarm_rules, alarms
-from station.service.alarm_memory import Memory, news, recall, remember
-from station.service.alarm_rules import Alarm, alarms_of
+from station.service import alarm_rules, alarms, health
+from station.service.alarm_memory import Alarm, Memory, news, recall, remember
+from station.service.alarm_rules import alarms_of
 from station.service.journal import Journal
 from station.service.lock import only_writer
 from station.service.targets import send
@@ -68,7 +69,7 @@ def test_what_was_told_survives_a_restart_and_a_full_disk(tmp_path, monkeypatch)
         raise StoreError("no space left on the device")
 
     memory.digest = "2026-11-20.txt"
-    monkeypatch.setattr(alarm_memory, "written_whole", full)
+    monkeypatch.setattr("station.archive.layout.written_whole", full)
     before = path.stat().st_ino, path.stat().st_size
     remember(path, memory)
     assert recall(path) == memory
@@ -197,14 +198,16 @@ def test_a_dead_target_neither_stops_the_others_nor_loses_a_word(
 ):
     site = make_site(more=f'[alarms]\ntargets = ["good", "dead"]\n{only("stalled_h = 1")}')
     credentials(good=webhook.url, dead=deaf_url)
-    monkeypatch.setattr(alarms, "send", lambda messages: send(messages, patience_s=1.0))
+    monkeypatch.setattr(alarms, "send", lambda messages: send(messages, patience_s=3.0))
     began_s, told = time.monotonic(), []
     for minute in (0, 11, 16):
         status = alarms.look(site, tell=told.append, now_s=lambda at=minute: NOW_S + 60 * at)
-    assert time.monotonic() - began_s < 10
+    assert time.monotonic() - began_s < 18
     assert status == 1
     assert told == ["alarm: the service is not running"]
     assert webhook.came == [("[station test] 1 alarm", "alarm: the service is not running")]
+    Journal(site.station.data / "journal.sqlite").close()
+    assert "alarm    the service is not running" in health.describe(health.status(site)).splitlines()
     # It answers again; and hears what it has missed.
     credentials(dead=webhook.url)
     with only_writer(site.station.data):
@@ -269,3 +272,27 @@ def test_the_digest_is_sent_once(make_site, credentials, webhook):
     for _ in range(2):
         assert alarms.look(site) == 0
     assert webhook.came == [("[station test] digest 2026-11-20", "day 20 ±")]
+
+
+def test_change_is_judged_at_every_epoch_once_and_at_the_newest_always(make_site, tmp_path, write_series):
+    """A step at hour 20 that all scans until hour 40 were processed after, between two looks."""
+    (tmp_path / "areas.geojson").write_text("{}")
+    rules = f'[areas]\nfile = "areas.geojson"\n[alarms]\n{NO_RULES}[alarms.change]\nareas = ["tongue"]\n'
+    site = make_site(more=rules)
+    hours = np.arange(40)
+    change_m = np.where(hours < 20, 0.0, -0.5)[:, None] * [1.0, 1.0]
+    write_series(3600.0 * hours, change_m, np.full((40, 2), 0.01), ["tongue", "rock"])
+
+    def ask(judged_hour):
+        judged_s = None if judged_hour is None else 3600.0 * judged_hour
+        return alarms_of(site, since_utc_s=0.0, judged_utc_s=judged_s, now_s=NOW_S)
+
+    (alarm,) = ask(15)
+    text = "tongue fell by 0.5 m (± 0.028 m at 95 %) in the 6 h before 1970-01-02 00:00 UTC"
+    assert (alarm.key, alarm.text, alarm.size) == ("change in tongue", text, 0.5)  # the last one to show it
+    assert ask(25) == []
+    assert ask(None) == []  # what is older than the alarms is no news
+    write_series(3600.0 * hours[:23], change_m[:23], np.full((23, 2), 0.01), ["tongue", "rock"])
+    assert [one.key for one in ask(22)] == [one.key for one in ask(None)] == ["change in tongue"]
+    write_series(3600.0 * hours, change_m, np.full((40, 2), 0.01), ["snout", "rock"])
+    assert [one.text for one in ask(25)] == ["alarms.change names areas that areas.file has not: tongue"]

@@ -6,7 +6,6 @@ import os
 import re
 from datetime import UTC, date, datetime
 
-import h5py
 import numpy as np
 import pytest
 
@@ -19,24 +18,6 @@ from station.service.worker import Worker
 
 DAY = date(2026, 11, 20)
 DAY_S = datetime(2026, 11, 20, tzinfo=UTC).timestamp()
-
-
-def letters(words, width):
-    return np.array([word.encode() for word in words], f"S{width}").view("S1").reshape(len(words), width)
-
-
-def write_series(data, hours, change_m, sigma_m, names, verdicts=None):
-    """As much of series.nc and areas.nc as is read; `change_m` and `sigma_m` (hours, areas)."""
-    files = letters([f"e{hour}.nc" for hour in hours], 64)
-    for name in ("series.nc", "areas.nc"):
-        with h5py.File(data / name, "w") as file:
-            file["time"] = DAY_S + 3600.0 * np.asarray(hours)
-            file["epoch_file"] = files
-            if name == "series.nc":
-                file["verdict"] = np.zeros(len(hours), "i1") if verdicts is None else verdicts
-            else:
-                file["area_name"] = letters(names, max(len(name.encode()) for name in names))
-                file["mean_change"], file["mean_change_uncertainty"] = change_m, sigma_m
 
 
 @pytest.fixture
@@ -71,20 +52,20 @@ def test_what_came_that_day_and_no_other(site):
     assert "all: 5 stored, 1 set aside, 0 waiting" in told
 
 
-def test_areas_change_from_the_last_scan_before_the_day(site):
+def test_areas_change_from_the_last_scan_before_the_day(site, write_series):
     """3-4-5: 0.3 and 0.4 m at one sigma make 0.5 of a difference, 0.98 at 95 %."""
     fill(site, [(1, "good", "")])
     change_m = np.array([[9.0, 0], [1.0, 0], [5.0, 0], [3.5, FILL], [8.0, 0]])
     sigma_m = np.array([[9.0, 1], [0.3, 1], [9.0, 1], [0.4, FILL], [9.0, 1]])
-    write_series(site.station.data, [-5, -1, 3, 23, 25], change_m, sigma_m, ["tongue", "Hütte"])
+    write_series(DAY_S + 3600.0 * np.array([-5, -1, 3, 23, 25]), change_m, sigma_m, ["tongue", "Hütte"])
     told = digest(site, DAY)
     assert "tongue: +2.500 ± 0.980, +3.500 ± 0.784" in told
     assert "Hütte: +0.000 ± 2.772" in told  # not seen at 23 h: its change at 3 h
 
 
-def test_unusable_epochs_are_left_out(site):
+def test_unusable_epochs_are_left_out(site, write_series):
     change_m = np.array([[1.0], [50.0], [2.0]])
-    write_series(site.station.data, [1, 2, 3], change_m, np.ones((3, 1)), ["a"], np.array([0, 2, 1]))
+    write_series(DAY_S + 3600.0 * np.array([1, 2, 3]), change_m, np.ones((3, 1)), ["a"], np.array([0, 2, 1]))
     (curve,) = read_curves(site, -np.inf)
     assert curve.change_m.tolist() == [1.0, 2.0]
     (late,) = read_curves(site, DAY_S + 2.5 * 3600)
@@ -94,10 +75,10 @@ def test_unusable_epochs_are_left_out(site):
         read_curves(site, 0.0)
 
 
-def test_it_is_never_more_than_10_kb(site):
+def test_it_is_never_more_than_10_kb(site, write_series):
     names = [f"area {number} {'ö' * 60}" for number in range(300)]
     many = np.ones((2, 300))
-    write_series(site.station.data, [-1, 1], many, many, names)
+    write_series(DAY_S + 3600.0 * np.array([-1, 1]), many, many, names)
     fill(site, [(hour / 100, "set aside", f"{hour} {'ü' * 400}") for hour in range(200)])
     told = digest(site, DAY)
     assert MOST_BYTES * 0.9 < len(told.encode()) <= MOST_BYTES == 10_000

@@ -16,8 +16,7 @@ from prometheus_client.parser import text_string_to_metric_families
 
 from station.config import read_site
 from station.errors import ConfigError
-from station.service.alarm_memory import FILE, Memory, news, remember
-from station.service.alarm_rules import Alarm
+from station.service.alarm_memory import FILE, Alarm, Memory, news, remember
 from station.service.journal import Journal
 from station.service.metrics import Metrics
 
