@@ -13,10 +13,11 @@ from statistics import median
 import numpy as np
 
 from station.config import AlarmsSection, ChangeAlarm, Site
-from station.errors import StationError
+from station.errors import StationError, StoreError
 from station.science.onset import Onsets, onsets, threshold_sigmas
 from station.service.alarm_memory import Alarm
 from station.service.area_series import Curve, read_curves
+from station.service.health import need_room
 from station.service.journal import Entry, Journal, State
 from station.service.lock import in_use
 
@@ -118,6 +119,11 @@ def _disk(site: Site, rules: AlarmsSection) -> Iterator[Alarm]:
     free_gb = shutil.disk_usage(site.station.data).free / 1e9
     if free_gb < rules.disk_gb:
         yield Alarm("disk", f"{free_gb:.2f} GB free where the data folder is: make room")
+    elif rules.disk_gb:
+        try:
+            need_room(site)
+        except StoreError as error:
+            yield Alarm("disk", str(error))
 
 
 def _moved(site: Site) -> Iterator[Alarm]:

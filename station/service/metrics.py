@@ -65,12 +65,12 @@ class Metrics:
         path = self._site().service.metrics_file
         if path is None:
             return
-        registry = self._registry()
-        from prometheus_client import write_to_textfile  # noqa: PLC0415 - an extra
-
         try:
+            registry = self._registry()
+            from prometheus_client import write_to_textfile  # noqa: PLC0415 - an extra
+
             write_to_textfile(str(path), registry)
-        except OSError as error:
+        except (OSError, ConfigError) as error:  # no reason to measure nothing
             if not self._has_failed:
                 log.warning(logfmt(metrics_file=path, reason=error))
             self._has_failed = True

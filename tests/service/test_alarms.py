@@ -186,6 +186,12 @@ def test_the_disk_and_a_rule_that_cannot_be_asked(station_at, monkeypatch):
     monkeypatch.setattr(alarm_rules.shutil, "disk_usage", lambda _: SimpleNamespace(free=1.5e9))
     assert "1.50 GB free" in ask(0)["disk"]
 
+    monkeypatch.setattr(alarm_rules.shutil, "disk_usage", lambda _: SimpleNamespace(free=3e9))
+    assert ask(0) == {}
+    full = SimpleNamespace(f_bavail=10**6, f_frsize=4096, f_files=1000, f_favail=3)
+    monkeypatch.setattr("station.service.health.os.statvfs", lambda _: full)
+    assert "no inodes left" in ask(0)["disk"]
+
     def gone(_):
         raise OSError(5, "Input/output error")
 

@@ -82,6 +82,15 @@ def test_over_loopback_and_as_a_file_they_are_those_of_the_journal(station, port
         urllib.request.urlopen(f"http://127.0.0.1:{port}/metrics")
 
 
+def test_without_the_extra_the_service_measures_all_the_same(station, monkeypatch, caplog):
+    monkeypatch.setitem(sys.modules, "prometheus_client", None)
+    metrics = Metrics(lambda: station)
+    metrics.write()
+    assert "tls-station[metrics]" in caplog.text
+    with pytest.raises(ConfigError, match="pip install"), metrics.serving():
+        pass  # asked for at the start, it is said at the start
+
+
 def test_a_taken_port_and_a_folder_that_is_not_there(station, port, make_site, caplog):
     metrics = Metrics(lambda: station)
     with (
