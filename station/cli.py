@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import json
 import sys
+from collections.abc import Callable, Iterable
 from datetime import UTC, datetime
+from enum import StrEnum
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, TypeVar
 
 import typer
 
@@ -22,6 +24,33 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     rich_markup_mode=None,
 )
+
+T = TypeVar("T")
+
+
+class Drawn(StrEnum):
+    """What `station plot` draws."""
+
+    map = "map"
+    curve = "curve"
+    film = "film"
+
+
+class Shown(StrEnum):
+    """What a map shows."""
+
+    change = "change"
+    sigma = "sigma"
+    points = "points"
+
+
+class Exported(StrEnum):
+    """What `station export` writes."""
+
+    geotiff = "geotiff"
+    csv = "csv"
+    stac = "stac"
+
 
 SiteArgument = Annotated[
     Path, typer.Argument(metavar="SITE", help="The site file (TOML).", show_default=False)
@@ -202,11 +231,227 @@ def demo(
     sys.exit(run_demo(folder, hours))
 
 
-alarms = typer.Typer(no_args_is_help=True, add_completion=False)
-app.add_typer(alarms, name="alarms", help="Tell people what is wrong, or try whether they could be told.")
+FromOption = Annotated[
+    str | None, typer.Option("--from", metavar="TIME", help="First epoch, UTC.", show_default=False)
+]
+ToOption = Annotated[
+    str | None, typer.Option("--to", metavar="TIME", help="Last epoch, UTC.", show_default=False)
+]
+Against = Annotated[
+    str, typer.Option(metavar="EPOCH", help="reference, previous, or an epoch: a scan's name or a time.")
+]
 
 
-@alarms.command("look")
+def _bar(label: str) -> Callable[[list[T]], Iterable[T]]:
+    """Return what goes through a list with a progress bar, where a person looks on."""
+    from rich.console import Console
+    from rich.progress import track
+
+    return lambda rows: track(
+        rows, label, console=Console(stderr=True), transient=True, disable=not sys.stderr.isatty()
+    )
+
+
+@app.command()
+def areas(
+    site: SiteArgument,
+    polygons: Annotated[
+        Path | None,
+        typer.Argument(
+            metavar="[POLYGONS]", help="GeoJSON of named polygons; else the site's.", show_default=False
+        ),
+    ] = None,
+    first: FromOption = None,
+    last: ToOption = None,
+    against: Against = "reference",
+    table: Annotated[
+        str | None, typer.Option("--csv", metavar="FILE", help="Write CSV; - is stdout.", show_default=False)
+    ] = None,
+) -> None:
+    """Tell how areas changed, with 95 % intervals.
+
+    Mean, median, volume; also of polygons given after the fact, and between any two epochs.
+    """
+    from station.config import read_site
+    from station.products.areas import Span, area_lines, as_csv, as_text
+
+    lines = area_lines(read_site(site), polygons, Span.of(first, last), against, _bar("summing up"))
+    if table is None:
+        print(as_text(lines))
+    elif table == "-":
+        print(as_csv(lines), end="")
+    else:
+        Path(table).write_text(as_csv(lines), encoding="utf-8")
+
+
+@app.command()
+def plot(
+    site: SiteArgument,
+    what: Annotated[
+        Drawn, typer.Argument(metavar="map|curve|film", help="What to draw.", show_default=False)
+    ],
+    epoch: Annotated[str, typer.Option(metavar="EPOCH", help="Of a map: a scan's name or a time.")] = "last",
+    against: Against = "reference",
+    show: Annotated[Shown, typer.Option(help="Of a map.")] = Shown.change,
+    area: Annotated[
+        str | None, typer.Option(help="Of a curve: one area; else all.", show_default=False)
+    ] = None,
+    polygons: Annotated[
+        Path | None, typer.Option(metavar="GEOJSON", help="Of a curve.", show_default=False)
+    ] = None,
+    first: FromOption = None,
+    last: ToOption = None,
+    limit: Annotated[
+        float | None, typer.Option(help="Where the colours end, m.", min=1e-3, show_default=False)
+    ] = None,
+    width: Annotated[
+        int | None, typer.Option(help="Of a map, pixels.", min=300, max=8000, show_default=False)
+    ] = None,
+    out: Annotated[Path | None, typer.Option("--out", "-o", metavar="FILE", show_default=False)] = None,
+) -> None:
+    """Draw a map, the curve of an area, or a film.
+
+    The file's ending decides its format: png, webp, jpg; curves also svg, pdf; films webp, gif.
+    """
+    from station.config import read_site
+    from station.products import plots
+    from station.products.areas import Span, area_lines
+
+    found, span = read_site(site), Span.of(first, last)
+    out = out or Path(f"{found.station.id}_{what.value}.{'webp' if what is Drawn.film else 'png'}")
+    if what is Drawn.map:
+        plots.plot_map(found, epoch, against, show.value, out, width, limit)
+    elif what is Drawn.film:
+        plots.plot_film(found, span, out, width, limit, _bar("drawing"))
+    else:
+        lines = area_lines(found, polygons, span, against, _bar("summing up"))
+        since = (
+            f"the {against} one" if against == "previous" else against.replace("reference", "the reference")
+        )
+        title = f"{found.station.name or found.station.id}: mean change since {since}"
+        plots.plot_curve(lines, area, title, out)
+    print(out)
+
+
+@app.command()
+def export(
+    site: SiteArgument,
+    kind: Annotated[
+        Exported, typer.Argument(metavar="geotiff|csv|stac", help="For which tools.", show_default=False)
+    ],
+    folder: Annotated[Path, typer.Argument(metavar="[DIR]", help="Where to put it.")] = Path(),
+    first: FromOption = None,
+    last: ToOption = None,
+) -> None:
+    """Write files for tools that do not read NetCDF.
+
+    The newest epoch, or those of a span: change and its uncertainty as GeoTIFF with QGIS styles, a STAC
+    catalogue of these, or scans and areas as CSV.
+    """
+    from station.config import read_site
+    from station.products.areas import Span
+    from station.products.export import export as write
+
+    span = Span.of(first, last) if first or last else None
+    for path in write(read_site(site), kind.value, span, folder, _bar("writing")):
+        print(path)
+
+
+@app.command()
+def serve(
+    site: SiteArgument,
+    port: Annotated[int, typer.Option(min=1, max=65535, help="On 127.0.0.1.")] = 8750,
+) -> None:
+    """Show the station's page on this machine, read-only."""
+    from station.config import read_site
+    from station.products.serve import serve as show
+    from station.service.show import page_folder
+
+    folder = page_folder(read_site(site))
+    print(f"http://127.0.0.1:{port}/ (Ctrl-C ends it)", file=sys.stderr)
+    show(folder, port)
+
+
+sop_app = typer.Typer(
+    help="Solve an SOP from points and planes; see what an SOP says.",
+    no_args_is_help=True,
+    rich_markup_mode=None,
+)
+app.add_typer(sop_app, name="sop")
+
+Crs = Annotated[
+    str | None,
+    typer.Option(metavar="EPSG", help="The map, where the SOP leads to one without a POP or origin."),
+]
+Given = {"exists": True, "dir_okay": False, "show_default": False}
+
+
+@sop_app.command()
+def solve(
+    features: Annotated[Path, typer.Argument(metavar="FEATURES", help="Table of features (CSV).", **Given)],
+    out: Annotated[Path, typer.Option(metavar="SOP", help="Where to write it.", show_default=False)],
+    start: Annotated[
+        Path | None,
+        typer.Option(metavar="SOP", help="Start from this; needed without three points.", **Given),
+    ] = None,
+    crs: Crs = None,
+    scanner: Annotated[
+        str | None,
+        typer.Option(metavar="MODEL", help="Add the noise of this scanner, such as riegl-vz-6000."),
+    ] = None,
+    *,
+    json_: Json = False,
+) -> None:
+    """Solve an SOP by least squares, with its covariance.
+
+    Each row of the table: x,y,z in the scan, ref_x,ref_y,ref_z outside, sigma [m], name; for a point on a
+    plane also normal_x,normal_y,normal_z.
+    """
+    from dataclasses import asdict
+
+    from station.service.sop import describe_solution, known_scanner, solve_sop
+
+    found = solve_sop(features, out, start, crs, None if scanner is None else known_scanner(scanner))
+    print(json.dumps(asdict(found), indent=2) if json_ else describe_solution(found))
+
+
+@sop_app.command()
+def show(
+    sop: Annotated[
+        list[Path], typer.Argument(metavar="SOP...", help="One or more, in their order.", **Given)
+    ],
+    pop: Annotated[
+        Path | None, typer.Option(metavar="POP", help="From the project to WGS84.", **Given)
+    ] = None,
+    crs: Crs = None,
+    *,
+    json_: Json = False,
+) -> None:
+    """Tell where SOPs put the scanner and how it leans there.
+
+    Of each but the first also how it differs from the one before.
+    """
+    from dataclasses import asdict
+
+    from station.service.sop import describe_chain, show_sop
+
+    chains = show_sop(sop, pop, crs)
+    print(
+        json.dumps([asdict(chain) for chain in chains], indent=2)
+        if json_
+        else "\n".join(describe_chain(chain) for chain in chains)
+    )
+
+
+alarms_app = typer.Typer(
+    help="Tell people what is wrong; try whether they could be told.",
+    no_args_is_help=True,
+    rich_markup_mode=None,
+)
+app.add_typer(alarms_app, name="alarms")
+
+
+@alarms_app.command("look")
 def alarms_look(site: SiteArgument) -> None:
     """Ask the rules of [alarms], now, and tell what is new, still so or over.
 
@@ -219,7 +464,7 @@ def alarms_look(site: SiteArgument) -> None:
     sys.exit(look(read_site(site), tell=print))
 
 
-@alarms.command("test")
+@alarms_app.command("test")
 def alarms_test(site: SiteArgument) -> None:
     """Send a test message by every target and say which failed.
 

@@ -95,6 +95,21 @@ class ScannerSection(Section):
             )
         return {**known, **given}
 
+    @property
+    def instrument(self) -> Scanner:
+        """The scanner as a quantity, angles in radians."""
+        return Scanner(
+            model=self.model,
+            wavelength_um=self.wavelength_um,
+            beam_divergence_rad=self.beam_divergence_mrad * 1e-3,
+            exit_diameter_m=self.exit_diameter_m,
+            range_sigma_m=self.range_sigma_m,
+            angle_resolution_rad=math.radians(self.angle_resolution_deg),
+            inclination_sigma_rad=math.radians(self.inclination_sigma_deg),
+            inclination_range_rad=math.radians(self.inclination_range_deg),
+            range_max_m=self.range_max_m,
+        )
+
 
 class SopSection(Section):
     """A scanner orientation and position, and from when it holds."""
@@ -308,6 +323,15 @@ class AlarmsSection(Section):
     change: ChangeAlarm | None = None
 
 
+class ProductsSection(Section):
+    """What is made of every scan for people and other tools."""
+
+    page: bool = True
+    geotiff: bool = False
+    quicklook_width_px: Annotated[int, Field(ge=400, le=4000)] = 1200
+    change_limit_m: Positive | None = None
+
+
 class SiteFile(Section):
     """The whole file."""
 
@@ -327,6 +351,7 @@ class SiteFile(Section):
     flags: FlagsSection | None = None
     retention: RetentionSection = RetentionSection()
     service: ServiceSection = ServiceSection()
+    products: ProductsSection = ProductsSection()
     alarms: AlarmsSection | None = None
 
     @model_validator(mode="after")
@@ -356,18 +381,7 @@ class Site(SiteFile):
     @property
     def instrument(self) -> Scanner:
         """The scanner as a quantity, angles in radians."""
-        given = self.scanner
-        return Scanner(
-            model=given.model,
-            wavelength_um=given.wavelength_um,
-            beam_divergence_rad=given.beam_divergence_mrad * 1e-3,
-            exit_diameter_m=given.exit_diameter_m,
-            range_sigma_m=given.range_sigma_m,
-            angle_resolution_rad=math.radians(given.angle_resolution_deg),
-            inclination_sigma_rad=math.radians(given.inclination_sigma_deg),
-            inclination_range_rad=math.radians(given.inclination_range_deg),
-            range_max_m=given.range_max_m,
-        )
+        return self.scanner.instrument
 
     @property
     def adjusts(self) -> bool:
@@ -437,7 +451,7 @@ def read_site(path: str | Path) -> Site:
         given = tomllib.loads(path.read_text(encoding="utf-8"))
     except OSError as error:
         raise ConfigError(f"{path}: cannot be read: {error.strerror}") from error
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as error:
         raise ConfigError(f"{path}: not valid TOML: {error}") from error
     try:
         site = Site.model_validate({**given, "path": path})

@@ -58,6 +58,8 @@ def test_all_faults_at_once_with_the_nearest_right_key(tmp_path):
         (("[grid]", '[adjustment]\nstable = "there.geojson"\n[grid]'), r"adjustment.stable: no such file"),
         (("[grid]", '[adjustment]\nmethod = "best"\n[grid]'), "adjustment.method"),
         (("[grid]", '[areas]\nfile = "there.geojson"\n[grid]'), r"areas.file: no such file"),
+        (("[grid]", "[products]\nquicklook_width_px = 100\n[grid]"), "products.quicklook_width_px"),
+        (("[grid]", "[products]\nchange_limit_m = 0\n[grid]"), "products.change_limit_m"),
         (("[grid]", "[areas]\n[grid]"), "areas.file: missing"),
         (("[grid]", '[map]\npop = "pop.dat"\n[grid]'), "say which with map.crs"),
         (("east = 10.0", "east = -10.0"), "at least one cell_m beyond"),

@@ -1,6 +1,7 @@
 """The numbers the papers print, and independent ones where a paper errs.
 
-P1 … P15 count as in the project's sheet of equations. V: Voordendag et al. 2023, H: Hartzell et al. 2015,
+P1 … P15 count as in the project's sheet of equations; P10 stands with the volumes, P15
+with the registration. V: Voordendag et al. 2023, H: Hartzell et al. 2015,
 O: Ozendi et al. 2016, L: Leslar et al. 2014.
 """
 
@@ -9,8 +10,8 @@ import math
 import numpy as np
 import pytest
 
-from station.quantities import Air
-from station.science import air, beam, uncertainty
+from station.quantities import Air, Grid, Reference
+from station.science import air, beam, terrain, uncertainty, volume
 
 IHE = Air(temperature_c=-2.0, pressure_hpa=684.0, humidity_pct=28.0)  # V section 2.2: the scanner's setting
 GREEN_UM = 1.064
@@ -82,7 +83,7 @@ def test_refraction_coefficients():
 
 def test_p7_68_percent_ellipse():
     """Of draws from the distribution 68.3 % lie within, against 39.35 % for the unscaled ellipse."""
-    circle = beam.horizontal_error(np.diag([1.0, 1.0, 4.0])[None])[0]
+    circle = beam.error_ellipse(np.diag([1.0, 1.0, 4.0])[None])[0][0]
     assert circle**2 == pytest.approx(2.2977, abs=2e-3)
     draws = np.random.default_rng(7).normal(size=(200_000, 2))
     assert np.mean(np.hypot(*draws.T) < circle) == pytest.approx(0.683, abs=0.004)
@@ -100,8 +101,27 @@ def test_p8_errors_of_a_vz4000_at_500_m(elevation_deg, with_beam, horizontal_mm,
     jacobian = beam.polar_jacobian(array(500), np.radians(array(elevation_deg)), array(0.3))
     covariance = beam.point_covariance(jacobian, array(0.010, angle, angle)[None])
     if horizontal_mm:
-        assert beam.horizontal_error(covariance)[0] * 1e3 == pytest.approx(horizontal_mm, abs=0.15)
+        assert beam.error_ellipse(covariance)[0][0] * 1e3 == pytest.approx(horizontal_mm, abs=0.15)
     assert math.sqrt(covariance[0, 2, 2]) * 1e3 == pytest.approx(vertical_mm, abs=0.15)
+
+
+@pytest.mark.parametrize(
+    ("cell_m", "cells", "sigma_mm", "net_m3"),
+    [(0.5, (700, 800), (22.2, 12.3), 4.743), (0.25, (80, 112), (2.6, 1.6), 0.0182)],
+)
+def test_p9_net_volume_of_hartzells_sites(cell_m, cells, sigma_mm, net_m3):
+    """H Table 2, raster: Montezuma, 140 000 m², Mammoth, 560 m², from cells' sigma with and without snow."""
+    grid = Grid(0.0, cells[0] * cell_m, cell_m, cells[1], cells[0])
+    east, north = (axis.ravel() for axis in np.meshgrid(grid.x_m, grid.y_m))
+    level = terrain.ground(Reference.given(grid, "level", np.zeros(grid.shape)))
+    told = volume.raster(np.stack([east, north, 0 * east + 2], -1), level, np.ones(cells, bool))
+    assert told.area_m2 == {0.5: 140_000, 0.25: 560}[cell_m]
+    assert told.volume_m3 == pytest.approx(2 * told.area_m2)
+    gross_m6 = [
+        volume.independent_variance(told, np.broadcast_to(np.eye(3) * (s / 1e3) ** 2, (len(east), 3, 3)))
+        for s in sigma_mm
+    ]
+    assert math.sqrt(volume.net_variance(*gross_m6)) == pytest.approx(net_m3, rel=0.01)
 
 
 def test_p11_tilt_behind_the_unattended_half_metre():
@@ -133,12 +153,11 @@ def test_geometry_uncertainty_of_box_5():
 def test_published_budget_of_a_cell():
     """V-1 and V-2 by hand for box 5, and V-3 as the linear sum it is."""
     from station.config import ScannerSection
-    from station.quantities import Scanner
     from station.scanners import SCANNERS
 
     assert SCANNERS["riegl-vz-6000"]["beam_divergence_mrad"] == 0.12
     given = ScannerSection.model_validate({"model": "riegl-vz-6000"})
-    vz6000 = Scanner("vz", 1.064, given.beam_divergence_mrad * 1e-3, 0.0, 0.01, 0.0, 0.0, 6000.0)
+    vz6000 = given.instrument
     seen = array(3421.0), np.cos(np.radians(array(65.0))), np.cos(np.radians(array(25.0)))
     point_m2 = uncertainty.shot_variance_voordendag(*seen, array(0.0), vz6000)[0]
     assert math.sqrt(point_m2) == pytest.approx(math.sqrt(0.4777**2 + 0.137**2 + 0.01**2), abs=1e-3)

@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import netCDF4
 import numpy as np
-import xarray as xr
 
 from station.archive.layout import Series, strings
 from station.archive.reference import read_reference
@@ -16,9 +15,27 @@ from station.errors import StoreError
 from station.quantities import Bools, Floats, Grid, Reference, Shared
 from station.science.shared import Sensitivities, against, aggregate_variance, basis, cell_sensitivities
 from station.science.terrain import smooth_gradient
+from station.science.voids import area_weights, void_variance
+
+if TYPE_CHECKING:
+    import xarray as xr
 
 MARGIN_CELLS = 6  # that a smoothed gradient looks beyond a cell
 CHANGE, RANDOM = "elevation_change", "elevation_change_random_uncertainty"
+
+
+@dataclass(frozen=True)
+class AreaChange:
+    """How an area changed: mean with its voids interpolated, median of what was seen, one sigma each.
+
+    NaN where nothing was seen.
+    """
+
+    mean_m: float
+    mean_sigma_m: float
+    median_m: float
+    median_sigma_m: float
+    coverage: float  # share of its cells that have a change
 
 
 @dataclass(frozen=True)
@@ -69,26 +86,65 @@ class Aggregates:
         change count nothing. Source: EQUATIONS 6.2.
         """
         cells = weights != 0
-        held = [self._read(one, cells) for one in ([row] if other is None else [row, other])]
-        seen = np.logical_and.reduce(
-            [np.isfinite(one.change_m) & np.isfinite(one.reference.elevation_m[cells]) for one in held]
+        held = self._held(cells, row, other)
+        chosen = _seen(held, cells)
+        return self._total(held, chosen, weights[chosen], self._random(held, chosen, chosen[cells]))
+
+    def area(self, cells: Bools, row: Row, other: Row | None = None) -> AreaChange:
+        """Change of the cells (ny, nx) in an epoch, or from another epoch to it.
+
+        The median's sigma is that of a mean but for its random part, which is √(π/2) as large, as of normal
+        errors. Source: EQUATIONS 6.2; voids: Hartzell et al. (2015), see `science.voids`.
+        """
+        held = self._held(cells, row, other)
+        chosen = _seen(held, cells)
+        seen = chosen[cells]
+        if not seen.any():
+            return AreaChange(np.nan, np.nan, np.nan, np.nan, 0.0)
+        change_m = held[0].change_m[seen] - (0.0 if other is None else held[1].change_m[seen])
+        random_m2 = self._random(held, chosen, seen)
+        box = _box(cells, 0)
+        around_m, noise_m2 = np.full(cells.shape, np.nan)[box], np.zeros(cells[box].shape)
+        around_m[chosen[box]], noise_m2[chosen[box]] = change_m, np.sum(random_m2, axis=0)
+        weights, reach = area_weights(cells[box], chosen[box])
+        chosen_weights = weights[chosen[box]]
+        variance_m2 = self._total(held, chosen, chosen_weights, random_m2)
+        variance_m2 += void_variance(cells[box], reach, around_m, noise_m2)
+        same = np.full(len(change_m), 1 / len(change_m))
+        of_median_m2 = self._total(held, chosen, same, [np.pi / 2 * one for one in random_m2])
+        return AreaChange(
+            mean_m=float(chosen_weights @ change_m),
+            mean_sigma_m=float(np.sqrt(variance_m2)),
+            median_m=float(np.median(change_m)),
+            median_sigma_m=float(np.sqrt(of_median_m2)),
+            coverage=float(seen.mean()),
         )
-        chosen = cells.copy()
-        chosen[cells] = seen
-        weights = weights[chosen]
-        total = 0.0
+
+    def _held(self, cells: Bools, row: Row, other: Row | None) -> list[_Held]:
+        return [self._read(one, cells) for one in ([row] if other is None else [row, other])]
+
+    def _random(self, held: list[_Held], chosen: Bools, seen: Bools) -> list[Floats]:
+        """Variance of the chosen cells (n,) in each epoch that is theirs alone [m²]."""
+        found = []
         for one in held:
             random_m2 = one.random_m[seen] ** 2
-            if other is not None:  # what one reference does not know is in both and goes
+            if len(held) > 1:  # what one reference does not know is in both and goes
                 before_m2 = one.reference.random_variance_m2[chosen]
                 random_m2 = np.maximum(random_m2 - before_m2, 0.0) + self._apart(held, chosen) * before_m2
+            found.append(random_m2)
+        return found
+
+    def _total(self, held: list[_Held], chosen: Bools, weights: Floats, random_m2: list[Floats]) -> float:
+        """Variance of the weighted sum of the chosen cells (n,), over the epochs."""
+        total = 0.0
+        for one, own_m2 in zip(held, random_m2, strict=True):
             unknown = one.unknown
             if unknown is None:
-                total += float(np.sum(weights**2 * random_m2))
+                total += float(np.sum(weights**2 * own_m2))
                 continue
-            if other is None and not one.adjusted:
+            if len(held) == 1 and not one.adjusted:
                 unknown = against(unknown, one.reference.shared)
-            total += aggregate_variance(weights, random_m2, self._felt(one, chosen), unknown)
+            total += aggregate_variance(weights, own_m2, self._felt(one, chosen), unknown)
         return total
 
     def _apart(self, held: list[_Held], cells: Bools) -> Bools:
@@ -96,23 +152,14 @@ class Aggregates:
         one, other = (epoch.reference.elevation_m[cells] for epoch in held)
         return np.asarray(one != other)
 
-    def mean_change(self, cells: Bools, row: Row) -> tuple[float, float, float]:
-        """Mean change of the cells (ny, nx) in an epoch [m], one sigma [m], share of cells with a change."""
-        change_m = self._read(row, cells).change_m
-        seen = np.isfinite(change_m)
-        if not seen.any():
-            return np.nan, np.nan, 0.0
-        weights = np.zeros(cells.shape)
-        weights[cells] = seen / seen.sum()
-        sigma_m = float(np.sqrt(self.variance(weights, row)))
-        return float(change_m[seen].mean()), sigma_m, float(seen.mean())
-
     def coarsened(self, row: Row, cells: int) -> xr.Dataset:
         """Change in blocks of cells × cells of an epoch, every point counting the same, and one sigma [m].
 
         `point_count` is the sum. Shared errors are taken as one within a block. Rows and columns that fill
         no block are left out.
         """
+        import xarray as xr  # noqa: PLC0415 - the service does without
+
         grid = self._series.grid
         ny, nx = grid.ny // cells, grid.nx // cells
         if not ny or not nx:
@@ -177,6 +224,15 @@ class Aggregates:
 
 SCANNER = ("scanner_east", "scanner_north", "scanner_height", "scanner_axis_east", "scanner_axis_north")
 PARAMETER = ("parameter_name", "parameter_unit")
+
+
+def _seen(held: list[_Held], cells: Bools) -> Bools:
+    """Tell which of the cells (ny, nx) have a change in every epoch, and a reference."""
+    chosen = cells.copy()
+    chosen[cells] = np.logical_and.reduce(
+        [np.isfinite(one.change_m) & np.isfinite(one.reference.elevation_m[cells]) for one in held]
+    )
+    return chosen
 
 
 def _cells(variable: Any, index: int, cells: Bools) -> Floats:  # noqa: ANN401 - netCDF4 has no types

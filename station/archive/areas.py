@@ -13,39 +13,48 @@ import h5py
 import netCDF4
 import numpy as np
 
+from station.archive.aggregate import AreaChange
 from station.archive.layout import Series, define, introduce, strings, time_axis, written_whole
 from station.archive.series import read_source, runs
 from station.archive.store import Row, rows
 from station.archive.variables import BY_NAME, FILL, TEXT, TEXT_LENGTH, Variable
 from station.quantities import Bools
+from station.science.change import SIGNIFICANT_SIGMAS
 
 Columns = dict[str, np.ndarray[Any, Any]]  # all that lies over time, as it stands in the file
 
 MASKS = "area_masks_sha256"
 LACKING = -1
 _OVER_TIME = ("time", "area")
-_ONE_SIGMA = "one standard deviation, with what all cells of a scan share"
+_ONE_SIGMA = "one standard deviation, with what all cells of a scan share and what was interpolated"
+
+
+def _of(quantity: str, told: str, units: str, comment: str) -> tuple[Variable, ...]:
+    """Return the variables of a quantity: its value, one sigma, and between what it lies at 95 %."""
+    return (
+        Variable(quantity, _OVER_TIME, "f8", f"{told} of the area", units, comment=comment),
+        Variable(
+            f"{quantity}_uncertainty",
+            _OVER_TIME,
+            "f8",
+            f"uncertainty of the {told}",
+            units,
+            comment=_ONE_SIGMA,
+        ),
+        Variable(f"{quantity}_low", _OVER_TIME, "f8", f"lower end of the {told} at 95 %", units),
+        Variable(f"{quantity}_high", _OVER_TIME, "f8", f"upper end of the {told} at 95 %", units),
+    )
+
 
 AREA_VARIABLES: tuple[Variable, ...] = (
     Variable("area_name", ("area", "area_text"), "S1", "name of the area"),
     Variable("area_size", ("area",), "f8", "horizontal size of the area's cells on the grid", "m2"),
-    Variable(
-        "mean_change", _OVER_TIME, "f8", "mean elevation change of the area", "m",
-        comment="against the reference surface, of the cells that have a change",
+    *_of(
+        "mean_change", "mean elevation change", "m",
+        "against the reference surface; cells without a change are interpolated from those around them",
     ),
-    Variable(
-        "mean_change_uncertainty", _OVER_TIME, "f8", "uncertainty of the mean elevation change", "m",
-        comment=_ONE_SIGMA,
-    ),
-    Variable(
-        "volume_change", _OVER_TIME, "f8", "volume change of the area", "m3",
-        comment="mean_change times area_size: cells without a change are taken as the mean of those with one",
-    ),
-    Variable(
-        "volume_change_uncertainty", _OVER_TIME, "f8", "uncertainty of the volume change", "m3",
-        comment=f"{_ONE_SIGMA}; mean_change_uncertainty times area_size: nothing is added for cells without a"
-        " change, which are taken as the mean of those with one",
-    ),
+    *_of("median_change", "median elevation change", "m", "of the cells that have a change"),
+    *_of("volume_change", "volume change", "m3", "mean_change times area_size"),
     Variable("coverage", _OVER_TIME, "f8", "share of the area's cells that have a change", "1"),
     BY_NAME["epoch_file"],
     BY_NAME["reference_version"],
@@ -53,13 +62,10 @@ AREA_VARIABLES: tuple[Variable, ...] = (
 
 
 class Aggregator(Protocol):
-    """What knows the mean of an area and how sure it is."""
+    """What knows how an area changed and how sure that is."""
 
-    def mean_change(self, cells: Bools, row: Row) -> tuple[float, float, float]:
-        """Mean change of the cells (ny, nx) in an epoch [m], one sigma [m], share of cells with a change.
-
-        NaN where no cell has one.
-        """
+    def area(self, cells: Bools, row: Row) -> AreaChange:
+        """How the cells (ny, nx) changed in an epoch; NaN where none has a change."""
 
 
 def update_areas(
@@ -75,7 +81,7 @@ def update_areas(
     if not found:
         return None
     path = series.folder / "areas.nc"
-    masks = _fingerprint(series, areas)
+    masks = fingerprint(series, areas)
     known = _read(path, masks, len(areas))
     place = {key: index for index, key in enumerate(_keys(known))}
     at = [place.get((row.time_s, row.epoch_file), LACKING) for row in found]
@@ -95,12 +101,21 @@ def update_areas(
     return path
 
 
-def _fingerprint(series: Series, areas: dict[str, Bools]) -> str:
+def fingerprint(series: Series, areas: dict[str, Bools]) -> str:
     """Identify areas by their names, their order and their cells, and the grid these are of."""
     told = hashlib.sha256(json.dumps([astuple(series.grid), list(areas)]).encode())
     for cells in areas.values():
         told.update(np.packbits(cells).tobytes())
     return told.hexdigest()
+
+
+def is_of(path: Path, series: Series, areas: dict[str, Bools]) -> bool:
+    """Tell whether a file holds the series of just these areas."""
+    try:
+        with h5py.File(path, "r") as file:
+            return bool(file.attrs[MASKS] == np.bytes_(fingerprint(series, areas)))
+    except (OSError, RuntimeError, KeyError):
+        return False
 
 
 def _blank(times: int, areas: int) -> Columns:
@@ -150,22 +165,32 @@ def _measure(
         words = read_source(path, first, at, count).words
         for name in ("time", "time_bnds", "epoch_file", "reference_version"):
             columns[name][at : at + count] = words[name]
-    values = np.full((3, len(lacking), len(areas)), np.nan)
     for index, version in enumerate(strings(columns["reference_version"])):
         for area, cells in enumerate(areas.values()):
             if version and size_m2[area] > 0:
-                values[:, index, area] = aggregator.mean_change(cells, lacking[index])
+                told = figures(aggregator.area(cells, lacking[index]), float(size_m2[area]))
+                for name, value in told.items():
+                    columns[name][index, area] = value if np.isfinite(value) else FILL
         progress()
-    mean_m, sigma_m, coverage = values
-    for name, column in (
-        ("mean_change", mean_m),
-        ("mean_change_uncertainty", sigma_m),
-        ("volume_change", mean_m * size_m2),
-        ("volume_change_uncertainty", sigma_m * size_m2),
-        ("coverage", coverage),
-    ):
-        columns[name] = np.where(np.isfinite(column), column, FILL)
     return columns
+
+
+def figures(found: AreaChange, size_m2: float) -> dict[str, float]:
+    """Return what is told of the change of an area of that size, by the names of the variables."""
+    told: dict[str, float] = {}
+    for name, value, sigma in (
+        ("mean_change", found.mean_m, found.mean_sigma_m),
+        ("median_change", found.median_m, found.median_sigma_m),
+        ("volume_change", found.mean_m * size_m2, found.mean_sigma_m * size_m2),
+    ):
+        half = SIGNIFICANT_SIGMAS * sigma
+        told |= {
+            name: value,
+            f"{name}_uncertainty": sigma,
+            f"{name}_low": value - half,
+            f"{name}_high": value + half,
+        }
+    return told | {"coverage": found.coverage}
 
 
 def _write(

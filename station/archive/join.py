@@ -52,10 +52,13 @@ def _closed(kind: str, start: datetime, now: datetime) -> bool:
 
 
 def _is_joined(series: Series, found: list[Row], kind: str) -> bool:
-    """Tell whether all epochs lie in one file of this kind, or of the next larger."""
-    kinds = {"days": {"days", "months"}, "months": {"months"}}[kind]
+    """Tell whether all epochs lie in one file of this kind, or in those of the next larger.
+
+    A day may lie in two: in its month, and what came later in a file of the day, until that is made anew.
+    """
     paths = {row.path.relative_to(series.folder) for row in found}
-    return len(paths) == 1 and paths.pop().parts[0] in kinds
+    kinds = {path.parts[0] for path in paths}
+    return kinds <= {"days", "months"} if kind == "days" else kinds == {"months"} and len(paths) == 1
 
 
 def _join(series: Series, held: list[Source], path: Path, name: str, progress: Callable[[], None]) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -59,7 +59,8 @@ def written_whole(path: Path) -> Iterator[Path]:
     except (OSError, RuntimeError) as error:  # the netCDF library loses the errno of a full disk
         raise StoreError(f"{path}: cannot be written: {error}") from error
     finally:
-        beside.unlink(missing_ok=True)
+        with suppress(OSError):  # where even that cannot be: the sweep takes it, in time
+            beside.unlink(missing_ok=True)
 
 
 def _sync_folders(folder: Path) -> None:

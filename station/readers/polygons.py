@@ -82,7 +82,7 @@ def _json(path: Path) -> dict[str, Any]:
         told = json.loads(path.read_text(encoding="utf-8-sig"))
     except OSError as error:
         raise ConfigError(f"{path}: cannot be read: {error.strerror}") from error
-    except ValueError as error:  # of the text's encoding too
+    except (ValueError, RecursionError) as error:  # of the text's encoding, or its depth, too
         raise ConfigError(f"{path}: not valid GeoJSON: {error}") from error
     if not isinstance(told, dict):
         raise ConfigError(f"{path}: not valid GeoJSON: an object is missing")

@@ -223,6 +223,16 @@ def scan_start(
     return named
 
 
+def require_begun(start: datetime, now_s: float) -> None:
+    """Raise NotReadyError where a scan begins in the future: then a clock is wrong, or its name's zone."""
+    ahead_s = start.timestamp() - now_s
+    if ahead_s > CLOCKS_AGREE_S:
+        raise NotReadyError(
+            f"begins at {start:%Y-%m-%d %H:%M:%S} UTC, {timedelta(seconds=round(ahead_s))} ahead of this"
+            " computer's clock: held back until then; is one of the clocks wrong, or its name in local time?"
+        )
+
+
 def utc_interval(reader: ScanReader, pattern: str) -> tuple[datetime, datetime, TimeKind]:
     """Return start and end of a scan (UTC) and what its time stamps count; end = start where none are.
 
@@ -233,4 +243,9 @@ def utc_interval(reader: ScanReader, pattern: str) -> tuple[datetime, datetime, 
     if times_s is None:
         return start, start, TimeKind.NONE
     kind = time_kind(*times_s, start, standard=reader.header.standard_time)
-    return start, start + timedelta(seconds=times_s[1] - times_s[0]), kind
+    try:
+        return start, start + timedelta(seconds=times_s[1] - times_s[0]), kind
+    except OverflowError as error:
+        raise ScanError(
+            f"time stamps from {times_s[0]:g} to {times_s[1]:g} s: no scan lasts so long: they are corrupt"
+        ) from error

@@ -14,6 +14,7 @@ from station.quantities import Floats
 
 EXACT = 1e-6  # shifts 1 m at 1,000 km; files with nine digits reach 1e-9
 MENDABLE = 1e-4  # a few digits lost in writing; beyond that it is no rotation
+FARTHEST_M = 1e8  # from the origin of any frame or map; the earth's radius is 6.4e6
 
 
 def read_matrix(path: Path) -> Floats:
@@ -42,6 +43,8 @@ def read_matrix(path: Path) -> Floats:
             f"{path}: the last row must be 0 0 0 1, is {matrix[3].tolist()}"
             + ("; the matrix is transposed: write its columns as rows" if transposed else "")
         )
+    if (np.abs(matrix) > FARTHEST_M).any():
+        raise ConfigError(f"{path}: holds {np.abs(matrix).max():g}: metres, beyond any map")
     matrix[:3, :3] = _rotation(matrix[:3, :3], path)
     return matrix
 

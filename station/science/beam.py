@@ -8,6 +8,8 @@ import numpy as np
 
 from station.quantities import Floats
 
+ELLIPSE = -2 * math.log(1 - 0.683)  # 2.2977, the χ² of two dimensions within which 68.3 % lie
+
 
 def cartesian(range_m: Floats, elevation_rad: Floats, azimuth_rad: Floats) -> Floats:
     """Coordinates (n, 3) in the scanner's frame [m]; elevation counts from the horizontal plane.
@@ -62,13 +64,25 @@ def point_covariance(jacobian: Floats, sigma_m_rad_rad: Floats) -> Floats:
     return np.asarray(scaled @ np.swapaxes(scaled, -1, -2))
 
 
-def horizontal_error(covariance_m2: Floats) -> Floats:
-    """Semi-major axis of the 68.3 % horizontal error ellipse (n,) [m].
+def error_ellipse(covariance_m2: Floats) -> tuple[Floats, Floats, Floats]:
+    """Semi-axes [m] of the horizontal ellipse that holds points (n,) with 68.3 %, and its azimuth [rad].
 
-    Source: Hartzell et al. (2015), text to Fig. 7: sqrt(2.2977 λ_max), the χ² quantile of two dimensions.
+    The azimuth, of the longer, is clockwise from north, 0 to π. Unscaled, an ellipse holds 39.35 %.
+    Source: Hartzell et al. (2015), text to Fig. 7: sqrt(2.2977 λ), the χ² quantile of two dimensions.
     """
-    largest_m2 = np.linalg.eigvalsh(covariance_m2[..., :2, :2])[..., -1]
-    return np.asarray(np.sqrt(-2 * math.log(1 - math.erf(1 / math.sqrt(2))) * largest_m2))
+    variance_m2, direction = np.linalg.eigh(covariance_m2[..., :2, :2])
+    minor_m, major_m = (np.sqrt(ELLIPSE * np.maximum(variance_m2[..., k], 0.0)) for k in (0, 1))
+    azimuth_rad = np.arctan2(direction[..., 0, 1], direction[..., 1, 1]) % math.pi
+    return major_m, minor_m, azimuth_rad
+
+
+def error_ellipsoid(covariance_m2: Floats) -> tuple[Floats, Floats]:
+    """Semi-axes (n, 3) [m] of the ellipsoid of one sigma, the longest last, and their directions as columns.
+
+    Source: Ozendi et al. (2016), Eq. 8.
+    """
+    variance_m2, direction = np.linalg.eigh(covariance_m2)
+    return np.sqrt(np.maximum(variance_m2, 0.0)), direction
 
 
 def diameter(range_m: Floats, divergence_rad: float, exit_diameter_m: float) -> Floats:

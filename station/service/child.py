@@ -30,15 +30,32 @@ if TYPE_CHECKING:
 T = TypeVar("T")
 
 # Whatever of these cannot be imported is left out; the first brings nearly all of the rest.
-PRELOAD = ("station.service.tasks", "station.service.child", "laspy", "lazrs", "netCDF4", "scipy.signal")
+PRELOAD = (
+    "station.service.tasks",
+    "station.service.show",
+    "station.service.child",
+    "laspy",
+    "lazrs",
+    "netCDF4",
+    "scipy.signal",
+)
 # One scan is one core's work; and every further thread of a BLAS reserves address space against RLIMIT_AS.
 _ONE_THREAD = dict.fromkeys(("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "RAYON_NUM_THREADS"), "1")
 _TICK_S = 0.2
 _GONE_WITH_ITS_SERVER = 255  # what multiprocessing reports where the fork server died
 _NOT_STARTED = ("not started", None)
+# A scan that needs too much meets RLIMIT_AS; the kernel kills where the machine or the unit has less.
+_FROM_OUTSIDE = {signal.SIGKILL, signal.SIGTERM, signal.SIGINT, signal.SIGHUP}
+
+# Before a killed child is started again: what comes next in time shall not go before it for one kill.
+PAUSES_S = (1.0, 5.0, 30.0)
 
 _starting = threading.Lock()  # several threads may each run a child
 _forks = multiprocessing.get_context("forkserver")
+
+
+class _KilledError(NotReadyError):
+    """The child was lost by no fault of its own."""
 
 
 def prepare(preload: Sequence[str] = PRELOAD) -> None:
@@ -68,9 +85,26 @@ def run(
 
     `on_progress` is called here for each `progress()` there, and while waiting within `timeout_s`. Raises the
     StationError the task raised; ScanError where the child ran out of memory or time, panicked, or died by a
-    signal; NotReadyError where `should_stop()` became true or the child could not be started; RuntimeError
-    with the child's traceback for a bug.
+    signal of its own making; NotReadyError where `should_stop()` became true, or the child could not be
+    started or was killed from outside, again and again; RuntimeError with the child's traceback for a bug.
     """
+    hooks = on_progress, should_stop
+    for pause_s in PAUSES_S:
+        try:
+            return _run_once(task, args, memory_gb, timeout_s, *hooks)
+        except _KilledError:
+            _wait(pause_s, *hooks)
+    return _run_once(task, args, memory_gb, timeout_s, *hooks)
+
+
+def _run_once(
+    task: Callable[..., T],
+    args: tuple[object, ...],
+    memory_gb: float,
+    timeout_s: float,
+    on_progress: Callable[[], None],
+    should_stop: Callable[[], bool],
+) -> T:
     prepare()
     here, there = _forks.Pipe()
     with here:
@@ -91,9 +125,7 @@ def run(
     if kind == "returned":
         return value  # type: ignore[return-value] # it is what the task returned
     if report == _NOT_STARTED or exit_status == _GONE_WITH_ITS_SERVER:
-        raise NotReadyError(
-            f"the process for it could not be started or was lost (exit status {exit_status})"
-        )
+        raise _KilledError(f"the process for it could not be started or was lost (exit status {exit_status})")
     if kind == "died":
         raise _cause_of_death(exit_status)
     if kind == "memory":
@@ -106,6 +138,15 @@ def run(
     if kind == "panicked":
         raise ScanError(f"the decoder panicked: {value}")
     raise RuntimeError(f"a bug in {task.__name__}, in the child:\n{value}")
+
+
+def _wait(pause_s: float, on_progress: Callable[[], None], should_stop: Callable[[], bool]) -> None:
+    until_s = time.monotonic() + pause_s
+    while (left_s := until_s - time.monotonic()) > 0:
+        if should_stop():
+            raise NotReadyError("stopped before it was done")
+        on_progress()
+        time.sleep(min(left_s, _TICK_S))
 
 
 def _await_report(
@@ -143,12 +184,14 @@ def _end(child: ForkServerProcess) -> int | None:
     return exit_status
 
 
-def _cause_of_death(exit_status: int | None) -> ScanError:
+def _cause_of_death(exit_status: int | None) -> ScanError | NotReadyError:
+    """Say what a child died of: a decoder that crashes is the scan's fault, a kill from outside is not."""
     if exit_status is None or exit_status >= 0:
         return ScanError(f"the decoder ended the process without a word (exit status {exit_status})")
     name = signal.Signals(-exit_status).name
-    hint = ": probably out of memory" if name == "SIGKILL" else ""
-    return ScanError(f"the decoder died by {name}{hint}")
+    if -exit_status in _FROM_OUTSIDE:
+        return _KilledError(f"the process was killed ({name}): is the machine out of memory?")
+    return ScanError(f"the decoder died by {name}")
 
 
 def _work(there: Connection, task: Callable[..., object], args: tuple[object, ...], memory: int) -> None:

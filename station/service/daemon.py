@@ -166,6 +166,7 @@ class Daemon:
         try:
             worker.take(arrival)
         except StationError:
+            self._is_recovered = False  # it may have been broken off between file and journal
             raise
         except Exception as bug:  # the one place: a bug that one scan wakes must not keep the others out
             log.exception(logfmt(scan=arrival.name, verdict="later", reason="a bug: please report it"))

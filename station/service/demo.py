@@ -17,6 +17,7 @@ from station.config import Site, read_site
 from station.quantities import Quality
 from station.service.journal import Entry, State
 from station.service.once import one_line, process_scans
+from station.service.show import page_folder
 from station.service.tasks import series_of
 from station.simulation.station import demo, simulate
 
@@ -47,6 +48,8 @@ def run_demo(folder: Path, hours: int) -> int:
         + str(site.station.data)
         + "'))\""
     )
+    page = page_folder(site) / "index.html"
+    print(f"the page: {page.absolute().as_uri()}")
     return status
 
 
@@ -62,13 +65,13 @@ def _what_changed(site: Site, series: xr.Dataset, truth: xr.Dataset) -> Table:
     for name in ("scan", "measured, m", "± 1 σ, m", "true, m", "cells changed at 95 %"):
         table.add_column(name, justify="left" if name == "scan" else "right", no_wrap=True)
     for i, scan_id in enumerate(str(one) for one in series.scan_id.values):
-        measured_m, sigma_m, _ = found.mean_change(ice, found.row(i))
         seen = ice & np.isfinite(series.elevation_change[i].values)
+        measured = found.area(seen, found.row(i))
         true_m = (truth.change.values[in_truth.index(scan_id)] - zero)[seen].mean()
         certain = (series.quality[i].values[seen].astype(int) & Quality.CHANGE_SIGNIFICANT) > 0
         told = (
-            f"{measured_m:+.3f}",
-            f"{sigma_m:.3f}",
+            f"{measured.mean_m:+.3f}",
+            f"{measured.mean_sigma_m:.3f}",
             f"{true_m:+.3f}",
             f"{100 * certain.mean():.0f} %",
         )

@@ -17,7 +17,7 @@ from station.config import Origin, Site, SopSection
 from station.errors import ConfigError, NotReadyError, ScanError
 from station.pipeline import Pose, Setup, Told
 from station.quantities import Air, Habits, HeadTrack, InclinationLog, Shared
-from station.readers.inclination import read_inclination
+from station.readers.inclination import in_week_of, read_inclination
 from station.readers.scan import ScanReader, open_scan
 from station.readers.sop import read_matrix, sop_for
 from station.readers.weather import air_at, read_weather
@@ -198,14 +198,22 @@ def _log(site: Site, path: Path | None, track: HeadTrack | None, lacking: list[s
         if site.inclination.required:
             lacking.append("inclination log missing")
         return None
-    range_rad = site.instrument.inclination_range_rad
     try:
-        told = read_inclination(path)
-        log, dropped = inclination.clean(told, range_rad)
+        log = _clean(site, read_inclination(path), lacking)
     except ScanError as error:
         lacking.append(f"inclination log unusable: {error}")
         return None
-    rows = len(log.time_s)
+    if log is None or track is None:
+        return log
+    log = in_week_of(log, float(track.time_s[0]))
+    return log if _covers(log, track, lacking) else None
+
+
+def _clean(site: Site, told: InclinationLog, lacking: list[str]) -> InclinationLog | None:
+    """Return the good rows of a log, None where too few are or the sensor was out of its range."""
+    assert site.inclination is not None  # noqa: S101 - the caller's case
+    range_rad = site.instrument.inclination_range_rad
+    log, dropped = inclination.clean(told, range_rad)
     pegged = inclination.pegged(told, range_rad)
     if pegged > PEGGED_MOST:
         if site.inclination.required:
@@ -214,12 +222,13 @@ def _log(site: Site, path: Path | None, track: HeadTrack | None, lacking: list[s
                 f" {pegged:.0%} of its log, which is not used"
             )
         return None
+    rows = len(log.time_s)
     if rows < FEWEST_ROWS:
         lacking.append(f"inclination log has {rows} good rows")
         return None
     if dropped > 0.1 * (dropped + rows):
         lacking.append(f"inclination log bad: {dropped} of {dropped + rows} rows dropped")
-    return log if track is None or _covers(log, track, lacking) else None
+    return log
 
 
 def _covers(log: InclinationLog, track: HeadTrack, lacking: list[str]) -> bool:

@@ -114,7 +114,9 @@ class Inbox:
         next_s = math.inf
         for name, status in scans.items():
             if _is_done(known.get(quoted(name)), status):
-                self._sights.pop(name, None)
+                # To be done again it need not settle anew: later scans would be done before it.
+                print_ = _print(status) + self._log_print(name, there)
+                self._sights.setdefault(name, _Sight(print_, -math.inf))
                 continue
             if why := _refusal(name, status):
                 self._refuse(name, status, why)
@@ -143,15 +145,13 @@ class Inbox:
     ) -> tuple[Arrival, str, float]:
         """Return the arrival, what it still waits for ('' if nothing) and for how long [s]."""
         log_name = self._log_name(name)
-        log_status = there.get(log_name) if log_name else None
-        if log_status is not None and not (stat.S_ISREG(log_status.st_mode) and log_status.st_size):
-            log_status = None  # a link, or still empty: as if it were not there
-        print_ = _print(status) + (_print(log_status) if log_status else ())
+        log_print = self._log_print(name, there)
+        print_ = _print(status) + log_print
         now_s = self._monotonic_s()
         sight = self._sights.get(name)
         if sight is None or sight.print != print_:
             sight = self._sights[name] = _Sight(print_, now_s)
-        log_path = self._folder / log_name if log_name and log_status else None
+        log_path = self._folder / log_name if log_name and log_print else None
         arrival = Arrival(name, self._folder / name, log_path, status.st_size, status.st_mtime_ns)
         still_s = now_s - sight.since_s
         if still_s < self._settle_s:
@@ -162,6 +162,12 @@ class Inbox:
                 return arrival, f"{WAITS_FOR_LOG} {log_name}", left_s
         pause_s = self._pause_s(status, known)
         return arrival, "its next try" if pause_s else "", pause_s or math.inf
+
+    def _log_print(self, name: str, there: Mapping[str, os.stat_result]) -> tuple[int, ...]:
+        """Return the print of a scan's log; none for a link or one that is still empty."""
+        status = there.get(self._log_name(name) or "")
+        usable = status is not None and stat.S_ISREG(status.st_mode) and status.st_size
+        return _print(status) if status is not None and usable else ()
 
     def _log_name(self, name: str) -> str | None:
         return f"{Path(name).stem}{self._inclination.suffix}" if self._inclination else None

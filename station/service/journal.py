@@ -9,7 +9,7 @@ from __future__ import annotations
 import json
 import sqlite3
 import time
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, fields
 from enum import StrEnum
 from typing import TYPE_CHECKING, NamedTuple, Self
@@ -183,7 +183,8 @@ class Journal:
                 attempts=0,
                 next_try_utc_s=None,
             )
-        self._note(name).unlink(missing_ok=True)
+        with suppress(OSError):  # it is stored all the same
+            self._note(name).unlink(missing_ok=True)
 
     def set_aside(self, name: str, reason: str, *, sha256: str | None = None, log_sha256: str = "") -> None:
         """Note that a scan cannot be used, and why, here and in `set_aside/<name>.txt`."""
@@ -312,6 +313,12 @@ class Journal:
         if state is None:
             return self._select("ORDER BY name")
         return self._select("WHERE state = ? ORDER BY name", state)
+
+    def seconds(self) -> dict[str, float]:
+        """Return how long each stored scan took [s], by its name; all of them in a twentieth of a second."""
+        told = "SELECT name, json_extract(figures, '$.seconds') FROM scan WHERE state = 'stored'"
+        with self._faults():
+            return {str(name): float(took) for name, took in self._rows.execute(told) if took is not None}
 
     def changed_since(self, utc_s: float) -> list[Entry]:
         """Return the rows with which something happened since then, by that time."""

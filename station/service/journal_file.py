@@ -56,13 +56,22 @@ def open_to_write(path: Path) -> sqlite3.Connection:
 def open_to_read(path: Path) -> sqlite3.Connection:
     """Open without leaving a file behind: a reader of another user must not own the writer's side files."""
     if not path.exists():
-        empty = sqlite3.connect(":memory:", isolation_level=None)
-        empty.executescript(_SCHEMA)
-        return empty
+        return _empty()
     side = path.with_name(path.name + "-wal")
     quiet = not side.exists() or side.stat().st_size == 0
     mode = "immutable=1" if quiet else "mode=ro"
-    return sqlite3.connect(f"{path.absolute().as_uri()}?{mode}", uri=True, isolation_level=None, timeout=20.0)
+    uri = f"{path.absolute().as_uri()}?{mode}"
+    rows = sqlite3.connect(uri, uri=True, isolation_level=None, timeout=20.0)
+    if rows.execute("SELECT 1 FROM sqlite_master WHERE name = 'scan'").fetchone():
+        return rows
+    rows.close()  # the service has only just begun, or was killed just then
+    return _empty()
+
+
+def _empty() -> sqlite3.Connection:
+    rows = sqlite3.connect(":memory:", isolation_level=None)
+    rows.executescript(_SCHEMA)
+    return rows
 
 
 def explain(path: Path, error: sqlite3.Error) -> str:

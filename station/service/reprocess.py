@@ -277,6 +277,7 @@ class _Redoing:
         with self._console.status("publishing series.nc …"):
             self._worker.join_closed()
             self._worker.recover()
+            self._worker.show()
 
     def _progress(self) -> Progress:
         columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())

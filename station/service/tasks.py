@@ -33,7 +33,7 @@ from station.quantities import Bools, Measurement, Quality, Reference
 from station.readers.flags import flag_on, read_flags
 from station.readers.polygons import mask, read_polygons
 from station.readers.raster import read_geotiff
-from station.readers.scan import ScanReader, open_scan, utc_interval
+from station.readers.scan import ScanReader, open_scan, require_begun, utc_interval
 from station.science import ground, verdict
 from station.science.adjustment import Adjustment
 from station.science.grid import Gridder
@@ -135,8 +135,8 @@ def process(
 ) -> Outcome:
     """Measure a scan and store its epoch, unless just this is stored.
 
-    Raises ScanError where the scan cannot be used; NotReadyError where it changes meanwhile, or `patient` and
-    still without weather shortly after its arrival.
+    Raises ScanError where the scan cannot be used; NotReadyError where it changes meanwhile, begins in the
+    future, or `patient` and still without weather shortly after its arrival.
     """
     began_s = time.monotonic()
     series = series_of(site)
@@ -190,6 +190,7 @@ def _measure(
 ) -> store.Epoch:
     with opened(site, arrival.path) as reader:
         start, end, _ = utc_interval(reader, site.scans.name)
+        require_begun(start, time.time())
         gathered = gather(
             site,
             reader,

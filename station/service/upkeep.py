@@ -7,6 +7,7 @@ from datetime import UTC, datetime
 from station.archive import join, store
 from station.archive.aggregate import Aggregates
 from station.archive.areas import update_areas
+from station.archive.reference import settle_reference
 from station.archive.series import build_series
 from station.config import Site
 from station.errors import StoreError
@@ -21,6 +22,7 @@ def publish(site: Site, progress: Progress) -> None:
     Epochs are joined first where they are too many files.
     """
     series = series_of(site)
+    settle_reference(series)
     if max(len(store.sources(series.path)), len(store.epochs(series))) > MOST_SOURCES:
         join.join_closed(series, datetime.now(UTC), progress)
     build_series(series)

@@ -39,6 +39,7 @@ from station.service.references import (
     scans_due,
 )
 from station.service.retention import due_to_go, retire
+from station.service.show import show
 from station.service.stale import count_by_settings, late
 from station.service.tasks import Outcome, Past, Progress, Refused, Same, attend, open_only, series_of
 from station.service.upkeep import join_epochs, publish, sweep_store
@@ -106,6 +107,7 @@ class Worker:
         _say(arrival.name, outcome)
         if self._site.adjusts and (moved := self.run(moved_by, outcome.start_utc_s)):
             log.warning("%s", logfmt(scan=arrival.name, moved=moved))
+        self.show()
         self._make_reference_when_due()
         return True
 
@@ -122,7 +124,8 @@ class Worker:
         """Make journal and files agree: checksums are completed, lost rows made anew, the series is rebuilt.
 
         Epochs that are lost or damaged are redone where their scan is still in the inbox. One written just
-        before a power cut is found by `tasks.process` as the same and not stored twice.
+        before a power cut is found by `tasks.process` as the same and not stored twice. A reference that was
+        due is made now: what comes next is to be measured from it, as without the cut.
         """
         self._put_aside(self.run(unopened))
         self.seal()
@@ -130,6 +133,7 @@ class Worker:
         self._have_lost_done_again()
         if holds_epochs(self._series):
             self._mending(publish)
+        self._make_reference_when_due()
 
     def seal(self) -> None:
         """Note the checksums of files that have none; put aside those that cannot be read."""
@@ -223,7 +227,15 @@ class Worker:
     ) -> bool:
         self._journal.set_aside(arrival.name, reason, sha256=sha256, log_sha256=log_sha256)
         log.warning("%s", logfmt(scan=arrival.name, verdict="set_aside", reason=reason))
+        self.show()
         return False
+
+    def show(self) -> None:
+        """Bring the page up to what is stored; what fails there keeps no scan from the store."""
+        try:
+            self.run(show)
+        except (StationError, RuntimeError) as error:
+            log.warning("%s", logfmt(page="failed", reason=error))
 
     def _note_same(self, arrival: Arrival, same: Same) -> bool:
         """Put a scan back where it was, or aside if it is another's copy; tell whether it is stored."""
@@ -270,6 +282,8 @@ class Worker:
         """Build the master surface once enough usable scans are stored; make a better one of ever more."""
         wanted, usable = self._site.reference.scans, self._usable()
         made = current(self._series)
+        if made and not isinstance(wanted, Path):
+            self._have_bare_done_again()
         chosen = scans_due(self._site, usable, len(made))
         if isinstance(wanted, Path) or not chosen or len(usable) < number_due(self._site, len(made)):
             return
@@ -294,6 +308,12 @@ class Worker:
         if not made:
             others = (row.name for row in self._journal.rows(State.STORED) if row.reference != version)
             self._journal.again(others)
+
+    def _have_bare_done_again(self) -> None:
+        """Redo what is stored without change: the power went between the reference and its first use."""
+        bare = [row.name for row in self._journal.rows(State.STORED) if not row.reference]
+        inbox = self._site.scans.inbox
+        self._journal.again(name for name in bare if name in self._taken or (inbox / name).is_file())
 
     def _arrival(self, name: str) -> Arrival | None:
         """Find a scan again: where it was taken from, in the inbox or in the archive."""

@@ -20,6 +20,7 @@ from station.quantities import Grid, Habits, Measurement, Reference, Shared, Sur
 from station.science import prior, shared
 from station.science.adjustment import adjust
 from station.science.patches import Patches
+from station.science.voids import area_weights, void_variance
 
 GRID = Grid(west_m=632_000.0, north_m=5_186_000.0, cell_m=10.0, nx=40, ny=30)
 START_S = 1_763_683_200.0  # 2025-11-21 00:00 UTC
@@ -269,7 +270,7 @@ def test_epochs_in_a_joined_file_say_the_same(filled):
     assert [row.index for row in rows] == [0, 1, 2, 3]
     assert [found.variance(weights, rows[i]) for i in (0, 1, 2)] == [before[i] for i in (NONE, JOINT, EMPTY)]
     assert found.variance(weights, rows[0], rows[1]) == pair
-    assert found.mean_change(weights > 0, rows[1]) == alone.mean_change(weights > 0, alone.row(JOINT))
+    assert found.area(weights > 0, rows[1]) == alone.area(weights > 0, alone.row(JOINT))
 
 
 def test_epochs_are_found_by_place_and_by_time(filled):
@@ -293,25 +294,52 @@ def test_epochs_are_found_by_place_and_by_time(filled):
         found.row(4)
 
 
-def test_mean_change_of_an_area(filled):
-    found = Aggregates(filled)
+def area_and_weights(ds, *indices):
+    """An area with voids; its seen cells, their weights in its mean, and the reaches of the voids."""
     area = np.zeros(GRID.shape, bool)
     area[10:20, 10:30] = True
+    seen = np.logical_and.reduce([np.isfinite(ds.elevation_change[i].values) for i in indices])
+    assert (area & ~seen).sum() > 20
+    return area, area & seen, *area_weights(area, seen)
+
+
+def test_an_area_with_voids(filled):
+    found = Aggregates(filled)
     with station.open(filled.folder) as ds:
         for index in (NONE, JOINT, ALONE):
-            change_m = ds.elevation_change[index].values[area]
-            seen = np.isfinite(change_m)
-            mean_m, sigma_m, share = found.mean_change(area, found.row(index))
-            assert mean_m == pytest.approx(change_m[seen].astype(float).mean(), rel=1e-6)
-            assert share == seen.mean()
-            weights = np.where(area & np.isfinite(ds.elevation_change[index].values), 1 / seen.sum(), 0)
-            assert sigma_m == pytest.approx(np.sqrt(found.variance(weights, found.row(index))))
-    for lacking in (
-        found.mean_change(area, found.row(EMPTY)),
-        found.mean_change(area & ~area, found.row(NONE)),
-    ):
-        assert np.isnan(lacking[:2]).all()
-        assert lacking[2] == 0.0
+            area, seen, weights, reach = area_and_weights(ds, index)
+            change_m = np.where(seen, ds.elevation_change[index].values, np.nan).astype(float)
+            random_m2 = ds.elevation_change_random_uncertainty[index].values.astype(float) ** 2
+            told = found.area(area, found.row(index))
+            assert told.coverage == seen.sum() / area.sum()
+            assert told.mean_m == pytest.approx(np.nansum(weights * change_m), rel=1e-6)
+            beyond_m2 = void_variance(area, reach, change_m, random_m2)
+            assert beyond_m2 > 0
+            wanted_m2 = found.variance(weights, found.row(index)) + beyond_m2
+            assert told.mean_sigma_m**2 == pytest.approx(wanted_m2, rel=1e-5)
+            assert told.median_m == pytest.approx(np.nanmedian(change_m))
+            same = seen / seen.sum()
+            more_m2 = (np.pi / 2 - 1) * np.nansum(same**2 * random_m2)  # the random part, of a median
+            wanted_m2 = found.variance(same, found.row(index)) + more_m2
+            assert told.median_sigma_m**2 == pytest.approx(wanted_m2, rel=1e-5)
+    for lacking in (found.area(area, found.row(EMPTY)), found.area(area & ~area, found.row(NONE))):
+        assert np.isnan(
+            [lacking.mean_m, lacking.mean_sigma_m, lacking.median_m, lacking.median_sigma_m]
+        ).all()
+        assert lacking.coverage == 0.0
+
+
+def test_an_area_from_one_epoch_to_another(filled):
+    found = Aggregates(filled)
+    with station.open(filled.folder) as ds:
+        area, seen, weights, _ = area_and_weights(ds, JOINT, NONE)
+        change_m = (ds.elevation_change[JOINT] - ds.elevation_change[NONE]).values.astype(float)
+    there, back = (found.area(area, found.row(a), found.row(b)) for a, b in ((JOINT, NONE), (NONE, JOINT)))
+    assert there.mean_m == pytest.approx(np.nansum(weights * change_m), rel=1e-6) == -back.mean_m
+    assert there.median_m == pytest.approx(np.median(change_m[seen])) == -back.median_m
+    assert there.mean_sigma_m == pytest.approx(back.mean_sigma_m)
+    assert there.mean_sigma_m**2 > found.variance(weights, found.row(JOINT), found.row(NONE))
+    assert there.coverage == seen.sum() / area.sum()
 
 
 def test_what_is_not_there_yet_is_said(tmp_path):

@@ -9,6 +9,7 @@ import pytest
 import xarray as xr
 
 from station.archive import store
+from station.archive.aggregate import AreaChange
 from station.archive.areas import update_areas
 from station.archive.join import join_closed
 from station.errors import StoreError
@@ -20,9 +21,9 @@ class Told:
     def __init__(self):
         self.asked = []
 
-    def mean_change(self, cells, row):
+    def area(self, cells, row):
         self.asked.append((row.epoch_file, int(cells.sum())))
-        return row.start.hour / 100, 0.02, 0.5
+        return AreaChange(row.start.hour / 100, 0.02, row.start.hour / 50, 0.03, 0.5)
 
 
 @pytest.fixture
@@ -67,6 +68,12 @@ def test_xarray_opens_it_with_names_times_and_numbers(series, epoch, update):
     assert file.mean_change_uncertainty.values == pytest.approx(0.02)
     assert file.volume_change_uncertainty.values[0] == pytest.approx([400.0, 2.0])
     assert (file.coverage == 0.5).all()
+    assert file.median_change.values[:, 0].tolist() == [0.02, 0.04, 0.06]
+    assert file.median_change_uncertainty.values == pytest.approx(0.03)
+    assert file.mean_change_low.values[0] == pytest.approx(0.01 - 1.96 * 0.02, abs=1e-6)  # 95 % of a normal
+    assert file.mean_change_high.values[0] == pytest.approx(0.01 + 1.96 * 0.02, abs=1e-6)
+    assert file.median_change_high.values[1] == pytest.approx(0.04 + 1.96 * 0.03, abs=1e-5)
+    assert file.volume_change_low.values[0] == pytest.approx([200 - 1.96 * 400, 1 - 1.96 * 2], abs=0.05)
     assert file.mean_change.set_xindex("area_name").sel(area_name="gate").values[1] == 0.02
     assert file.epoch_file.values[2] == "hef_20251121T030000Z.nc"
     assert file.reference_version.values.tolist() == ["1"] * 3
@@ -146,16 +153,16 @@ def test_before_there_was_a_reference_all_is_missing(series, epoch, update, told
     write(series, epoch, 2)
     file = opened(update())
     assert {name for name, _ in told.asked} == {"hef_20251121T020000Z.nc"}
-    for name in ("mean_change", "mean_change_uncertainty", "volume_change", "coverage"):
+    for name in ("mean_change", "mean_change_uncertainty", "median_change_low", "volume_change", "coverage"):
         assert np.isnan(file[name].values[0]).all()
         assert np.isfinite(file[name].values[1]).all()
 
 
 def test_unseen_areas_and_areas_beside_the_grid(series, epoch, update, areas):
     class Blind:
-        def mean_change(self, cells, _row):
+        def area(self, cells, _row):
             assert cells.any()
-            return np.nan, np.nan, 0.0
+            return AreaChange(np.nan, np.nan, np.nan, np.nan, 0.0)
 
     write(series, epoch, 1)
     file = opened(update({**areas, "beside": np.zeros(series.grid.shape, bool)}, by=Blind()))
@@ -200,7 +207,7 @@ def test_a_damaged_file_is_made_anew(series, epoch, update, damage):
 
 def test_an_aggregator_that_fails_leaves_the_old_file(series, epoch, update):
     class Failing:
-        def mean_change(self, _cells, _row):
+        def area(self, _cells, _row):
             raise StoreError("damaged")
 
     write(series, epoch, 1)

@@ -59,6 +59,19 @@ def test_a_late_scan_makes_a_new_revision_of_its_day(filled, epoch):
     assert np.all(np.diff(values(filled).time.values.astype(np.int64)) > 0)
 
 
+def test_a_day_that_lies_beside_its_month_is_left_for_the_month(filled, epoch):
+    """Where the month cannot be joined, for a scan from another place, it must not be made anew each time."""
+    join_closed(filled, MONTH_AFTER, lambda: None)
+    store.write_epoch(filled, epoch(5, value=0.5))
+    elsewhere = Shared(("heading",), ("rad",), np.zeros(1), np.eye(1), np.zeros(1))
+    store.write_epoch(filled, dataclasses.replace(epoch(25), shared=elsewhere))
+    build_series(filled)
+    before = values(filled)
+    made = [join_closed(filled, MONTH_AFTER, lambda: None) for _ in range(4)]
+    assert made == [1, 0, 0, 0]
+    assert values(filled).identical(before)
+
+
 def test_parts_go_only_after_the_grace(filled):
     before = values(filled)
     now = datetime.now(UTC)

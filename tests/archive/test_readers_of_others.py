@@ -14,6 +14,7 @@ import pytest
 import xarray as xr
 
 from station.archive import reference, store
+from station.archive.aggregate import AreaChange
 from station.archive.areas import update_areas
 from station.archive.join import join_closed
 from station.archive.series import build_series
@@ -133,8 +134,8 @@ def test_gdal_knows_place_and_direction(built):
 
 
 class Told:
-    def mean_change(self, cells, _row):
-        return (0.25, 0.125, 0.5) if cells.all() else (np.nan, np.nan, 0.0)
+    def area(self, cells, _row):
+        return AreaChange(*((0.25, 0.125, 0.2, 0.2, 0.5) if cells.all() else (*[np.nan] * 4, 0.0)))
 
 
 @pytest.fixture

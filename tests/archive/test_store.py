@@ -105,6 +105,24 @@ def test_empty_chunks_are_not_written(series, epoch):
         assert file["elevation_change"].chunks == (1, 128, 128)
 
 
+def test_a_power_cut_between_the_names_of_a_reference_is_mended(series):
+    for version in ("1", "2"):
+        elevation = np.full(series.grid.shape, 2900.0 + float(version))
+        given = Reference.given(series.grid, version, elevation, elevation > 0)
+        reference.write_reference(series, given)
+    named = series.folder / "reference.nc"
+    for kept in ("1", None):
+        named.unlink()
+        if kept:
+            os.link(series.folder / f"reference_{kept}.nc", named)
+            os.utime(named, ns=(1, 1))
+        reference.settle_reference(series)
+        assert reference.read_reference(series).version == "2"
+    written_ns = named.stat().st_ctime_ns
+    reference.settle_reference(series)
+    assert named.stat().st_ctime_ns == written_ns
+
+
 def test_the_reference_comes_back_and_its_versions_stay(series):
     elevation = np.full(series.grid.shape, 2900.125)
     elevation[:5] = np.nan
@@ -207,11 +225,13 @@ def keep_writing(series, epoch):
 def test_kill_at_any_moment_leaves_a_whole_series(series, epoch):
     fork = multiprocessing.get_context("fork")
     rng = np.random.default_rng(20251121)
+    begun_s = time.monotonic()
     build(series, epoch, [0])
+    pace_s = time.monotonic() - begun_s  # of this machine, today
     for _ in range(30):
         child = fork.Process(target=keep_writing, args=(series, epoch))
         child.start()
-        time.sleep(rng.uniform(0.01, 0.3))
+        time.sleep(rng.uniform(0.1, 3.0) * pace_s)
         os.kill(child.pid, signal.SIGKILL)
         child.join()
         with station.open(series.folder) as told:

@@ -49,6 +49,16 @@ def test_dialects_of_the_header(tmp_path, text):
     assert np.degrees(log.roll_rad) == pytest.approx([0.1, 0.1])
 
 
+def test_a_time_of_another_day_is_a_bad_row(tmp_path):
+    rows = [f"{second},0.1,0.2" for second in range(40, 60)]
+    rows[7], rows[19] = "9e17,0.1,0.2", "-90000,0.1,0.2"
+    (tmp_path / "s-incl.txt").write_text("\n".join(["Time,Roll,Pitch", *rows, ""]))
+    log = read_inclination(tmp_path / "s-incl.txt")
+    assert np.flatnonzero(np.isnan(log.time_s)).tolist() == [7, 19]
+    assert np.isnan(log.roll_rad[7])
+    assert log.time_s[-2] == 58
+
+
 def test_half_a_number_is_not_taken_for_a_whole_one(tmp_path):
     log = read_inclination(written(tmp_path, "Time,Roll,Pitch\n1,0.1,-0.275\n2,0.1,-0.2"))
     assert log.time_s == pytest.approx([1, np.nan], nan_ok=True)

@@ -7,9 +7,17 @@ from importlib.metadata import EntryPoint
 import numpy as np
 import pytest
 
-from station.errors import ScanError
+from station.errors import NotReadyError, ScanError
 from station.readers import scan
-from station.readers.scan import TimeKind, gps_seconds, gps_to_utc, open_scan, time_kind, utc_interval
+from station.readers.scan import (
+    TimeKind,
+    gps_seconds,
+    gps_to_utc,
+    open_scan,
+    require_begun,
+    time_kind,
+    utc_interval,
+)
 
 NAMED = "%y%m%d_%H%M%S"
 START = datetime(2024, 10, 1, 12, 0, 0, tzinfo=UTC)
@@ -123,6 +131,24 @@ def test_a_name_that_contradicts_gps_is_refused(write_scan, name, hint):
     with (
         open_scan(made(write_scan, name, START_STANDARD_S)) as reader,
         pytest.raises(ScanError, match=hint),
+    ):
+        utc_interval(reader, NAMED)
+
+
+def test_a_scan_from_the_future_is_held_back():
+    now_s = START.timestamp()
+    require_begun(START, now_s)
+    require_begun(START + timedelta(minutes=14), now_s)  # clocks differ, and names are rounded
+    with pytest.raises(NotReadyError, match=r"begins at 2024-10-01 12:16:00 UTC, 0:16:00 ahead of this"):
+        require_begun(START + timedelta(minutes=16), now_s)
+
+
+def test_time_stamps_that_no_calendar_reaches_are_refused(write_scan):
+    points_m, time_s = np.random.default_rng(0).normal(size=(3, 100)), times(40.0)
+    time_s[-1] = 1e300
+    with (
+        open_scan(write_scan("241001_120000.laz", points_m, time_s)) as reader,
+        pytest.raises(ScanError, match="no scan lasts so long"),
     ):
         utc_interval(reader, NAMED)
 

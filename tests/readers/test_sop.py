@@ -72,6 +72,16 @@ def test_what_is_no_pose_is_explained(tmp_path, rotation, last, reason):
         read_matrix(written(tmp_path, rotation, last=last))
 
 
+@pytest.mark.parametrize("value", ["1e200", "-1e300", "2e8"])
+@pytest.mark.parametrize("place", [0, 3])
+def test_what_overflows_is_refused(tmp_path, value, place):
+    rows = np.eye(4).astype(str)
+    rows[0, place] = value
+    (tmp_path / "sop.dat").write_text("\n".join(" ".join(row) for row in rows))
+    with pytest.raises(ConfigError, match="beyond any map"):
+        read_matrix(tmp_path / "sop.dat")
+
+
 def test_a_transposed_matrix_is_recognised(tmp_path):
     matrix = np.eye(4)
     matrix[:3, :3], matrix[:3, 3] = TURN, (1, 2, 3)

@@ -45,6 +45,15 @@ def kill(number, _progress):
     time.sleep(10)
 
 
+def killed_times(times, note, _progress):
+    with Path(note).open("ab") as count:
+        count.write(b".")
+    size = Path(note).stat().st_size
+    if size <= times:
+        os.kill(os.getpid(), signal.SIGKILL)
+    return size - 1
+
+
 def abort(_progress):
     os.abort()
 

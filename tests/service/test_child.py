@@ -27,6 +27,11 @@ def tasks(monkeypatch):
     return child_tasks
 
 
+@pytest.fixture(autouse=True)
+def hurry(monkeypatch):
+    monkeypatch.setattr(child, "PAUSES_S", (0.01, 0.01))
+
+
 def run(task, *args, memory_gb=1.0, timeout_s=20.0, **hooks):
     return child.run(task, *args, memory_gb=memory_gb, timeout_s=timeout_s, **hooks)
 
@@ -66,10 +71,33 @@ def test_the_memory_is_the_scans_own(tasks):
         run(tasks.allocate, 1.1, memory_gb=1.0)
 
 
-@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGABRT, signal.SIGSEGV, signal.SIGTERM])
-def test_a_death_by_signal_says_which(tasks, number):
-    with pytest.raises(ScanError, match=number.name):
+@pytest.mark.parametrize(
+    ("number", "fault"),
+    [
+        (signal.SIGABRT, ScanError),
+        (signal.SIGSEGV, ScanError),
+        (signal.SIGKILL, NotReadyError),  # no decoder does that: the machine is out of memory
+        (signal.SIGTERM, NotReadyError),
+    ],
+)
+def test_a_death_by_signal_says_which(tasks, number, fault):
+    with pytest.raises(fault, match=number.name):
         run(tasks.kill, number)
+
+
+def test_a_child_killed_once_or_twice_is_started_again(tasks, tmp_path):
+    assert run(tasks.killed_times, 2, str(tmp_path / "count")) == 2
+    with pytest.raises(NotReadyError, match="SIGKILL"):
+        run(tasks.killed_times, 9, str(tmp_path / "other"))
+    assert (tmp_path / "other").stat().st_size == 3
+
+
+def test_a_stop_ends_the_pause_before_the_next_try(tasks, tmp_path, monkeypatch):
+    monkeypatch.setattr(child, "PAUSES_S", (60.0,))
+    until_s = time.monotonic() + 1.0
+    with pytest.raises(NotReadyError, match="stopped"):
+        run(tasks.killed_times, 9, str(tmp_path / "count"), should_stop=lambda: time.monotonic() > until_s)
+    assert time.monotonic() < until_s + 10.0
 
 
 @pytest.mark.parametrize(

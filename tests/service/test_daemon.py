@@ -250,6 +250,7 @@ def test_a_full_disk_is_waited_out(write_site, start):
     (path.parent / "data" / "full").unlink()
     wait_for(lambda: stored(path) == [FIRST])
     wait_for(lambda: 'service="goes on"' in service.log())
+    assert did(path).count("recover") > 1  # what was broken off between file and journal is made to agree
 
 
 def test_a_second_service_on_the_same_data_is_refused(write_site, start):

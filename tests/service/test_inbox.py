@@ -126,6 +126,25 @@ def test_only_what_changed_is_taken_again(make_inbox, drop, journal):
     assert journal.entry(FIRST).state is State.WAITING
 
 
+def test_a_scan_to_be_done_again_goes_before_later_ones(make_inbox, drop, clock, journal):
+    """Else what is made of the first scans would depend on when they were done again."""
+    inbox = make_inbox()
+    drop(FIRST)
+    inbox.look()
+    clock.forward(60)
+    journal.stored(
+        inbox.look().first.name, sha256="0", verdict="good", epoch="e", start_utc_s=0.0, revision=1
+    )
+    drop(SECOND)
+    for anew in (inbox, make_inbox()):  # also after a restart
+        anew.look()
+        clock.forward(60)
+        assert anew.look().first.name == SECOND
+        journal.again([FIRST])
+        assert anew.look().first.name == FIRST
+        journal.stored(FIRST, sha256="0", verdict="good", epoch="e", start_utc_s=0.0, revision=1)
+
+
 def test_later_is_not_taken_before_its_time(make_inbox, drop, clock, journal):
     inbox = make_inbox(settle_s=0)
     drop(FIRST)

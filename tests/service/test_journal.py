@@ -241,3 +241,17 @@ def test_what_was_acknowledged_survives_twenty_kills(tmp_path):
     check = sqlite3.connect(path)
     assert check.execute("PRAGMA integrity_check").fetchall() == [("ok",)]
     check.close()
+
+
+@pytest.mark.parametrize("content", [b"", None])
+def test_a_journal_that_has_only_just_begun_is_empty_to_its_readers(tmp_path, content):
+    """As a service leaves it that was killed in its first moment: without a table, or without a byte."""
+    path = tmp_path / "journal.sqlite"
+    if content is None:
+        rows = sqlite3.connect(path)
+        rows.execute("PRAGMA journal_mode = WAL")
+        rows.close()
+    else:
+        path.write_bytes(content)
+    with Journal(path, read_only=True) as reader:
+        assert reader.rows() == []

@@ -1,0 +1,201 @@
+"""Maps of the recent epochs as files: which are kept, and those that lack are drawn."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import time
+import zipfile
+from collections.abc import Callable
+from dataclasses import dataclass
+from datetime import datetime, timedelta
+from pathlib import Path
+
+import numpy as np
+from PIL import Image
+
+from station import __version__
+from station.archive.layout import Series, written_whole
+from station.archive.store import Row
+from station.products.colours import round_up
+from station.products.look import Base, base_of, look_at
+from station.products.maps import Caption, change_map, encoded, points_map, sigma_map
+from station.quantities import Grid
+
+ALL_FOR = timedelta(days=2)  # before the newest epoch; then the last map of each day …
+DAILY_FOR = timedelta(days=60)  # … and before that the last of each month
+MOST_DRAWN = 8  # at a time: an archive that was there before the page is shown bit by bit
+GRACE_S = 3600.0  # a page that is open somewhere may still name a map that is kept no longer
+SIGMAS_TO_THE_END = 10.0
+
+
+@dataclass(frozen=True)
+class Style:
+    """How maps are drawn; maps of another style are drawn anew."""
+
+    station: str
+    width_px: int
+    limit_m: float | None  # None: fixed once, by the first epoch that is drawn
+
+
+@dataclass(frozen=True)
+class Hung:
+    """A map that is there, relative to the gallery's folder."""
+
+    start: datetime
+    file: str
+
+
+@dataclass(frozen=True)
+class Gallery:
+    """What there is to show: change by time, and for the newest epoch what goes with it."""
+
+    change: list[Hung]
+    sigma: str | None
+    points: str | None
+    limit_m: float | None
+    size: tuple[int, int]  # of a map [pixels]
+
+
+def hang(
+    series: Series,
+    folder: Path,
+    found: list[tuple[Row, str, str]],
+    style: Style,
+    progress: Callable[[], None],
+) -> Gallery:
+    """Draw the maps that lack, newest first, and take down those that are kept no longer.
+
+    `found` are the epochs that have a reference, in the order of time: row, its version, what the caption
+    says of its verdict. Raises StoreError where something cannot be read or written.
+    """
+    if not found:
+        return Gallery([], None, None, style.limit_m, (0, 0))
+    limit_m = style.limit_m or _limit(series, folder, found[0])
+    told = json.dumps([style.station, style.width_px, limit_m, __version__])
+    tag = hashlib.sha256(told.encode()).hexdigest()[:8]
+    place = folder / "maps"
+    kept = [found[index] for index in thinned([row.start for row, _, _ in found])]
+    drawn, hung = 0, []
+    for row, version, verdict in reversed(kept):
+        name = f"{Path(row.epoch_file).stem}_{tag}.webp"
+        last = row is found[-1][0]
+        if not all((place / one).is_file() for one in _names(name, last=last)):
+            if drawn == MOST_DRAWN:
+                continue
+            caption = Caption(style.station, f"{row.start:%Y-%m-%d %H:%M} UTC", verdict)
+            _draw(series, folder, row, version, caption, style.width_px, limit_m, name, last=last)
+            drawn += 1
+            progress()
+        hung.append(Hung(row.start, f"maps/{name}"))
+    hung.reverse()
+    _, sigma, points = _names(Path(hung[-1].file).name, last=True)
+    _take_down(place, {Path(one.file).name for one in hung} | {sigma, points})
+    with Image.open(folder / hung[-1].file) as picture:
+        return Gallery(hung, f"maps/{sigma}", f"maps/{points}", limit_m, picture.size)
+
+
+def _names(name: str, *, last: bool) -> tuple[str, ...]:
+    """Return the files of an epoch: its change, and for the newest its sigma and points."""
+    stem = name.removesuffix(".webp")
+    return (name, f"{stem}_sigma.webp", f"{stem}_points.webp") if last else (name,)
+
+
+def thinned(starts: list[datetime]) -> list[int]:
+    """Return which of some moments, in their order, are kept: fewer the older they are."""
+    newest = starts[-1]
+    kept: dict[object, int] = {}
+    for index, start in enumerate(starts):
+        if newest - start <= ALL_FOR:
+            kept[start] = index
+        elif newest - start <= DAILY_FOR:
+            kept[start.date()] = index
+        else:
+            kept[(start.year, start.month)] = index
+    return sorted(kept.values())
+
+
+def _draw(
+    series: Series,
+    folder: Path,
+    row: Row,
+    version: str,
+    caption: Caption,
+    width_px: int,
+    limit_m: float,
+    name: str,
+    *,
+    last: bool,
+) -> None:
+    look = look_at(row, kept_base(series, folder, version, width_px), points=last)
+    pictures = [change_map(look, caption, limit_m, width_px, "the reference")]
+    if last:
+        pictures += [sigma_map(look, caption, limit_m, width_px), points_map(look, caption, width_px)]
+    for file, picture in zip(_names(name, last=last), pictures, strict=True):
+        put(folder / "maps" / file, encoded(picture))
+
+
+def put(path: Path, content: bytes) -> None:
+    """Replace a file as a whole; one that is the same already is left as it is."""
+    try:
+        if path.read_bytes() == content:
+            return
+    except OSError:
+        pass
+    with written_whole(path) as beside:
+        beside.write_bytes(content)
+
+
+def kept_base(series: Series, folder: Path, version: str, pixels: int) -> Base:
+    """Return the base of a reference's version; kept beside the maps it takes half a second off each."""
+    path = folder / f".terrain_{version}_{pixels}.npz"
+    grid = series.grid
+    try:
+        with path.open("rb") as raw, np.load(raw, allow_pickle=False) as file:
+            if np.array_equal(file["grid"], [grid.west_m, grid.north_m, grid.cell_m, grid.nx, grid.ny]):
+                top, bottom, left, right, factor = (int(n) for n in file["part"])
+                west_m, north_m, cell_m = (float(n) for n in file["place"])
+                shade = np.where(file["shade"] == 0, np.float32(np.nan), (file["shade"] - 1.0) / 254.0)
+                ny, nx = shade.shape
+                part = Grid(west_m, north_m, cell_m, nx, ny)
+                rows, columns = slice(top, bottom), slice(left, right)
+                return Base(version, factor, rows, columns, shade.astype(np.float32), part)
+    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile):
+        pass  # not there yet, or damaged: made anew
+    base = base_of(series, version, pixels)
+    shade = np.where(np.isfinite(base.shade), 1 + 254 * np.nan_to_num(base.shade), 0).round().astype(np.uint8)
+    with written_whole(path) as beside, beside.open("wb") as file:
+        np.savez_compressed(
+            file,
+            grid=[grid.west_m, grid.north_m, grid.cell_m, grid.nx, grid.ny],
+            part=[base.rows.start, base.rows.stop, base.columns.start, base.columns.stop, base.factor],
+            place=[base.grid.west_m, base.grid.north_m, base.grid.cell_m],
+            shade=shade,
+        )
+    return base
+
+
+def _limit(series: Series, folder: Path, first: tuple[Row, str, str]) -> float:
+    """Return where the colours of change end [m]: fixed once, by the first epoch there is then."""
+    path = folder / "limit.json"
+    try:
+        return float(json.loads(path.read_text(encoding="ascii"))["change_limit_m"])
+    except (OSError, ValueError, KeyError, TypeError):
+        pass
+    limit_m = default_limit(series, *first[:2])
+    put(path, json.dumps({"change_limit_m": limit_m}).encode("ascii"))
+    return limit_m
+
+
+def default_limit(series: Series, row: Row, version: str) -> float:
+    """Return ten times the median sigma of an epoch's cells [m], rounded up."""
+    look = look_at(row, base_of(series, version, max(series.grid.shape)))
+    if not look.seen.any():
+        return 1.0
+    return round_up(SIGMAS_TO_THE_END * float(np.median(look.sigma_m[look.seen])))
+
+
+def _take_down(place: Path, kept: set[str]) -> None:
+    for path in place.glob("*.webp"):
+        if path.name not in kept and time.time() - path.stat().st_mtime > GRACE_S:
+            path.unlink(missing_ok=True)

@@ -1,0 +1,61 @@
+"""Tables of features as people write them."""
+
+import numpy as np
+import pytest
+
+from station.errors import ConfigError
+from station.readers.features import read_features
+
+HEAD = "name,x,y,z,ref_x,ref_y,ref_z,normal_x,normal_y,normal_z,sigma\n"
+
+
+def written(tmp_path, text):
+    path = tmp_path / "features.csv"
+    path.write_text(text, encoding="utf-8")
+    return path
+
+
+def test_points_and_planes(tmp_path):
+    told = read_features(
+        written(
+            tmp_path,
+            "# survey of May\n\n" + HEAD + "hut,1.5,-2,3,635000.25,5185000,3000,,,,0.01\n"
+            "roof , 4,5,6, 635001,5185001,3001, 0,0,2, 0.02  # pitched\n",
+        )
+    )
+    assert told.names == ("hut", "roof")
+    assert told.scan_m.tolist() == [[1.5, -2, 3], [4, 5, 6]]
+    assert told.reference_m[0].tolist() == [635000.25, 5185000, 3000]
+    assert told.normal.tolist() == [[0, 0, 0], [0, 0, 1]]
+    assert told.is_plane.tolist() == [False, True]
+    assert told.sigma_m.tolist() == [0.01, 0.02]
+
+
+def test_columns_in_any_order_and_without_what_is_optional(tmp_path):
+    told = read_features(written(tmp_path, "\ufeffSigma, Z, Y, X, ref_z, ref_y, ref_x\n0.1,3,2,1,6,5,4\n"))
+    assert np.concatenate([told.scan_m, told.reference_m], axis=1).tolist() == [[1, 2, 3, 4, 5, 6]]
+    assert told.names == ("feature_1",)
+
+
+@pytest.mark.parametrize(
+    ("text", "reason"),
+    [
+        ("", "lacking x, y, z, ref_x, ref_y, ref_z, sigma"),
+        ("x,y,z,ref_x,ref_y,ref_z,sigma,colour\n", "not known colour"),
+        (HEAD, "holds no feature"),
+        (HEAD + "# none\nhut,1,2,three,4,5,6,,,,1\n", "line 3: z is 'three', no number"),
+        (HEAD + "hut,1,2,3,4,5\n", "line 2: ref_z is '', no number"),
+        (HEAD + "hut,1,2,3,4,5,6,,,,nan\n", "line 2: sigma is 'nan', no number"),
+        (HEAD + "hut,1,2,3,4,5,6,,,,0\n", r"line 2 \(hut\): sigma must be more than 0"),
+        (HEAD + "hut,1,2,3,4,5,6,1,,,1\n", "line 2: normal_y is '', no number"),
+        (HEAD + "hut,1,2,3,4,5,6,0,0,0,1\n", r"line 2 \(hut\): the normal has no length"),
+    ],
+)
+def test_what_is_wrong_is_said(tmp_path, text, reason):
+    with pytest.raises(ConfigError, match=reason):
+        read_features(written(tmp_path, text))
+
+
+def test_a_file_that_is_none(tmp_path):
+    with pytest.raises(ConfigError, match="cannot be read"):
+        read_features(tmp_path / "nowhere.csv")
