@@ -88,11 +88,8 @@ class Daemon:
         self._heart = Heart()
         # SimpleQueue, because its put() may be called from a signal handler while get() waits.
         self._wakes: SimpleQueue[Wake] = SimpleQueue()
-        self._due = {
-            Wake.EXPECTED,
-            Wake.JOIN,
-            Wake.SWEEP,
-        }  # a station that is never up at night has them done at start
+        # Housekeeping too: a station that is never up at night has it done at start.
+        self._due = {Wake.EXPECTED, Wake.JOIN, Wake.SWEEP}
         self._stop_s = math.inf  # when a running scan is given up
         self._pauses = 0  # faults in a row
         self._looked_s = -math.inf
