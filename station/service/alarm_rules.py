@@ -5,6 +5,7 @@ Asked by a process of its own, beside the service or without one: a dead service
 
 from __future__ import annotations
 
+import logging
 import shutil
 from collections.abc import Callable, Iterator
 from datetime import UTC, datetime
@@ -14,12 +15,17 @@ import numpy as np
 
 from station.config import AlarmsSection, ChangeAlarm, Site
 from station.errors import StationError, StoreError
+from station.readers.scan import suffixes
 from station.science.onset import Onsets, onsets, threshold_sigmas
 from station.service.alarm_memory import Alarm
 from station.service.area_series import Curve, read_curves
 from station.service.health import need_room
+from station.service.inbox import is_scan, list_folder, quoted
 from station.service.journal import Entry, Journal, State
 from station.service.lock import in_use
+from station.service.logs import logfmt
+
+log = logging.getLogger("station")
 
 YEAR_S = 365.25 * 86400
 DAY_S = 86400.0
@@ -44,6 +50,9 @@ def alarms_of(site: Site, *, since_utc_s: float, judged_utc_s: float | None, now
             found.extend(answer())
         except (StationError, OSError) as error:
             found.append(Alarm(f"unknown {rule}", f"whether {rule} cannot be told: {error}"))
+        except Exception as bug:  # one broken rule must not silence the others
+            log.exception(logfmt(rule=rule, reason="a bug: please report it"))
+            found.append(Alarm(f"unknown {rule}", f"whether {rule} cannot be told: a bug: {bug!r}"[:500]))
 
     ask("the service works", lambda: _service(site, rules, since_utc_s, now_s))
     ask("the disk has room", lambda: _disk(site, rules))
@@ -60,15 +69,14 @@ def _service(site: Site, rules: AlarmsSection, since_utc_s: float, now_s: float)
         yield Alarm("service", "the service is not running", patience_s=RESTART_S)
     if not (site.station.data / "journal.sqlite").is_file():
         return
-    span_s = max(DAY_S, rules.no_scan_h * 3600, rules.stalled_h * 3600)
+    span_s = max(DAY_S, rules.no_scan_h * 3600)
     with Journal(site.station.data / "journal.sqlite", read_only=True) as journal:
         recent = journal.changed_since(now_s - span_s)
         newest = journal.newest(NEWEST)
-        waiting = [row for row in journal.waiting() if row.state is State.WAITING]
     yield from _silence(rules, recent, since_utc_s, now_s)
-    yield from _stall(rules, recent, waiting, now_s)
     yield from _set_aside(rules, recent, now_s)
     yield from _honesty(rules, newest)
+    yield from _stall(site, rules, now_s)
 
 
 def _silence(rules: AlarmsSection, recent: list[Entry], since_utc_s: float, now_s: float) -> Iterator[Alarm]:
@@ -84,11 +92,19 @@ def _silence(rules: AlarmsSection, recent: list[Entry], since_utc_s: float, now_
     yield Alarm("no scan", f"no scan stored for {rules.no_scan_h:g} h: {why}")
 
 
-def _stall(rules: AlarmsSection, recent: list[Entry], waiting: list[Entry], now_s: float) -> Iterator[Alarm]:
+def _stall(site: Site, rules: AlarmsSection, now_s: float) -> Iterator[Alarm]:
+    """Tell of scans that nobody has touched while nothing else was done either."""
     from_s = now_s - rules.stalled_h * 3600
-    stuck = [row for row in waiting if row.seen_utc_s < from_s and not row.waits_for]
-    if rules.stalled_h and stuck and not any(row.changed_utc_s >= from_s for row in recent):
-        text = f"{len(stuck)} scans wait, but none was touched for {rules.stalled_h:g} h: the service stalls"
+    with Journal(site.station.data / "journal.sqlite", read_only=True) as journal:
+        if not rules.stalled_h or journal.changed_since(from_s):
+            return
+        waiting = [row for row in journal.waiting() if row.state is State.WAITING]
+        known = journal.glimpses()
+    stuck = sum(row.seen_utc_s < from_s and not row.waits_for for row in waiting)
+    for name, file in list_folder(site.scans.inbox).items():  # since when it is there: its mtime may be older
+        stuck += is_scan(name, suffixes()) and quoted(name) not in known and file.st_ctime < from_s
+    if stuck:
+        text = f"{stuck} scans wait, but none was touched for {rules.stalled_h:g} h: the service stalls"
         yield Alarm("stalled", text)
 
 

@@ -85,6 +85,7 @@ class Rows:
 
     def __init__(self, site):
         self.now_s = NOW_S
+        self.inbox = site.scans.inbox
         self.journal = Journal(site.station.data / "journal.sqlite", now_s=lambda: self.now_s)
 
     def add(self, hour, *, verdict="good", waits="", **figures):
@@ -157,6 +158,13 @@ def test_a_dead_service_is_noticed_and_one_that_stalls(station_at):
     assert "1 scans wait" in ask(3.1)["stalled"]
     rows.add(3)
     assert ask(3.1) == {}
+    # One that never saw the inbox: its files are there by the true clock.
+    inbox = rows.inbox
+    (inbox / "later.laz").write_bytes(b"")
+    came_hour = ((inbox / "later.laz").stat().st_ctime - NOW_S) / HOUR_S
+    rows.add(came_hour + 0.1)
+    assert ask(came_hour + 0.9) == {}
+    assert "2 scans wait" in ask(came_hour + 1.2)["stalled"]  # that, and scan2
 
 
 def test_the_share_set_aside(station_at):
@@ -226,6 +234,26 @@ def test_a_dead_target_neither_stops_the_others_nor_loses_a_word(
     with only_writer(site.station.data):
         assert alarms.look(site, now_s=lambda: NOW_S + 4 * HOUR_S) == 0
     assert len(webhook.came) == before
+
+
+def test_a_rule_with_a_bug_leaves_the_others(station_at, monkeypatch):
+    _, ask = station_at(only("stalled_h = 1"))
+    monkeypatch.setattr(alarm_rules, "in_use", lambda _: 1 / 0)
+    monkeypatch.setattr(alarm_rules.shutil, "disk_usage", lambda _: SimpleNamespace(free=-1))
+    told = ask(0)
+    assert "ZeroDivisionError" in told["unknown the service works"]
+    assert "disk" in told
+
+
+def test_two_at_once_do_not_tell_twice(make_site, credentials, webhook):
+    site = make_site(more=f'[alarms]\ntargets = ["hook"]\n{only("disk_gb = 1e9")}')
+    credentials(hook=webhook.url)
+    with alarms._alone(site.station.data) as is_alone:
+        assert is_alone
+        assert alarms.look(site) == 0
+    assert webhook.came == []
+    assert alarms.look(site) == 0
+    assert len(webhook.came) == 1
 
 
 def test_a_test_message_says_which_target_failed(make_site, credentials, webhook):
