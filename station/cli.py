@@ -460,8 +460,9 @@ def alarms_look(site: SiteArgument) -> None:
     """
     from station.config import read_site
     from station.service.alarms import look
+    from station.service.targets import leave
 
-    sys.exit(look(read_site(site), tell=print))
+    leave(look(read_site(site), tell=print))
 
 
 @alarms_app.command("test")
@@ -472,8 +473,9 @@ def alarms_test(site: SiteArgument) -> None:
     """
     from station.config import read_site
     from station.service.alarms import test
+    from station.service.targets import leave
 
-    sys.exit(test(read_site(site), print))
+    leave(test(read_site(site), print))
 
 
 @app.callback(invoke_without_command=True)

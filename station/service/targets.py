@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import logging
 import os
+import sys
 import threading
 import time
 from pathlib import Path
+from typing import NoReturn
 
 from station.errors import ConfigError
 from station.service.logs import logfmt
@@ -78,3 +80,10 @@ def send(messages: dict[str, tuple[str, str]], *, patience_s: float = PATIENCE_S
     for target, why in lost.items():
         log.error(logfmt(target=target, reason=why))
     return lost
+
+
+def leave(status: int) -> NoReturn:
+    """End the process now: apprise's own threads would hold it until the last target has answered."""
+    sys.stdout.flush()
+    sys.stderr.flush()
+    os._exit(status)

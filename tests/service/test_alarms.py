@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 import time
 from types import SimpleNamespace
 
@@ -267,6 +269,18 @@ def test_a_test_message_says_which_target_failed(make_site, credentials, webhook
     assert [title for title, _ in webhook.came] == ["[station test] test"]
     good = make_site(more='[alarms]\ntargets = ["good"]\n')
     assert alarms.test(good, told.append) == 0
+
+
+def test_a_target_that_never_answers_does_not_hold_the_process():
+    """As apprise does: work in a pool of threads, which Python waits for when it ends."""
+    hangs = (
+        "import time; from concurrent.futures import ThreadPoolExecutor; from station.service import targets;"
+        "ThreadPoolExecutor().submit(time.sleep, 60); print('told'); targets.leave(1)"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", hangs], capture_output=True, text=True, check=False, timeout=40
+    )
+    assert (done.returncode, done.stdout) == (1, "told\n")
 
 
 def test_secrets_are_not_told(make_site, credentials, capfd):
