@@ -555,6 +555,41 @@ def _plain(found: object) -> object:
     return None if isinstance(found, float) and not math.isfinite(found) else found
 
 
+alarms_app = typer.Typer(
+    help="Tell people what is wrong; try whether they could be told.",
+    no_args_is_help=True,
+    rich_markup_mode=None,
+)
+app.add_typer(alarms_app, name="alarms")
+
+
+@alarms_app.command("look")
+def alarms_look(site: SiteArgument) -> None:
+    """Ask the rules of [alarms], now, and tell what is new, still so or over.
+
+    Runs every few minutes by a timer, beside the service. Exits with 1 if a target could not be reached: it
+    is told the next time.
+    """
+    from station.config import read_site
+    from station.service.alarms import look
+    from station.service.targets import leave
+
+    leave(look(read_site(site), tell=print))
+
+
+@alarms_app.command("test")
+def alarms_test(site: SiteArgument) -> None:
+    """Send a test message by every target and say which failed.
+
+    Exits with 1 if one did.
+    """
+    from station.config import read_site
+    from station.service.alarms import test
+    from station.service.targets import leave
+
+    leave(test(read_site(site), print))
+
+
 @app.callback(invoke_without_command=True)
 def _version(
     version: Annotated[bool, typer.Option("--version", help="Print the version.", is_eager=True)] = False,

@@ -12,6 +12,7 @@ import json
 import math
 import tomllib
 from datetime import UTC, datetime
+from ipaddress import ip_address
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -274,10 +275,52 @@ class RetentionSection(Section):
         return self
 
 
+def _on_loopback(address: str) -> str:
+    host, _, port = address.rpartition(":")
+    try:
+        is_loopback = host == "localhost" or ip_address(host.strip("[]")).is_loopback
+        is_port = 0 < int(port) < 65536
+    except ValueError:
+        is_loopback = is_port = False
+    if not (is_loopback and is_port):
+        raise ValueError('give an address of this machine alone and a port: "127.0.0.1:9750"')
+    return address
+
+
 class ServiceSection(Section):
     """The running service."""
 
     memory_gb: Annotated[float, Field(ge=0.5, le=1024)] = 5.0
+    metrics: Annotated[str, AfterValidator(_on_loopback)] | None = None
+    metrics_file: Path | None = None
+
+
+Target = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_-]{0,63}$")]
+
+
+class ChangeAlarm(Section):
+    """What change of an area is worth an alarm."""
+
+    areas: tuple[str, ...] = ()  # none named: all
+    within_h: Positive = 6.0
+    least_m: NotNegative = 0.0
+    scans: Annotated[int, Field(ge=1, le=24)] = 2
+    false_alarms_per_year: Positive = 1.0
+
+
+class AlarmsSection(Section):
+    """What people are told of, and by which targets: names of credentials. 0 switches a rule off."""
+
+    targets: tuple[Target, ...] = ()
+    digest: Target | None = None
+    repeat_h: Positive = 24.0
+    no_scan_h: NotNegative = 3.0
+    stalled_h: NotNegative = 1.0
+    disk_gb: NotNegative = 2.0
+    set_aside_share: Annotated[float, Field(ge=0, le=1)] = 0.5
+    z_std: NotNegative = 1.5
+    moved: bool = True
+    change: ChangeAlarm | None = None
 
 
 class ProductsSection(Section):
@@ -309,6 +352,7 @@ class SiteFile(Section):
     retention: RetentionSection = RetentionSection()
     service: ServiceSection = ServiceSection()
     products: ProductsSection = ProductsSection()
+    alarms: AlarmsSection | None = None
 
     @model_validator(mode="after")
     def _chain_is_complete(self) -> SiteFile:
@@ -318,6 +362,8 @@ class SiteFile(Section):
             raise ValueError("map.pop and map.origin lead to a map: say which with map.crs")
         if self.map.pop and self.map.origin and self.scans.frame == "scanner":
             raise ValueError("map.pop and map.origin are two ways to the same map: keep one")
+        if self.alarms and self.alarms.change and not self.areas:
+            raise ValueError("alarms.change needs areas: name their file in [areas]")
         return self
 
 
@@ -431,7 +477,7 @@ def _absolute(site: Site, folder: Path) -> Site:
             elif isinstance(value, Section):
                 changed[key] = settle(value)
             elif isinstance(value, tuple):
-                changed[key] = tuple(settle(one) for one in value)
+                changed[key] = tuple(settle(one) if isinstance(one, Section) else one for one in value)
         return section.model_copy(update=changed)
 
     settled = settle(site)

@@ -24,6 +24,7 @@ from station.service.jobs import Clockwork, Wake
 from station.service.journal import Journal, State
 from station.service.lock import only_writer
 from station.service.logs import log_to_stderr, logfmt
+from station.service.metrics import Metrics
 from station.service.watch import Ear
 
 if TYPE_CHECKING:
@@ -87,7 +88,8 @@ class Daemon:
         self._heart = Heart()
         # SimpleQueue, because its put() may be called from a signal handler while get() waits.
         self._wakes: SimpleQueue[Wake] = SimpleQueue()
-        self._due = {Wake.JOIN, Wake.SWEEP}  # a station that is never up at night has them done at start
+        # Housekeeping too: a station that is never up at night has it done at start.
+        self._due = {Wake.EXPECTED, Wake.JOIN, Wake.SWEEP}
         self._stop_s = math.inf  # when a running scan is given up
         self._pauses = 0  # faults in a row
         self._looked_s = -math.inf
@@ -98,6 +100,7 @@ class Daemon:
         self._journal: Journal | None = None
         self._parts: tuple[Takes, Inbox, Ear, Clockwork] | None = None
         self._is_recovered = False
+        self._metrics = Metrics(lambda: self._site)
 
     def wake(self, wake: Wake) -> None:
         """Have the loop do something as soon as the running scan is done; from any thread or signal."""
@@ -113,7 +116,7 @@ class Daemon:
     def serve(self) -> None:
         """Be the loop."""
         self._await_clock()
-        with only_writer(self._site.station.data), self._closing:
+        with only_writer(self._site.station.data), self._metrics.serving(), self._closing:
             self._closing.callback(self._let_go)
             while not self._is_stopping():
                 try:
@@ -141,6 +144,7 @@ class Daemon:
         if Wake.EXPECTED in self._due:
             self._due.discard(Wake.EXPECTED)
             self._note_silence()
+            self._metrics.write()
         self._looked_s = time.monotonic()
         listing = inbox.look()
         self._note_new(listing.new)

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 from station.errors import NotReadyError, StationError, StoreError
 from station.readers.scan import suffixes
+from station.service.alarm_memory import firing
 from station.service.inbox import is_scan, list_folder, quoted
 from station.service.journal import Entry, Journal, State
 from station.service.lock import in_use
@@ -162,6 +163,7 @@ def status(site: Site) -> Status:
         "set_aside": set_aside,
         "last": _last(last) if last else None,
         "moved": _moved(site),
+        "alarms": firing(data),
         "stale": _stale(site),
         "series": str(data / "series.nc") if (data / "series.nc").exists() else None,
         "disk_free_gb": round(shutil.disk_usage(data).free / 1e9, 2) if data.is_dir() else None,
@@ -190,6 +192,7 @@ def describe(found: Status) -> str:
     lines.append(f"disk     {f'{free:.2f} GB free' if free is not None else 'no data folder yet'}")
     lines.append(f"series   {found['series'] or 'none yet'}")
     lines += [f"moved    {found['moved']}"] if found["moved"] else []
+    lines += [f"alarm    {text}" for text in found["alarms"].values()]
     lines += [f"fault    {fault}" for fault in found["faults"]]
     for one in found["waiting"]:
         then = f", next try {one['next_try']}" if one["next_try"] else ""

@@ -320,6 +320,21 @@ class Journal:
         with self._faults():
             return {str(name): float(took) for name, took in self._rows.execute(told) if took is not None}
 
+    def changed_since(self, utc_s: float) -> list[Entry]:
+        """Return the rows with which something happened since then, by that time."""
+        return self._select("WHERE changed_utc_s >= ? ORDER BY changed_utc_s", utc_s)
+
+    def newest(self, count: int) -> list[Entry]:
+        """Return the newest scans that are stored, by their start."""
+        found = self._select("WHERE state = 'stored' ORDER BY start_utc_s DESC LIMIT ?", count)
+        return found[::-1]
+
+    def verdicts(self) -> dict[str, int]:
+        """Return how many stored scans have which verdict."""
+        told = "SELECT verdict, count(*) FROM scan WHERE state = 'stored' GROUP BY verdict"
+        with self._faults():
+            return {str(verdict): int(count) for verdict, count in self._rows.execute(told)}
+
     def counts(self) -> dict[str, int]:
         """Return how many scans stand where; every state is named."""
         with self._faults():

@@ -395,5 +395,8 @@ def _figures(epoch: store.Epoch, seconds: float) -> dict[str, float | str]:
     for figure in ("stable_nmad", "stable_z_std"):
         if np.isfinite(epoch.numbers.get(figure, np.nan)):
             told[figure] = round(epoch.numbers[figure], 3)
+    for figure, name in (("platform_roll", "roll_deg"), ("platform_pitch", "pitch_deg")):
+        if figure in epoch.numbers:
+            told[name] = round(epoch.numbers[figure], 4)
     told["seconds"] = round(seconds, 2)
     return told

@@ -14,6 +14,7 @@ from station.archive.store import series_in
 from station.config import Site
 from station.errors import ConfigError, NotReadyError, ScanError, StationError, StoreError
 from station.service import child
+from station.service.digest import write_digest, yesterday
 from station.service.inbox import Arrival
 from station.service.integrity import (
     holds_epochs,
@@ -155,9 +156,18 @@ class Worker:
             self._journal.forget_files([name])
 
     def join_closed(self) -> None:
-        """Join closed days and months."""
+        """Join closed days and months; sum up the day that is over."""
         self._mending(join_epochs)
         self.seal()
+        self._sum_up()
+
+    def _sum_up(self) -> None:
+        """Write the digest of yesterday; what fails there keeps no scan from the store."""
+        try:
+            if self.run(write_digest, yesterday(time.time())):
+                log.info("%s", logfmt(digest="written"))
+        except (StationError, RuntimeError) as error:
+            log.warning("%s", logfmt(digest="failed", reason=error))
 
     def sweep(self) -> None:
         """Delete what no longer serves, redo what came late, tell what is stale, let raw scans go."""

@@ -2,6 +2,13 @@
 
 from __future__ import annotations
 
+import json
+import socket
+import threading
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+
+import h5py
+import numpy as np
 import pytest
 
 from station.config import read_site
@@ -40,3 +47,79 @@ def write_site(tmp_path):
 @pytest.fixture
 def make_site(write_site):
     return lambda **settings: read_site(write_site(**settings))
+
+
+class Webhook:
+    """A web server that keeps what alarms bring: (title, text)."""
+
+    def __init__(self):
+        self.came = came = []
+
+        class Hook(BaseHTTPRequestHandler):
+            def do_POST(self):
+                body = json.loads(self.rfile.read(int(self.headers["Content-Length"])))
+                came.append((body["title"], body["message"]))
+                self.send_response(200)
+                self.end_headers()
+
+            def log_message(self, *_):
+                pass
+
+        self.server = ThreadingHTTPServer(("127.0.0.1", 0), Hook)
+        self.thread = threading.Thread(target=self.server.serve_forever)
+        self.thread.start()
+        self.url = f"json://127.0.0.1:{self.server.server_port}/"
+
+    def close(self):
+        self.server.shutdown()
+        self.server.server_close()
+        self.thread.join()
+
+
+@pytest.fixture
+def webhook():
+    hook = Webhook()
+    yield hook
+    hook.close()
+
+
+@pytest.fixture
+def deaf_url():
+    """Give the address of a server that takes a connection and says nothing."""
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        yield f"json://127.0.0.1:{server.getsockname()[1]}/?rto=20"
+
+
+@pytest.fixture
+def credentials(tmp_path, monkeypatch):
+    folder = tmp_path / "credentials"
+    folder.mkdir()
+    monkeypatch.setenv("CREDENTIALS_DIRECTORY", str(folder))
+
+    def write(**urls):
+        for name, url in urls.items():
+            (folder / name).write_text(f"{url}\n")
+
+    return write
+
+
+def letters(words, width):
+    return np.array([word.encode() for word in words], f"S{width}").view("S1").reshape(len(words), width)
+
+
+@pytest.fixture
+def write_series(tmp_path):
+    """Give a way to write as much of series.nc and areas.nc as alarms read; change, sigma: (times, areas)."""
+
+    def write(time_s, change_m, sigma_m, names, verdicts=None):
+        for name in ("series.nc", "areas.nc"):
+            with h5py.File(tmp_path / "data" / name, "w") as file:
+                file["time"] = time_s
+                file["epoch_file"] = letters([f"e{one:.0f}.nc" for one in time_s], 64)
+                if name == "series.nc":
+                    file["verdict"] = np.zeros(len(time_s), "i1") if verdicts is None else verdicts
+                else:
+                    file["area_name"] = letters(names, max(len(name.encode()) for name in names))
+                    file["mean_change"], file["mean_change_uncertainty"] = change_m, sigma_m
+
+    return write

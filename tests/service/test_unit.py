@@ -9,6 +9,7 @@ import subprocess
 import pytest
 
 from station.service.daemon import Pace
+from station.service.targets import PATIENCE_S
 
 UNIT = "systemd/station@.service"
 
@@ -50,3 +51,27 @@ def test_its_times_fit_those_of_the_service(unit):
     assert float(keys["WatchdogSec"]) / 3 >= Pace().period_s
     assert keys["RestartPreventExitStatus"] == "78"
     assert keys["Type"] == "notify"
+
+
+def test_alarms_are_told_by_a_unit_and_timer_of_their_own(analyze, unit):
+    """The part with a network is apart from the one that reads scans."""
+    service, timer = (unit.with_name(f"station-alarms@.{kind}") for kind in ("service", "timer"))
+    done = analyze("verify", str(service), str(timer))
+    assert (done.returncode, done.stderr) == (0, "")
+    told = analyze("security", "--offline=yes", str(service)).stdout
+    assert float(re.search(r"Overall exposure level for \S+: ([\d.]+)", told).group(1)) <= 1.5
+    limit_s = float(re.search(r"^TimeoutStartSec=(\d+)$", service.read_text(), re.MULTILINE).group(1))
+    assert limit_s > 2 * PATIENCE_S + 60  # alarms, then the digest
+
+
+def test_metrics_open_the_loopback_only(analyze, unit, tmp_path):
+    (tmp_path / "station@.service.d").mkdir()
+    opened = shutil.copy(unit, tmp_path)
+    shutil.copy(unit.with_name("metrics.conf"), tmp_path / "station@.service.d")
+    done = analyze("verify", str(opened))
+    assert (done.returncode, done.stderr) == (0, "")
+    whole = tmp_path / "whole@.service"  # without a root, systemd-analyze security reads no drop-ins
+    whole.write_text(unit.read_text().replace("[Install]", unit.with_name("metrics.conf").read_text()))
+    told = analyze("security", "--offline=yes", str(whole)).stdout
+    assert float(re.search(r"Overall exposure level for \S+: ([\d.]+)", told).group(1)) <= 1.2
+    assert re.search(r"IPAddressDeny= .*with only localhost entries", told)
