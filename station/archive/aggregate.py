@@ -39,7 +39,7 @@ class AreaChange:
 
 
 @dataclass(frozen=True)
-class _Held:
+class Held:
     """What an epoch keeps of some cells (n,)."""
 
     change_m: Floats
@@ -87,7 +87,7 @@ class Aggregates:
         """
         cells = weights != 0
         held = self._held(cells, row, other)
-        chosen = _seen(held, cells)
+        chosen = seen_in_all(held, cells)
         return self._total(held, chosen, weights[chosen], self._random(held, chosen, chosen[cells]))
 
     def area(self, cells: Bools, row: Row, other: Row | None = None) -> AreaChange:
@@ -97,7 +97,7 @@ class Aggregates:
         errors. Source: EQUATIONS 6.2; voids: Hartzell et al. (2015), see `science.voids`.
         """
         held = self._held(cells, row, other)
-        chosen = _seen(held, cells)
+        chosen = seen_in_all(held, cells)
         seen = chosen[cells]
         if not seen.any():
             return AreaChange(np.nan, np.nan, np.nan, np.nan, 0.0)
@@ -120,10 +120,10 @@ class Aggregates:
             coverage=float(seen.mean()),
         )
 
-    def _held(self, cells: Bools, row: Row, other: Row | None) -> list[_Held]:
-        return [self._read(one, cells) for one in ([row] if other is None else [row, other])]
+    def _held(self, cells: Bools, row: Row, other: Row | None) -> list[Held]:
+        return [self.read(one, cells) for one in ([row] if other is None else [row, other])]
 
-    def _random(self, held: list[_Held], chosen: Bools, seen: Bools) -> list[Floats]:
+    def _random(self, held: list[Held], chosen: Bools, seen: Bools) -> list[Floats]:
         """Variance of the chosen cells (n,) in each epoch that is theirs alone [m²]."""
         found = []
         for one in held:
@@ -134,7 +134,7 @@ class Aggregates:
             found.append(random_m2)
         return found
 
-    def _total(self, held: list[_Held], chosen: Bools, weights: Floats, random_m2: list[Floats]) -> float:
+    def _total(self, held: list[Held], chosen: Bools, weights: Floats, random_m2: list[Floats]) -> float:
         """Variance of the weighted sum of the chosen cells (n,), over the epochs."""
         total = 0.0
         for one, own_m2 in zip(held, random_m2, strict=True):
@@ -144,10 +144,10 @@ class Aggregates:
                 continue
             if len(held) == 1 and not one.adjusted:
                 unknown = against(unknown, one.reference.shared)
-            total += aggregate_variance(weights, own_m2, self._felt(one, chosen), unknown)
+            total += aggregate_variance(weights, own_m2, self.felt(one, chosen), unknown)
         return total
 
-    def _apart(self, held: list[_Held], cells: Bools) -> Bools:
+    def _apart(self, held: list[Held], cells: Bools) -> Bools:
         """Tell where the references of two epochs are not one surface."""
         one, other = (epoch.reference.elevation_m[cells] for epoch in held)
         return np.asarray(one != other)
@@ -188,7 +188,8 @@ class Aggregates:
         x_m = grid.x_m[: nx * cells].reshape(nx, cells).mean(axis=1)
         return xr.Dataset({name: (("y", "x"), v) for name, v in rasters.items()}, {"y": y_m, "x": x_m})
 
-    def _felt(self, held: _Held, cells: Bools) -> Sensitivities:
+    def felt(self, held: Held, cells: Bools) -> Sensitivities:
+        """Return what the chosen cells (ny, nx) of an epoch feel of its shared parameters."""
         grid, elevation_m = self._series.grid, held.reference.elevation_m
         east_m, north_m, height_m, axis_east, axis_north = held.scanner
         up = float(np.sqrt(max(1 - axis_east**2 - axis_north**2, 0.0)))
@@ -201,15 +202,15 @@ class Aggregates:
         gradient = smooth_gradient(around, grid.cell_m)
         return cell_sensitivities(of, part, position_m, around, gradient, cells[rows, columns])
 
-    def _read(self, row: Row, cells: Bools) -> _Held:
+    def read(self, row: Row, cells: Bools) -> Held:
         """Read what an epoch keeps of the chosen cells (ny, nx)."""
         with netCDF4.Dataset(row.path) as file:
             reference = self.reference(str(file["reference_version"][row.index]))
-            change_m, random_m = (_cells(file[name], row.index, cells) for name in (CHANGE, RANDOM))
+            change_m, random_m = (cell_values(file[name], row.index, cells) for name in (CHANGE, RANDOM))
             scanner = tuple(float(np.ma.filled(file[name][row.index], np.nan)) for name in SCANNER)
             joint = str(file["adjustment"][row.index]) == "joint"
             if "parameter_name" not in file.variables or not np.isfinite(scanner).all():
-                return _Held(change_m, random_m, None, scanner, reference, joint)
+                return Held(change_m, random_m, None, scanner, reference, joint)
             file.set_auto_chartostring(False)
             names, units = (tuple(strings(np.ma.getdata(file[name][:]))) for name in PARAMETER)
             estimate, covariance, noise = (
@@ -219,14 +220,14 @@ class Aggregates:
                 )
             )  # fmt: skip
         unknown = Shared(names, units, estimate, covariance, noise)
-        return _Held(change_m, random_m, unknown, scanner, reference, joint)
+        return Held(change_m, random_m, unknown, scanner, reference, joint)
 
 
 SCANNER = ("scanner_east", "scanner_north", "scanner_height", "scanner_axis_east", "scanner_axis_north")
 PARAMETER = ("parameter_name", "parameter_unit")
 
 
-def _seen(held: list[_Held], cells: Bools) -> Bools:
+def seen_in_all(held: list[Held], cells: Bools) -> Bools:
     """Tell which of the cells (ny, nx) have a change in every epoch, and a reference."""
     chosen = cells.copy()
     chosen[cells] = np.logical_and.reduce(
@@ -235,7 +236,7 @@ def _seen(held: list[_Held], cells: Bools) -> Bools:
     return chosen
 
 
-def _cells(variable: Any, index: int, cells: Bools) -> Floats:  # noqa: ANN401 - netCDF4 has no types
+def cell_values(variable: Any, index: int, cells: Bools) -> Floats:  # noqa: ANN401 - netCDF4 has no types
     """Read the chosen cells (n,) of a raster, and no more of it than their bounding box."""
     if not cells.any():
         return np.empty(0)

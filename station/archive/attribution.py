@@ -131,7 +131,7 @@ def attribute(series: Series, epoch: int | str) -> Attribution:
     every = np.ones(series.grid.shape, bool)
     if not said(row.path)["reference_version"]:
         raise StoreError(f"{row.epoch_file}: has no reference yet: its change is not known")
-    held = found._read(row, every)  # noqa: SLF001 - the same room
+    held = found.read(row, every)
     if held.unknown is None:
         raise StoreError(
             f"{row.epoch_file}: does not say what its points share: the scanner's place is not known"
@@ -143,7 +143,7 @@ def attribute(series: Series, epoch: int | str) -> Attribution:
     )
     cells = seen.reshape(series.grid.shape)
     return Attribution(
-        series, row, cells, found._felt(held, cells), held.random_m[seen] ** 2,  # noqa: SLF001
+        series, row, cells, found.felt(held, cells), held.random_m[seen] ** 2,
         held.unknown if held.adjusted else against(held.unknown, held.reference.shared),
         held.reference, (held.scanner[0], held.scanner[1], held.scanner[2]),
     )  # fmt: skip

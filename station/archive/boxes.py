@@ -12,7 +12,7 @@ import netCDF4
 import numpy as np
 from scipy import sparse
 
-from station.archive.aggregate import Aggregates, _Held
+from station.archive.aggregate import Aggregates, Held
 from station.archive.layout import Series
 from station.archive.observed import some_epochs
 from station.archive.store import Row
@@ -45,11 +45,11 @@ def box_statistics(series: Series, most: int, progress: Callable[[], None]) -> l
     told: list[dict[str, Any]] = []
     felt: tuple[tuple[object, ...], Felt, list[dict[str, float]]] | None = None
     for row in some:
-        one = held._read(row, cells)  # noqa: SLF001 - the same room
+        one = held.read(row, cells)
         key = one.reference.version, one.scanner
         if felt is None or felt[0] != key:
             places = _places(series.grid, cells, weights, one)
-            felt = key, Felt(held._felt(one, cells)), places  # noqa: SLF001
+            felt = key, Felt(held.felt(one, cells)), places
         told += _of_epoch(row, one, of, weights, felt[1], felt[2])
         progress()
     return told
@@ -57,7 +57,7 @@ def box_statistics(series: Series, most: int, progress: Callable[[], None]) -> l
 
 def _of_epoch(
     row: Row,
-    one: _Held,
+    one: Held,
     of: Ints,
     weights: sparse.csr_array,
     felt: Felt,
@@ -121,7 +121,7 @@ def _boxes(grid: Grid, known: Bools, eye_m: tuple[float, float]) -> tuple[Bools,
     return cells, of, means(of)
 
 
-def _places(grid: Grid, cells: Bools, weights: sparse.csr_array, one: _Held) -> list[dict[str, float]]:
+def _places(grid: Grid, cells: Bools, weights: sparse.csr_array, one: Held) -> list[dict[str, float]]:
     """Say where each box is and how it is seen."""
     row, column = np.nonzero(cells)
     east, north = (

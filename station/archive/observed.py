@@ -93,7 +93,7 @@ def _read(series: Series, most: int, progress: Callable[[], None]) -> Iterator[_
         progress()
         if not chosen.any():
             continue
-        of = held._read(row, chosen)  # noqa: SLF001 - the same room
+        of = held.read(row, chosen)
         known = np.isfinite(of.change_m)
         if of.unknown is None or scan_id in of.reference.scan_ids or not known.any():
             continue
@@ -137,8 +137,8 @@ class _Ground:
         """Return what cells and pairs of them feel: the same as long as scanner and reference are."""
         key = one.reference.version, one.scanner
         if key not in self._known:
-            held = self._held._read(one.row, self.cells)  # noqa: SLF001
-            felt = calibration.Felt(self._held._felt(held, self.cells))  # noqa: SLF001
+            held = self._held.read(one.row, self.cells)
+            felt = calibration.Felt(self._held.felt(held, self.cells))
             apart = calibration.differences(*self.pairs[:2], len(self.band))
             self._known = {key: (felt, felt.sums(apart))}
         return self._known[key]

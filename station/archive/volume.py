@@ -8,7 +8,7 @@ import numpy.typing as npt
 import shapely
 import xarray as xr
 
-from station.archive.aggregate import CHANGE, Aggregates, _cells, _Held, _seen
+from station.archive.aggregate import CHANGE, Aggregates, Held, cell_values, seen_in_all
 from station.archive.store import Row
 from station.errors import StoreError
 from station.quantities import Bools, Floats, Grid, Scanner
@@ -41,7 +41,7 @@ class Volumes(Aggregates):
         the published one; each sums up to 1. Raises StoreError where nothing was seen.
         """
         held = self._held(cells, row, other)
-        chosen = _seen(held, cells)
+        chosen = seen_in_all(held, cells)
         if not chosen.any():
             raise StoreError(f"{row.path}: none of the {np.count_nonzero(cells)} cells has a change")
         size_m2 = self._series.grid.cell_m**2 * np.count_nonzero(cells)
@@ -76,10 +76,10 @@ class Volumes(Aggregates):
     def _sigma(self, row: Row, chosen: Bools) -> Floats:
         """One sigma of chosen cells (n,) in an epoch, everything included [m]."""
         with netCDF4.Dataset(row.path) as file:
-            return _cells(file[f"{CHANGE}_uncertainty"], row.index, chosen)
+            return cell_values(file[f"{CHANGE}_uncertainty"], row.index, chosen)
 
     def _contributions(
-        self, held: list[_Held], chosen: Bools, weights: Floats, random_m2: list[Floats]
+        self, held: list[Held], chosen: Bools, weights: Floats, random_m2: list[Floats]
     ) -> tuple[Floats, Floats]:
         """What each chosen cell (n,) adds to the variance of a weighted sum: its own, the shared."""
         own, common = np.zeros(len(weights)), np.zeros(len(weights))
@@ -90,7 +90,7 @@ class Volumes(Aggregates):
                 continue
             if len(held) == 1 and not one.adjusted:
                 unknown = against(unknown, one.reference.shared)
-            common += shared_contributions(weights, self._felt(one, chosen), unknown)
+            common += shared_contributions(weights, self.felt(one, chosen), unknown)
         return own, common
 
     def point_covariance(self, points_m: Floats, row: Row, scanner: Scanner) -> Floats:
@@ -98,7 +98,7 @@ class Volumes(Aggregates):
 
         Raises StoreError where the epoch does not say what its points share.
         """
-        held = self._read(row, np.zeros(self._series.grid.shape, np.bool_))
+        held = self.read(row, np.zeros(self._series.grid.shape, np.bool_))
         if held.unknown is None:
             raise StoreError(f"{row.path}: the epoch holds nothing of the scanner: its scan came on the map")
         position_m, (east, north) = held.scanner[:3], held.scanner[3:]

@@ -8,7 +8,7 @@ import numpy as np
 from scipy import sparse, stats
 
 from station.quantities import Bools, Floats, Ints, Shared
-from station.science.shared import GLOBAL, Basis, Sensitivities, _between, line_variances
+from station.science.shared import GLOBAL, Basis, Sensitivities, leans_between, line_variances
 
 LIMIT_95 = 1.959964  # of a normal variable
 NEAR_ONE = 1.1  # a factor within that of 1 is left alone
@@ -130,7 +130,7 @@ class Felt:
 
     def sums(self, weights: sparse.csr_array) -> Sums:
         """Return weighted sums (m, n) of the cells."""
-        own = (weights @ self._lines).toarray() @ _between(self._of).left
+        own = (weights @ self._lines).toarray() @ leans_between(self._of).left
         return Sums(weights, self._of, (weights @ self._design).toarray(), own)
 
 

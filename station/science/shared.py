@@ -207,7 +207,7 @@ class Sensitivities:
         _, _, bend_share = self.refraction_knot()
         order = np.argsort(before.astype(np.int16), kind="stable")
         bounds = np.searchsorted(before[order], np.arange(of.intervals + 1))
-        own = _between(of).left ** 2 @ line_variances(of, unknown)
+        own = leans_between(of).left ** 2 @ line_variances(of, unknown)
         for knot in np.flatnonzero(np.diff(bounds)):
             cells = order[bounds[knot] : bounds[knot + 1]]
             bend = knot // LEAN_PER_REFRACTION
@@ -306,13 +306,13 @@ def aggregate_variance(
     For a difference of two epochs add both; what a reference shares with both cancels.
     Source: EQUATIONS 6.2; Hartzell et al. (2015), Eq. 14 and 21, lack the second term.
     """
-    g, lines = felt.total(weights), felt.by_line(weights) @ _between(felt.of).left
+    g, lines = felt.total(weights), felt.by_line(weights) @ leans_between(felt.of).left
     own = lines**2 @ line_variances(felt.of, unknown)
     return float(np.sum(weights**2 * random_variance_m2) + g @ unknown.covariance @ g + own)
 
 
 @dataclass(frozen=True)
-class _Between:
+class LeansBetween:
     """Matrices between the leans of lines and those at knots."""
 
     knots: Floats  # (lines, knots) interpolates
@@ -321,14 +321,15 @@ class _Between:
 
 
 @lru_cache(maxsize=4)
-def _between(of: Basis) -> _Between:
+def leans_between(of: Basis) -> LeansBetween:
+    """Return the matrices of a basis; made once."""
     before = np.arange(of.line_count) // LINES_A_KNOT
     share = (np.arange(of.line_count) % LINES_A_KNOT + 0.5) / LINES_A_KNOT
     knots = np.zeros((of.line_count, of.lean_count))
     knots[np.arange(of.line_count), before] = 1 - share
     knots[np.arange(of.line_count), (before + 1) % of.lean_count] += share
     fit = np.asarray(np.linalg.pinv(knots), dtype=np.float64)
-    return _Between(knots, fit, np.eye(of.line_count) - knots @ fit)
+    return LeansBetween(knots, fit, np.eye(of.line_count) - knots @ fit)
 
 
 def against(unknown: Shared, common: Shared | None) -> Shared:
@@ -343,7 +344,7 @@ def against(unknown: Shared, common: Shared | None) -> Shared:
 
 def lines_from_knots(of: Basis, unknown: Floats) -> Floats:
     """Covariance by line (9 + lines + refraction knots) of one by knot (p, p)."""
-    wide = _beside(_between(of).knots, len(GLOBAL), of.refraction_count)
+    wide = _beside(leans_between(of).knots, len(GLOBAL), of.refraction_count)
     return np.asarray(wide @ unknown @ wide.T)
 
 
@@ -353,7 +354,7 @@ def by_knots(of: Basis, estimate: Floats, covariance: Floats) -> Shared:
     What the knots cannot hold of a line's lean is kept as the variance of independent leans from which the
     knots have taken their part; that loses less than 5 % of the sigma of boxes and areas.
     """
-    between = _between(of)
+    between = leans_between(of)
     narrow = _beside(between.fit, len(GLOBAL), of.refraction_count)
     lines = slice(len(GLOBAL), len(GLOBAL) + of.line_count)
     left = between.left

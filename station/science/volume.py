@@ -20,8 +20,8 @@ from station.science.shared import (
     GLOBAL,
     Basis,
     Sensitivities,
-    _between,
     aggregate_variance,
+    leans_between,
     line_variances,
     sensitivities,
 )
@@ -232,7 +232,7 @@ def shared_contributions(weights: Floats, felt: Sensitivities, unknown: Shared) 
     lean, bend = np.split(back[len(GLOBAL) :], [of.lean_count])
     lean_before, lean_after, lean_share = felt.lean_knot()
     bend_before, bend_after, bend_share = felt.refraction_knot()
-    left = _between(of).left
+    left = leans_between(of).left
     own = left @ (line_variances(of, unknown) * (felt.by_line(weights) @ left))
     height_m2 = (
         back[: len(GLOBAL)] @ felt.globals_
