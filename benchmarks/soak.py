@@ -59,7 +59,10 @@ def main() -> None:
 
 
 def soak(folder: Path, scans: int) -> tuple[list[Sample], dict[str, int]]:
-    """Feed a service scan by scan; return samples on the way and how many scans ended where."""
+    """Feed a service scan by scan; return samples on the way and how many scans ended where.
+
+    Ctrl-C ends it early.
+    """
     few = replace(
         tiny(SIMULATED), lines=60, shots_per_line=60, cell_m=20.0, reference_scans=2, melt_m_per_h=0.0
     )
@@ -90,6 +93,8 @@ def soak(folder: Path, scans: int) -> tuple[list[Sample], dict[str, int]]:
                 given += 1
             samples.append(_sample(service.pid, done))
             time.sleep(LOOKS_S)
+    except KeyboardInterrupt:  # what there is will do
+        pass
     finally:
         service.send_signal(signal.SIGTERM)
         service.wait(120)
