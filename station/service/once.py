@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from station.config import Site
 from station.errors import NotReadyError, ScanError
-from station.service.inbox import Arrival
 from station.service.journal import Entry, Journal, State
 from station.service.lock import only_writer
 from station.service.places import arrival_of
@@ -19,23 +18,23 @@ Tell = Callable[[Entry], None]
 def process_scans(site: Site, scans: Sequence[Path], tell: Tell) -> int:
     """Process scans in the order of their names, `tell` the journal row of each; return the exit status.
 
-    Those from before the reference was there are done again, and told again.
+    Those from before the reference was there are done again as soon as it is, and told again.
     """
     site.station.data.mkdir(parents=True, exist_ok=True)
     with only_writer(site.station.data), Journal(site.station.data / "journal.sqlite") as journal:
         worker = Worker(site, journal)
         arrivals = {path.name: arrival_of(site, path) for path in sorted(scans, key=lambda path: path.name)}
         journal.seen((one.name, one.size, one.mtime_ns, "") for one in arrivals.values())
-        todo: Iterable[Arrival] = arrivals.values()
+        todo = list(arrivals)
         while todo:
-            for arrival in todo:
-                worker.take(arrival)
-                entry = journal.entry(arrival.name)
-                assert entry is not None  # noqa: S101 - it was just taken
-                if entry.state is not State.WAITING:  # for the reference it just made possible
-                    tell(entry)
-            again = {row.name for row in journal.waiting() if row.state is State.WAITING}
-            todo = [one for name, one in arrivals.items() if name in again]
+            name = todo.pop(0)
+            worker.take(arrivals[name])
+            entry = journal.entry(name)
+            assert entry is not None  # noqa: S101 - it was just taken
+            if entry.state is not State.WAITING:  # for the reference it just made possible
+                tell(entry)
+            again = {row.name for row in journal.waiting() if row.state is State.WAITING} - set(todo)
+            todo[:0] = [name for name in arrivals if name in again]  # before later ones, as in the service
         states = {row.state for row in journal.rows() if row.name in arrivals}
     if State.SET_ASIDE in states:
         return ScanError.exit_status
