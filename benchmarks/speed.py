@@ -9,8 +9,9 @@ from dataclasses import replace
 import numpy as np
 from scipy import ndimage
 
+from station.config import ScannerSection
 from station.pipeline import Setup, Told, gridder_for, level, measure
-from station.quantities import Bools, Floats, Grid, Reference, Scanner
+from station.quantities import Bools, Floats, Grid, Reference
 from station.science import prior, shared
 from station.science.adjustment import LineLog
 from station.science.grid import Gridder
@@ -18,7 +19,7 @@ from station.science.grid import Gridder
 GRID = Grid(west_m=0.0, north_m=5000.0, cell_m=1.0, nx=4000, ny=5000)
 RIDGE_M = (2000.0, -50.0, 700.0)  # beside the grid: the head looks over half a turn, as at Hintereisferner
 AMIDST_M = (3900.0, 300.0, 700.0)  # on the grid: a whole turn
-SCANNER = Scanner("riegl-vz-6000", 1.064, 0.12e-3, 0.015, 0.015, 9e-6, 1.4e-4, 6000.0)
+SCANNER = ScannerSection.model_validate({"model": "riegl-vz-6000"}).instrument
 VALID = 0.31  # share of the grid's cells that a scan sees: Voordendag et al. (2023)
 STABLE = 0.3  # of these
 POINTS_A_CELL = 2
