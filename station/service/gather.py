@@ -13,7 +13,7 @@ import numpy as np
 from pyproj import CRS, Transformer
 
 from station.archive.layout import written_whole
-from station.config import Origin, Site, SopSection
+from station.config import Origin, Site, SopSection, WeatherSection
 from station.errors import ConfigError, NotReadyError, ScanError
 from station.pipeline import Pose, Setup, Told
 from station.quantities import Air, Habits, HeadTrack, InclinationLog, Shared
@@ -336,19 +336,27 @@ def _fit(log: InclinationLog, track: HeadTrack | None, sigma_rad: float) -> Cycl
     return Cycle((float(log.roll_rad.mean()), 0.0, 0.0), (float(log.pitch_rad.mean()), 0.0, 0.0))
 
 
+def weather_at(given: WeatherSection, moment_s: float) -> Air | None:
+    """Return the air that the weather log tells at a moment, None where it has a gap.
+
+    Raises ScanError or NotReadyError where the log cannot be used.
+    """
+    log = read_weather(
+        given.file,
+        format=given.format,
+        columns=given.columns,
+        utc_offset_h=given.utc_offset_h,
+        window_utc_s=(moment_s - given.max_age_s, moment_s + given.max_age_s),
+    )
+    return air_at(log, moment_s, given.max_age_s)
+
+
 def _air(site: Site, moment: datetime, height_m: float, lacking: list[str]) -> tuple[Air, bool]:
     """Return the air of the scan and whether it was measured."""
     if site.weather is not None:
-        given, moment_s = site.weather, moment.timestamp()
+        given = site.weather
         try:
-            log = read_weather(
-                given.file,
-                format=given.format,
-                columns=given.columns,
-                utc_offset_h=given.utc_offset_h,
-                window_utc_s=(moment_s - given.max_age_s, moment_s + given.max_age_s),
-            )
-            air = air_at(log, moment_s, given.max_age_s)
+            air = weather_at(given, moment.timestamp())
         except (ScanError, NotReadyError) as error:  # a scan does not wait for ever for its weather
             lacking.append(f"weather unusable: {error}")
             air = None

@@ -26,9 +26,8 @@ from station.errors import NotReadyError, ScanError
 from station.quantities import Air
 from station.readers.flags import flag_on, read_flags
 from station.readers.sop import sop_for
-from station.readers.weather import air_at, read_weather
 from station.service.content import sha256_of
-from station.service.gather import kept_zero, sop_identity
+from station.service.gather import kept_zero, sop_identity, weather_at
 from station.service.inbox import Arrival
 from station.service.journal import Entry, State
 from station.service.places import find_scan
@@ -203,16 +202,9 @@ class Today:
 def _weather_at(given: WeatherSection, moment_s: float) -> Air | None:
     """Return the air at a moment; None where the log does not tell, or cannot be used."""
     try:
-        log = read_weather(
-            given.file,
-            format=given.format,
-            columns=given.columns,
-            utc_offset_h=given.utc_offset_h,
-            window_utc_s=(moment_s - given.max_age_s, moment_s + given.max_age_s),
-        )
+        return weather_at(given, moment_s)
     except (ScanError, NotReadyError):
         return None
-    return air_at(log, moment_s, given.max_age_s)
 
 
 def plan(
