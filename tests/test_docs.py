@@ -11,8 +11,9 @@ from pydantic import BaseModel
 from station import config, errors
 from station.archive.areas import AREA_VARIABLES
 from station.archive.variables import VARIABLES
-from station.config import SiteFile, read_site, write_site
+from station.config import read_site, write_site
 from station.scanners import SCANNERS
+from station.sections import SiteFile
 
 ROOT = Path(__file__).parents[1]
 README = (ROOT / "README.md").read_text(encoding="utf-8")

@@ -52,8 +52,8 @@ def test_p7_68_percent_ellipse():
 
 def test_published_budget_of_a_cell():
     """V-1 and V-2 by hand for box 5, and V-3 as the linear sum it is."""
-    from station.config import ScannerSection
     from station.scanners import SCANNERS
+    from station.sections import ScannerSection
 
     assert SCANNERS["riegl-vz-6000"]["beam_divergence_mrad"] == 0.12
     given = ScannerSection.model_validate({"model": "riegl-vz-6000"})

@@ -8,9 +8,9 @@ from pathlib import Path
 
 import numpy as np
 
-from station.config import SopSection
 from station.errors import ConfigError, ScanError
 from station.quantities import Floats
+from station.sections import SopSection
 
 EXACT = 1e-6  # shifts 1 m at 1,000 km; files with nine digits reach 1e-9
 MENDABLE = 1e-4  # a few digits lost in writing; beyond that it is no rotation

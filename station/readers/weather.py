@@ -11,10 +11,10 @@ from typing import BinaryIO, Literal
 
 import numpy as np
 
-from station.config import WeatherColumns
 from station.errors import ScanError
 from station.quantities import Air, WeatherLog
 from station.readers.scan import foreign_code
+from station.sections import WeatherColumns
 
 # What air can be (temperature_c, pressure_hpa, humidity_pct); loggers write -7999 and the like for faults.
 LIMITS = ((-60.0, 50.0), (300.0, 1100.0), (0.0, 110.0))

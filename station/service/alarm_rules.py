@@ -13,10 +13,11 @@ from statistics import median
 
 import numpy as np
 
-from station.config import AlarmsSection, ChangeAlarm, Site
+from station.config import Site
 from station.errors import StationError, StoreError
 from station.readers.scan import suffixes
 from station.science.onset import Onsets, onsets, threshold_sigmas
+from station.sections import AlarmsSection, ChangeAlarm
 from station.service.alarm_memory import Alarm
 from station.service.area_series import Curve, read_curves
 from station.service.health import need_room

@@ -13,7 +13,7 @@ import numpy as np
 from pyproj import CRS, Transformer
 
 from station.archive.layout import written_whole
-from station.config import Origin, Site, SopSection, WeatherSection
+from station.config import Site
 from station.errors import ConfigError, NotReadyError, ScanError
 from station.pipeline import Pose, Setup, Told
 from station.quantities import Air, Habits, HeadTrack, InclinationLog, Shared
@@ -24,6 +24,7 @@ from station.readers.weather import air_at, read_weather
 from station.science import inclination, pose, prior, shared
 from station.science.air import air_correction, standard_air
 from station.science.inclination import LEVEL, Cycle, Lean
+from station.sections import Origin, SopSection, WeatherSection
 
 MOST_OF_THE_SCAN = 0.97  # of its time a log covers, unless it is late or short
 FEWEST_ROWS = 20  # of a log that is worth filtering

@@ -13,7 +13,6 @@ from pyproj import CRS, Transformer
 from pyproj.exceptions import CRSError
 from scipy.spatial.transform import Rotation
 
-from station.config import ScannerSection
 from station.errors import ConfigError, StoreError
 from station.quantities import Floats, Scanner
 from station.readers.features import read_features
@@ -22,6 +21,7 @@ from station.scanners import SCANNERS
 from station.science import pose
 from station.science.points import shot_covariance
 from station.science.registration import UNKNOWN, Features, Registration, solve
+from station.sections import ScannerSection
 
 SUSPECT = 3.3  # sigmas: one residual of a thousand is larger by chance
 NEAR_M = 1e4  # how far from the scanner a map has to be right

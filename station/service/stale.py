@@ -21,11 +21,12 @@ from station.archive.reference import current
 from station.archive.series import read_source, runs
 from station.archive.store import AIR, Row, rows
 from station.archive.variables import FILL, VERDICTS
-from station.config import Site, WeatherSection
+from station.config import Site
 from station.errors import NotReadyError, ScanError
 from station.quantities import Air
 from station.readers.flags import flag_on, read_flags
 from station.readers.sop import sop_for
+from station.sections import WeatherSection
 from station.service.content import sha256_of
 from station.service.gather import kept_zero, sop_identity, weather_at
 from station.service.inbox import Arrival

@@ -25,7 +25,7 @@ from pathlib import Path
 
 import numpy as np
 
-from station.config import WeatherColumns, read_site
+from station.config import read_site
 from station.errors import ConfigError, ScanError
 from station.quantities import Grid, HeadTrack
 from station.readers.inclination import read_inclination
@@ -34,6 +34,7 @@ from station.readers.scan import open_scan, utc_interval
 from station.readers.sop import read_matrix
 from station.readers.weather import LIMITS, air_at, read_weather
 from station.science import inclination, pose
+from station.sections import WeatherColumns
 
 PATIENCE_S = 5  # for one case of a few kilobytes
 MEMORY = 1 << 29  # beyond what the modules take

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from station.config import SopSection
 from station.errors import ConfigError, ScanError
 from station.readers.sop import read_matrix, sop_for
+from station.sections import SopSection
 
 TURN = Rotation.from_euler("xyz", [0.1, 0.59, -1.2]).as_matrix()
 

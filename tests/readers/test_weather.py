@@ -5,10 +5,10 @@ from datetime import UTC, datetime
 import numpy as np
 import pytest
 
-from station.config import WeatherColumns
 from station.errors import NotReadyError, ScanError
 from station.quantities import Air, WeatherLog
 from station.readers.weather import air_at, read_weather
+from station.sections import WeatherColumns
 
 REAL = WeatherColumns(temperature_c="TAact_2m_Avg", humidity_pct="RHact_2m_Avg", pressure_hpa="Pact")
 PLAIN = WeatherColumns(time="time", temperature_c="t", humidity_pct="rh", pressure_hpa="p")

@@ -4,7 +4,8 @@ import json
 
 import pytest
 
-from station.config import FlagsSection, RetentionSection, read_site
+from station.config import read_site
+from station.sections import FlagsSection, RetentionSection
 from station.service import check
 from station.simulation.station import simulate, tiny
 

@@ -1,0 +1,353 @@
+"""The tables of the site file: every key, what it may be, and what stands for it when it is left out.
+
+What each key does is told in the commented files in `config/`.
+"""
+
+from __future__ import annotations
+
+import math
+from datetime import UTC, datetime
+from ipaddress import ip_address
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from pydantic import AfterValidator, AwareDatetime, BaseModel, ConfigDict, Field, model_validator
+
+from station.quantities import Air, Scanner
+from station.scanners import SCANNERS
+
+Positive = Annotated[float, Field(gt=0)]
+NotNegative = Annotated[float, Field(ge=0)]
+
+
+def _in_utc(moment: datetime) -> datetime:
+    return moment.astimezone(UTC)
+
+
+Utc = Annotated[AwareDatetime, AfterValidator(_in_utc)]
+
+
+class Section(BaseModel):
+    """A table of the site file: nothing unknown, nothing changed after reading."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+
+class StationSection(Section):
+    """Who the station is; goes into the metadata of everything it writes."""
+
+    id: Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_-]{0,31}$")]
+    data: Path
+    name: str = ""
+    institution: str = ""
+
+
+class ScansSection(Section):
+    """Where scans arrive and how they are named."""
+
+    inbox: Path
+    name: str = "%y%m%d_%H%M%S"
+    frame: Literal["scanner", "map"] = "scanner"
+    point_time: Literal["auto", "none"] = "auto"
+    settle_s: NotNegative = 60.0
+    expected_every_s: Positive = 3600.0
+    polling: bool = False
+    timeout_s: Positive = 1800.0
+
+
+class ScannerSection(Section):
+    """The instrument: a known model, each value of which may be overridden."""
+
+    model: str = "riegl-vz-6000"
+    wavelength_um: Annotated[float, Field(ge=0.3, le=2.5)]
+    beam_divergence_mrad: Annotated[float, Field(ge=0, le=10)]
+    exit_diameter_m: Annotated[float, Field(ge=0, le=0.2)]
+    range_sigma_m: Annotated[float, Field(gt=0, le=1)]
+    angle_resolution_deg: Annotated[float, Field(ge=0, le=1)]
+    inclination_sigma_deg: Annotated[float, Field(gt=0, le=1)]
+    inclination_range_deg: Annotated[float, Field(gt=0, le=90)]
+    range_max_m: Positive
+
+    @model_validator(mode="before")
+    @classmethod
+    def _fill_from_model(cls, given: dict[str, Any]) -> dict[str, Any]:
+        model = given.get("model", "riegl-vz-6000")
+        known = SCANNERS.get(model, {})
+        missing = set(SCANNERS["riegl-vz-6000"]) - set(given)
+        if not known and missing:
+            raise ValueError(
+                f"unknown scanner {model!r}: take one of {', '.join(SCANNERS)},"
+                f" or give {', '.join(sorted(missing))}"
+            )
+        return {**known, **given}
+
+    @property
+    def instrument(self) -> Scanner:
+        """The scanner as a quantity, angles in radians."""
+        return Scanner(
+            model=self.model,
+            wavelength_um=self.wavelength_um,
+            beam_divergence_rad=self.beam_divergence_mrad * 1e-3,
+            exit_diameter_m=self.exit_diameter_m,
+            range_sigma_m=self.range_sigma_m,
+            angle_resolution_rad=math.radians(self.angle_resolution_deg),
+            inclination_sigma_rad=math.radians(self.inclination_sigma_deg),
+            inclination_range_rad=math.radians(self.inclination_range_deg),
+            range_max_m=self.range_max_m,
+        )
+
+
+class SopSection(Section):
+    """A scanner orientation and position, and from when it holds."""
+
+    from_: Annotated[Utc, Field(alias="from")]
+    file: Path
+    scan: str | None = None
+
+
+class Origin(Section):
+    """A point on the ellipsoid of WGS84."""
+
+    latitude_deg: Annotated[float, Field(ge=-90, le=90)]
+    longitude_deg: Annotated[float, Field(ge=-180, le=360)]
+    height_m: float
+
+
+class MapSection(Section):
+    """The map the products are in, and how the project frame hangs on it."""
+
+    crs: str | None = None
+    origin: Origin | None = None
+    pop: Path | None = None
+    vertical_datum: str = ""
+
+
+class Bounds(Section):
+    """Outer edges of the grid in the map CRS."""
+
+    west: float
+    south: float
+    east: float
+    north: float
+
+
+class GridSection(Section):
+    """The fixed raster."""
+
+    bounds_m: Bounds
+    cell_m: Positive = 1.0
+    min_points: Annotated[int, Field(ge=1)] = 1
+
+    @model_validator(mode="after")
+    def _whole_cells(self) -> GridSection:
+        bounds = self.bounds_m
+        for low, high, axis in (("west", "east", "columns"), ("south", "north", "rows")):
+            cells = (getattr(bounds, high) - getattr(bounds, low)) / self.cell_m
+            if cells < 1:
+                raise ValueError(f"bounds_m.{high} must be at least one cell_m beyond bounds_m.{low}")
+            if abs(cells - round(cells)) > 1e-6:
+                raise ValueError(
+                    f"bounds_m.{low} to bounds_m.{high} is {cells:g} {axis} of cell_m = {self.cell_m:g}:"
+                    " make it a whole number"
+                )
+        if self.shape[0] * self.shape[1] > 100_000_000:
+            raise ValueError(f"{self.shape} cells are too many: coarsen cell_m or cut bounds_m")
+        return self
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Rows and columns."""
+        bounds, cell_m = self.bounds_m, self.cell_m
+        return (round((bounds.north - bounds.south) / cell_m), round((bounds.east - bounds.west) / cell_m))
+
+
+class InclinationSection(Section):
+    """The inclination log beside each scan and what is done with it."""
+
+    suffix: str = "-incl.txt"
+    required: bool = True
+    wait_s: NotNegative = 900.0
+    filter: Literal["blackman", "none"] = "blackman"
+    cutoff_hz: Literal["auto"] | Positive = "auto"
+    mode: Literal["relative", "absolute"] = "relative"
+
+
+class WeatherColumns(Section):
+    """What the weather log calls its columns."""
+
+    time: str = "TIMESTAMP"
+    temperature_c: str
+    humidity_pct: str
+    pressure_hpa: str
+
+
+class WeatherSection(Section):
+    """The station's weather log."""
+
+    file: Path
+    format: Literal["toa5", "csv"] = "toa5"
+    columns: WeatherColumns
+    max_age_s: Positive = 3600.0
+    wait_s: NotNegative = 900.0
+    utc_offset_h: Annotated[float, Field(ge=-14, le=14)] = 0.0
+
+
+class AirValues(Section):
+    """Temperature, pressure and humidity."""
+
+    temperature_c: Annotated[float, Field(ge=-60, le=50)]
+    pressure_hpa: Annotated[float, Field(ge=300, le=1100)]
+    humidity_pct: Annotated[float, Field(ge=0, le=100)]
+
+    @property
+    def air(self) -> Air:
+        """The same as a quantity."""
+        return Air(self.temperature_c, self.pressure_hpa, self.humidity_pct)
+
+
+class AirSection(Section):
+    """What the scanner itself assumed of the air; without this table nothing is corrected for air."""
+
+    scanner_setting: AirValues | Literal["weather"] = AirValues(
+        temperature_c=-2.0, pressure_hpa=684.0, humidity_pct=28.0
+    )
+    scanner_corrects: bool = True
+
+
+class AdjustmentSection(Section):
+    """How the pose of each scan is found, and on which ground: found out, or the polygons of a GeoJSON."""
+
+    method: Literal["none", "joint"] = "joint"
+    stable: Literal["auto"] | Path = "auto"
+
+
+class UncertaintySection(Section):
+    """Which budget is computed, and whether its terms are stored."""
+
+    model: Literal["rigorous", "voordendag2023"] = "rigorous"
+    registration_sigma_m: NotNegative = 0.0  # of the published budget only
+    store_terms: bool = False
+
+
+class ReferenceSection(Section):
+    """The master surface: the mean of the first usable scans, or a GeoTIFF."""
+
+    scans: Annotated[int, Field(ge=1, le=200)] | Path = 8
+
+
+class AreasSection(Section):
+    """Named polygons, each of which becomes a time series of mean and volume change."""
+
+    file: Path
+
+
+class FlagsSection(Section):
+    """A person's list of times whose epochs are not to be used."""
+
+    file: Path
+
+
+class RetentionSection(Section):
+    """What becomes of raw scans that are stored and verified."""
+
+    raw: Literal["leave", "move", "delete"] = "leave"
+    keep_days: NotNegative = 30.0
+    archive: Path | None = None
+
+    @model_validator(mode="after")
+    def _says_where(self) -> RetentionSection:
+        if self.raw == "move" and self.archive is None:
+            raise ValueError('raw = "move" needs archive, the folder to move scans to')
+        return self
+
+
+def _on_loopback(address: str) -> str:
+    host, _, port = address.rpartition(":")
+    try:
+        is_loopback = host == "localhost" or ip_address(host.strip("[]")).is_loopback
+        is_port = 0 < int(port) < 65536
+    except ValueError:
+        is_loopback = is_port = False
+    if not (is_loopback and is_port):
+        raise ValueError('give an address of this machine alone and a port: "127.0.0.1:9750"')
+    return address
+
+
+class ServiceSection(Section):
+    """The running service."""
+
+    memory_gb: Annotated[float, Field(ge=0.5, le=1024)] = 5.0
+    metrics: Annotated[str, AfterValidator(_on_loopback)] | None = None
+    metrics_file: Path | None = None
+
+
+Target = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_-]{0,63}$")]
+
+
+class ChangeAlarm(Section):
+    """What change of an area is worth an alarm."""
+
+    areas: tuple[str, ...] = ()  # none named: all
+    within_h: Positive = 6.0
+    least_m: NotNegative = 0.0
+    scans: Annotated[int, Field(ge=1, le=24)] = 2
+    false_alarms_per_year: Positive = 1.0
+
+
+class AlarmsSection(Section):
+    """What people are told of, and by which targets: names of credentials. 0 switches a rule off."""
+
+    targets: tuple[Target, ...] = ()
+    digest: Target | None = None
+    repeat_h: Positive = 24.0
+    no_scan_h: NotNegative = 3.0
+    stalled_h: NotNegative = 1.0
+    disk_gb: NotNegative = 2.0
+    set_aside_share: Annotated[float, Field(ge=0, le=1)] = 0.5
+    z_std: NotNegative = 1.5
+    moved: bool = True
+    change: ChangeAlarm | None = None
+
+
+class ProductsSection(Section):
+    """What is made of every scan for people and other tools."""
+
+    page: bool = True
+    geotiff: bool = False
+    quicklook_width_px: Annotated[int, Field(ge=400, le=4000)] = 1200
+    change_limit_m: Positive | None = None
+
+
+class SiteFile(Section):
+    """The whole file."""
+
+    station: StationSection
+    scans: ScansSection
+    scanner: ScannerSection = ScannerSection.model_validate({})
+    sop: tuple[SopSection, ...] = ()
+    map: MapSection = MapSection()
+    grid: GridSection
+    inclination: InclinationSection | None = None
+    weather: WeatherSection | None = None
+    air: AirSection | None = None
+    adjustment: AdjustmentSection = AdjustmentSection()
+    uncertainty: UncertaintySection = UncertaintySection()
+    reference: ReferenceSection = ReferenceSection()
+    areas: AreasSection | None = None
+    flags: FlagsSection | None = None
+    retention: RetentionSection = RetentionSection()
+    service: ServiceSection = ServiceSection()
+    products: ProductsSection = ProductsSection()
+    alarms: AlarmsSection | None = None
+
+    @model_validator(mode="after")
+    def _chain_is_complete(self) -> SiteFile:
+        if self.scans.frame == "scanner" and not self.sop:
+            raise ValueError('scans.frame = "scanner" needs an [[sop]] to lead the points to the map')
+        if self.map.crs is None and (self.map.pop or self.map.origin):
+            raise ValueError("map.pop and map.origin lead to a map: say which with map.crs")
+        if self.map.pop and self.map.origin and self.scans.frame == "scanner":
+            raise ValueError("map.pop and map.origin are two ways to the same map: keep one")
+        if self.alarms and self.alarms.change and not self.areas:
+            raise ValueError("alarms.change needs areas: name their file in [areas]")
+        return self
