@@ -25,7 +25,7 @@ from station.quantities import (
     Tilt,
 )
 from station.science import budget, change, ground, prior, shared, uncertainty
-from station.science.adjustment import Adjustment, LineLog, adjust, prior_of_difference, turned
+from station.science.adjustment import Adjustment, LineLog, adjust, turned
 from station.science.air import AirCorrection, refraction_rise
 from station.science.grid import Gridder, slope_sampling_variance
 from station.science.patches import Cells, collect
@@ -136,13 +136,10 @@ class Told:
 
 def level(gridder: Gridder, setup: Setup, told: Told, reference: Reference, stable: Bools) -> Adjustment:
     """Estimate the state of the scanner from a scan on its grid; `stable` (ny, nx) is ground known for it."""
-    habits = reference.habits
-    sigma = prior.globals_sigma(habits, weather_known=told.weather_known)
-    motion, bend = prior.motion(habits, told.lines), prior.bending(habits, told.of)
-    state = prior_of_difference(told.of, prior.by_line(told.of, sigma, motion, bend), reference.shared)
+    state = prior.beforehand(told.of, told.lines, reference.habits, weather_known=told.weather_known)
     bands = _cells(gridder, setup, told.of, reference, stable)
     patches = collect(told.of, bands, setup.scanner.range_max_m)
-    return adjust(patches, told.assumed_rad, state, told.log)
+    return adjust(patches, told.assumed_rad, state.against(reference.shared), told.log)
 
 
 def _cells(gridder: Gridder, setup: Setup, of: Basis, reference: Reference, stable: Bools) -> Iterator[Cells]:

@@ -8,14 +8,26 @@ Source: EQUATIONS 6.3, ADJUSTMENT.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from collections.abc import Callable
+from dataclasses import dataclass
 
 import numpy as np
 from scipy import linalg, sparse
 
 from station.quantities import Bools, Floats, Shared
+from station.science.leans import KnownLeans, OwnLeans
 from station.science.patches import CHI2_MEDIAN, Kind, Patches
-from station.science.shared import GLOBAL, Basis, Sensitivities, by_knots, lines_from_knots
+from station.science.shared import (
+    GLOBAL,
+    Basis,
+    Sensitivities,
+    condensed,
+    interpolated,
+    leans_between,
+    lines_from_knots,
+    rows_at_knots,
+    rows_at_lines,
+)
 
 ROUNDS = 8
 SETTLED_M = 0.0001  # a round that moves the patches by less is the last
@@ -47,6 +59,33 @@ class LineLog:
 
 
 @dataclass(frozen=True)
+class Beforehand:
+    """What is known of the scanner's state before a scan is looked at.
+
+    The lean of a line is what is straight between the knots beside it, and its own.
+    """
+
+    of: Basis
+    knots: Floats  # (p, p) covariance of the globals, the lean at knots, the refraction
+    own: OwnLeans
+
+    def against(self, reference: Shared | None) -> Beforehand:
+        """Return the same for the difference to the state of the reference, which is wrong itself."""
+        if reference is None:
+            return self
+        if reference.names != self.of.names:  # the scanner has been moved: it is as unsure as a scan
+            return Beforehand(self.of, 2 * self.knots, self.own.twice())
+        return Beforehand(self.of, self.knots + reference.covariance, self.own)
+
+    def by_line(self) -> Floats:
+        """Covariance (u, u) of globals, leans of lines and refraction knots."""
+        covariance = lines_from_knots(self.of, self.knots)
+        lines = slice(len(GLOBAL), len(GLOBAL) + self.of.line_count)
+        covariance[lines, lines] += self.own.covariance()
+        return covariance
+
+
+@dataclass(frozen=True)
 class Adjustment:
     """The scanner's state against the SOP: nine globals, the lean of each group of lines, refraction.
 
@@ -56,7 +95,7 @@ class Adjustment:
 
     of: Basis
     estimate: Floats  # (u,)
-    covariance: Floats  # (u, u)
+    unknown: Unknown
     change_step_m: float
     stable_weight: Floats
 
@@ -76,9 +115,14 @@ class Adjustment:
         """Share of the stable patches that fit nothing else; nought where there is none."""
         return float(np.mean(self.stable_weight < TRUSTED)) if len(self.stable_weight) else 0.0
 
+    @property
+    def covariance(self) -> Floats:
+        """Covariance (u, u) of the estimate."""
+        return self.unknown.by_line()
+
     def shared(self) -> Shared:
         """The same by knots, for the store."""
-        return by_knots(self.of, self.estimate, self.covariance)
+        return self.unknown.by_knots(self.estimate)
 
 
 def turned(felt: Sensitivities, assumed_rad: Floats) -> Floats:
@@ -87,17 +131,8 @@ def turned(felt: Sensitivities, assumed_rad: Floats) -> Floats:
     return np.asarray(felt.globals_[0] * east + felt.globals_[1] * north - felt.globals_[2] * up)
 
 
-def prior_of_difference(of: Basis, prior: Floats, reference: Shared | None) -> Floats:
-    """Covariance of a scan's state against that of the reference, which is wrong itself."""
-    if reference is None:
-        return prior
-    if reference.names != of.names:  # the scanner has been moved: the reference is as unsure as a scan
-        return 2 * prior
-    return prior + lines_from_knots(of, reference.covariance)
-
-
-def adjust(patches: Patches, assumed_rad: Floats, prior: Floats, log: LineLog | None) -> Adjustment:
-    """Estimate the scanner's state from patches, the log and a prior covariance (u, u).
+def adjust(patches: Patches, assumed_rad: Floats, before: Beforehand, log: LineLog | None) -> Adjustment:
+    """Estimate the scanner's state from patches, the log and what is known beforehand.
 
     `assumed_rad` (3, lines) is the lean that the points were already turned by, about east, north and up.
     Withheld patches are left out.
@@ -107,84 +142,171 @@ def adjust(patches: Patches, assumed_rad: Floats, prior: Floats, log: LineLog | 
     moving = patches.kind == Kind.MOVING
     wanted_m = patches.residual_m + turned(patches.felt, assumed_rad)
     field, changes = _change_field(patches, moving)
-    aside = _Aside(of, prior, log)
-    columns = [_design(patches.felt), sparse.csr_array((len(patches), aside.faults)), field]
-    whole = sparse.csr_array(sparse.hstack(columns))
-    normal, right = (np.zeros((whole.shape[1],) * n) for n in (2, 1))
-    normal[: aside.size, : aside.size], right[: aside.size] = aside.normal, aside.right
+    normals = _Normals(patches.felt, field, wanted_m, before, log)
     scatter_m2 = np.full(len(patches), SCATTER_M[0] ** 2)
     trust = np.ones(len(patches))
+    left_m = wanted_m
     solved: _Solved | None = None
     for round_ in range(ROUNDS):
-        before = solved
-        weight = trust / (patches.variance_m2 + scatter_m2)
-        sums = (whole.T @ sparse.csr_array(whole.multiply(weight[:, None]))).toarray()
-        near = changes if before is None else changes.near(before.place)
-        solved = _solve(normal + sums, right + whole.T @ (weight * wanted_m), aside.size, near)
-        left_m = wanted_m - whole @ solved.estimate
+        last, last_m = solved, left_m
+        reduced = normals.weighted(trust / (patches.variance_m2 + scatter_m2))
+        solved = _solve(reduced, normals.size, changes, last.place if last else None)
+        left_m = wanted_m - normals.effect(solved)
         scatter_m2 = _scatter(patches, left_m, moving)
         if round_ >= ROUNDS_TRUSTING:
             ratio = left_m / np.sqrt(patches.variance_m2 + scatter_m2) / TUKEY
             trust = np.where(np.abs(ratio) < 1, (1 - ratio**2) ** 2, 0.0)
-            if before is not None and before.place == solved.place and round_ > ROUNDS_TRUSTING + 1:
-                moved_m = whole @ (solved.estimate - before.estimate)
-                if np.linalg.norm(moved_m) <= SETTLED_M * np.sqrt(len(moved_m)):
+            if last is not None and last.place == solved.place and round_ > ROUNDS_TRUSTING + 1:
+                if np.linalg.norm(left_m - last_m) <= SETTLED_M * np.sqrt(len(left_m)):
                     break
     assert solved is not None  # noqa: S101 - there is a first round
-    states = slice(len(prior))
-    covariance = solved.covariance()[states, states]
-    return Adjustment(of, solved.estimate[states], covariance, solved.step_m, trust[~moving])
+    return Adjustment(
+        of, solved.by_line(of), Unknown(of, solved.reduced, solved.whole()), solved.step_m, trust[~moving]
+    )
 
 
-class _Aside:
-    """What prior and log alone say: normal equations of the state and the log's own faults."""
+@dataclass(frozen=True)
+class _Reduced:
+    """Normal equations after the own leans of the lines were taken out of them."""
 
-    def __init__(self, of: Basis, prior: Floats, log: LineLog | None) -> None:
-        self.faults = 0 if log is None else log.faults.shape[1]
-        state = len(prior)
-        self.size = state + self.faults
-        self.normal = np.eye(self.size)
-        self.normal[:state, :state] = _Factored(prior).inverse()
-        self.right = np.zeros(self.size)
-        if log is None:
-            return
-        felt = np.zeros((of.line_count, self.size))
-        azimuth_rad = of.line_azimuth_rad
+    normal: Floats  # (m, m)
+    right: Floats  # (m,)
+    own: KnownLeans
+    felt: Floats  # (lines, m) how the own leans go with the other unknowns
+    told: Floats  # (lines,) their right side
+
+    def own_rad(self, estimate: Floats) -> Floats:
+        """Own leans (lines,) that go with the other unknowns (m,)."""
+        return self.own.times((self.told - self.felt @ estimate)[:, None])[:, 0]
+
+
+class _Normals:
+    """Normal equations of the state by knots, the log's own faults and the change: m unknowns.
+
+    Each line's own lean is an unknown too, which is taken out at once.
+    """
+
+    def __init__(
+        self,
+        felt: Sensitivities,
+        field: sparse.csr_array,
+        wanted_m: Floats,
+        before: Beforehand,
+        log: LineLog | None,
+    ) -> None:
+        of = felt.of
+        seen, state = _design(felt), len(before.knots)
+        self._patches = len(felt)
+        self._lean, self._line, self._wanted = felt.lean, felt.line, wanted_m
+        faults = 0 if log is None else log.faults.shape[1]
+        self.size = state + faults
+        self._design = sparse.hstack([seen, sparse.csr_array((len(felt), faults)), field], format="csr")
+        self._log_weight = np.empty(0)
+        if log is not None:
+            self._add(log, interpolated(of, np.eye(of.lean_count)), of.line_azimuth_rad)
+        self._prior = np.zeros((self._design.shape[1],) * 2)
+        self._prior[:state, :state] = _Factored(before.knots).inverse()
+        self._prior[range(state, self.size), range(state, self.size)] = 1.0
+        self._own = before.own
+        rows = np.arange(len(self._line))
+        shape = of.line_count, len(rows)
+        self._lines = sparse.csr_array((self._lean, (self._line, rows)), shape=shape)
+
+    def _add(self, log: LineLog, knots: Floats, azimuth_rad: Floats) -> None:
+        """Add what the log says of each line, as further observations."""
+        felt = np.zeros((len(knots), self._design.shape[1]))
         felt[:, 0], felt[:, 1] = np.cos(azimuth_rad), -np.sin(azimuth_rad)
-        felt[:, len(GLOBAL) : len(GLOBAL) + of.line_count] = np.eye(of.line_count)
-        felt[:, state:] = log.faults
-        weighted = felt * log.weight[:, None]
-        self.normal += felt.T @ weighted
-        self.right = weighted.T @ log.lean_rad
+        felt[:, len(GLOBAL) : len(GLOBAL) + knots.shape[1]] = knots
+        felt[:, self.size - log.faults.shape[1] : self.size] = log.faults
+        self._design = sparse.vstack([self._design, sparse.csr_array(felt)], format="csr")
+        self._lean = np.concatenate([self._lean, np.ones(len(knots))])
+        self._line = np.concatenate([self._line, np.arange(len(knots))])
+        self._wanted = np.concatenate([self._wanted, log.lean_rad])
+        self._log_weight = log.weight
+
+    def weighted(self, weight: Floats) -> _Reduced:
+        """Return the equations for a weight of each patch (n,)."""
+        weight = np.concatenate([weight, self._log_weight])
+        weighted = sparse.diags_array(weight) @ self._design
+        own = self._own.given(np.bincount(self._line, weight * self._lean**2, self._lines.shape[0]))
+        felt = (self._lines @ weighted).toarray()
+        told = self._lines @ (weight * self._wanted)
+        normal = self._prior + (self._design.T @ weighted).toarray() - own.between(felt)
+        right = weighted.T @ self._wanted - felt.T @ own.times(told[:, None])[:, 0]
+        return _Reduced(normal, right, own, felt, told)
+
+    def effect(self, solved: _Solved) -> Floats:
+        """Effect of a solution on the patches (n,) [m]."""
+        own_rad = solved.reduced.own_rad(solved.estimate)
+        effect = self._design @ solved.estimate + self._lean * own_rad[self._line]
+        return np.asarray(effect[: self._patches])
 
 
 def _design(felt: Sensitivities) -> sparse.csr_array:
-    """Matrix J (n, u)."""
+    """Matrix J (n, p), by knots."""
     of, count = felt.of, len(felt)
-    before, after, share = felt.refraction_knot()
-    last = len(GLOBAL) + of.line_count
-    rows = np.tile(np.arange(count), len(GLOBAL) + 3)
-    columns = np.concatenate(
-        [np.repeat(np.arange(len(GLOBAL)), count), len(GLOBAL) + felt.line, last + before, last + after]
+    row = np.arange(count)
+    rows, columns, values = (
+        [np.tile(row, len(GLOBAL))],
+        [np.repeat(np.arange(len(GLOBAL)), count)],
+        [felt.globals_.ravel()],
     )
-    values = np.concatenate(
-        [felt.globals_.ravel(), felt.lean, felt.refraction * (1 - share), felt.refraction * share]
-    )
-    return sparse.csr_array((values, (rows, columns)), shape=(count, last + of.refraction_count))
+    for effect, (before, after, share), first in (
+        (felt.lean, felt.lean_knot(), len(GLOBAL)),
+        (felt.refraction, felt.refraction_knot(), len(GLOBAL) + of.lean_count),
+    ):
+        rows += [row, row]
+        columns += [first + before, first + after]
+        values += [effect * (1 - share), effect * share]
+    placed = np.concatenate(values), (np.concatenate(rows), np.concatenate(columns))
+    return sparse.csr_array(placed, shape=(count, len(of.names)))
+
+
+@dataclass(frozen=True)
+class Unknown:
+    """What an adjustment leaves unknown: own leans of the lines, given the other unknowns, and these."""
+
+    of: Basis
+    reduced: _Reduced
+    whole: _Factored  # (m, m)
+
+    def by_line(self) -> Floats:
+        """Covariance (u, u) of the state."""
+        of = self.of
+        state, lines = len(of.names), slice(len(GLOBAL), len(GLOBAL) + of.line_count)
+        tied = rows_at_lines(of, np.eye(state, len(self.reduced.right)))
+        tied[lines] -= self.reduced.own.times(self.reduced.felt)
+        half = self.whole.half(tied.T)
+        covariance = half.T @ half
+        covariance[lines, lines] += self.reduced.own.times(np.eye(of.line_count))
+        return np.asarray(covariance)
+
+    def by_knots(self, estimate: Floats) -> Shared:
+        """Return what is known of the state (u,), condensed to knots."""
+        of, own, between = self.of, self.reduced.own, leans_between(self.of)
+        lean = slice(len(GLOBAL), len(GLOBAL) + of.lean_count)
+        felt = own.times(self.reduced.felt)
+        narrow = between.fit @ felt
+        tied = np.eye(len(of.names), len(self.reduced.right))
+        tied[lean] -= narrow
+        half = self.whole.half(tied.T)
+        covariance = half.T @ half
+        beside = own.times(between.fit.T)
+        at_knots = between.fit @ beside
+        covariance[lean, lean] += at_knots
+        left_rad2 = own.variance() - np.einsum(
+            "ij,ij->i", between.knots, 2 * beside - interpolated(of, at_knots)
+        )
+        left_rad2 += np.sum(self.whole.half((felt - interpolated(of, narrow)).T) ** 2, axis=0)
+        return condensed(of, rows_at_knots(of, estimate[:, None])[:, 0], covariance, left_rad2)
 
 
 @dataclass(frozen=True)
 class _Changes:
-    """Priors of the change at its knots, for a step of one, by how alike neighbours are; which are tried."""
+    """Priors of the change at its knots, for a step of one, by how alike neighbours are."""
 
     precision: list[Floats]  # (knots, knots)
     log_determinant: list[float]  # of the covariance
-    tried: list[tuple[int, int]]  # places among ALIKE_CHANGES and CHANGE_STEPS_M
-
-    def near(self, place: tuple[int, int]) -> _Changes:
-        """Return the same with only those tried that lie next to a place."""
-        around = [p for p in self.tried if max(abs(p[0] - place[0]), abs(p[1] - place[1])) <= 1]
-        return replace(self, tried=around)
 
 
 def _change_field(patches: Patches, moving: Bools) -> tuple[sparse.csr_array, _Changes]:
@@ -210,9 +332,8 @@ def _change_field(patches: Patches, moving: Bools) -> tuple[sparse.csr_array, _C
     apart += np.abs(np.subtract.outer(out, out)) / ALIKE_RANGE_KNOTS
     own = np.eye(len(knots)) + UNIFORM_CHANGE**2
     covariances = [_Factored(own + alike**2 * np.exp(-apart)) for alike in ALIKE_CHANGES]
-    tried = [(alike, step) for alike in range(len(ALIKE_CHANGES)) for step in range(len(CHANGE_STEPS_M))]
     return field, _Changes(
-        [one.inverse() for one in covariances], [one.log_determinant() for one in covariances], tried
+        [one.inverse() for one in covariances], [one.log_determinant() for one in covariances]
     )
 
 
@@ -221,13 +342,19 @@ class _Factored:
 
     def __init__(self, matrix: Floats) -> None:
         self._scale = 1 / np.sqrt(np.diag(matrix))
-        scaled = matrix * self._scale[:, None] * self._scale
-        self._root, _ = linalg.cho_factor(scaled, lower=True, overwrite_a=True, check_finite=False)
+        self._root = _root(matrix * self._scale[:, None] * self._scale)
+
+    def half(self, right: Floats) -> Floats:
+        """Return H (n, k) so that HᵀH is the right side (n, k) both sides of the inverse."""
+        scaled = right * self._scale[:, None]
+        return np.asarray(
+            linalg.solve_triangular(self._root, scaled, lower=True, overwrite_b=True, check_finite=False)
+        )
 
     def solve(self, right: Floats) -> Floats:
-        """Solution for right sides (n,) or (n, k)."""
-        scale = self._scale if right.ndim == 1 else self._scale[:, None]
-        return np.asarray(linalg.cho_solve((self._root, True), right * scale, check_finite=False) * scale)
+        """Solution (n,)."""
+        solved = linalg.cho_solve((self._root, True), right * self._scale, check_finite=False)
+        return np.asarray(solved * self._scale)
 
     def inverse(self) -> Floats:
         """Inverse (n, n)."""
@@ -239,43 +366,96 @@ class _Factored:
 
     def log_determinant(self) -> float:
         """Logarithm of the determinant."""
-        return float(2 * (np.log(np.diag(self._root)).sum() - np.log(self._scale).sum()))
+        return _log_determinant(self._root) - float(2 * np.log(self._scale).sum())
+
+
+def _root(matrix: Floats) -> Floats:
+    """Return the lower triangular root of a symmetric matrix (n, n), which it overwrites."""
+    root, _ = linalg.cho_factor(matrix.T, lower=True, overwrite_a=True, check_finite=False)
+    return np.asarray(root)
+
+
+def _log_determinant(root: Floats) -> float:
+    return float(2 * np.log(np.diag(root)).sum())
 
 
 @dataclass(frozen=True)
 class _Solved:
     """Solution of normal equations whose last unknowns have the prior that makes the data most likely."""
 
-    estimate: Floats
+    reduced: _Reduced
+    estimate: Floats  # (m,)
     place: tuple[int, int]  # of the change's prior
-    step_m: float
-    state: _Factored  # the block of the state and the log's faults
-    across: Floats  # what a unit of change does to these
-    change: _Factored
+    precision: Floats  # (knots, knots) of that
 
-    def covariance(self) -> Floats:
-        """Covariance of the state and the log's faults."""
-        return self.state.inverse() + self.across @ self.change.solve(self.across.T)
+    @property
+    def step_m(self) -> float:
+        """One sigma of the change between its knots."""
+        alike, step = self.place
+        return CHANGE_STEPS_M[step] * float(np.hypot(1.0, ALIKE_CHANGES[alike]))
+
+    def by_line(self, of: Basis) -> Floats:
+        """State (u,) with the leans of the lines."""
+        state = rows_at_lines(of, self.estimate[: len(of.names), None])[:, 0]
+        state[len(GLOBAL) : len(GLOBAL) + of.line_count] += self.reduced.own_rad(self.estimate)
+        return np.asarray(state)
+
+    def whole(self) -> _Factored:
+        """Return the normal equations with the prior that was chosen."""
+        normal, first = self.reduced.normal.copy(), len(self.estimate) - len(self.precision)
+        normal[first:, first:] += self.precision
+        return _Factored(normal)
 
 
-def _solve(normal: Floats, right: Floats, size: int, changes: _Changes) -> _Solved:
-    """Solve; how much the moving ground changed, and how smoothly, is chosen by the likelihood."""
+def _solve(reduced: _Reduced, size: int, changes: _Changes, near: tuple[int, int] | None) -> _Solved:
+    """Solve; how much the moving ground changed, and how smoothly, is chosen by the likelihood.
+
+    With a prior chosen before, neighbours are taken to be about as alike as then.
+    """
+    normal, right = reduced.normal, reduced.right
     state = _Factored(normal[:size, :size])
-    across = -state.solve(normal[:size, size:])
-    reduced = normal[size:, size:] + normal[size:, :size] @ across
-    told = right[size:] + across.T @ right[:size]
-    found = []
-    for alike, step in changes.tried:
-        step_m = CHANGE_STEPS_M[step]
-        change = _Factored(reduced + changes.precision[alike] / step_m**2)
-        change_m = change.solve(told)
-        spread = (change.log_determinant() + changes.log_determinant[alike]) / 2 + len(told) * np.log(step_m)
-        odds = float(told @ change_m / 2 - spread) - ALIKE_ODDS[alike]
-        found.append((odds, (alike, step), change_m, change))
-    _, place, change_m, change = max(found, key=lambda one: one[0])
-    estimate = np.concatenate([state.solve(right[:size]) + across @ change_m, change_m])
-    step_m = CHANGE_STEPS_M[place[1]] * float(np.hypot(1.0, ALIKE_CHANGES[place[0]]))
-    return _Solved(estimate, place, step_m, state, across, change)
+    half = state.half(normal[:size, size:])
+    left = normal[size:, size:] - half.T @ half
+    told = right[size:] - half.T @ state.half(right[:size, None])[:, 0]
+    tried: dict[tuple[int, int], tuple[float, Floats]] = {}
+
+    def odds(place: tuple[int, int]) -> float:
+        if place not in tried:
+            tried[place] = _likelihood(left, told, changes, place)
+        return tried[place][0]
+
+    step = (len(CHANGE_STEPS_M) - 1) // 2 if near is None else near[1]
+    for alike in range(len(ALIKE_CHANGES)):
+        if near is None or abs(alike - near[0]) <= 1:
+            step = _climbed(lambda step, alike=alike: odds((alike, step)), step)
+    place = max(tried, key=odds)
+    change_m = tried[place][1]
+    estimate = np.concatenate([state.solve(right[:size] - normal[:size, size:] @ change_m), change_m])
+    return _Solved(reduced, estimate, place, changes.precision[place[0]] / CHANGE_STEPS_M[place[1]] ** 2)
+
+
+def _climbed(odds: Callable[[int], float], step: int) -> int:
+    """Return the place among CHANGE_STEPS_M from which the odds fall to either side."""
+    while True:
+        beside = [s for s in (step - 1, step, step + 1) if 0 <= s < len(CHANGE_STEPS_M)]
+        best = max(beside, key=odds)
+        if best == step:
+            return step
+        step = best
+
+
+def _likelihood(
+    left: Floats, told: Floats, changes: _Changes, place: tuple[int, int]
+) -> tuple[float, Floats]:
+    """Log likelihood of a prior of the change, and the change (knots,) [m] with it."""
+    alike, step = place
+    step_m = CHANGE_STEPS_M[step]
+    if not len(told):
+        return -ALIKE_ODDS[alike], told
+    root = _root(left + changes.precision[alike] / step_m**2)
+    change_m = linalg.cho_solve((root, True), told, check_finite=False)
+    spread = (_log_determinant(root) + changes.log_determinant[alike]) / 2 + len(told) * np.log(step_m)
+    return float(told @ change_m / 2 - spread) - ALIKE_ODDS[alike], change_m
 
 
 def _scatter(patches: Patches, left_m: Floats, moving: Bools) -> Floats:

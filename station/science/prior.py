@@ -8,9 +8,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from station.quantities import Floats, Habits, HeadTrack, Shared, Tilt
-from station.science.adjustment import LineLog
+from station.science.adjustment import Beforehand, LineLog
 from station.science.inclination import SENSOR_STEP_RAD, Cycle, Lean
-from station.science.shared import GLOBAL, Basis, by_knots
+from station.science.leans import OwnLeans
+from station.science.shared import GLOBAL, LINES_A_KNOT, Basis, by_knots
 
 REFRACTION_MEMORY_RAD = math.radians(15.0)
 RANGE_SCALE_UNKNOWN_PPM = 4.0  # no weather: 5 K and 5 hPa off, 0.737 ppm/K, 0.290 ppm/hPa, EQUATIONS 5.8
@@ -140,6 +141,38 @@ def by_line(of: Basis, globals_sigma: Floats, lean: Floats, bend: Floats) -> Flo
     covariance[first:last, first:last] = lean
     covariance[last:, last:] = bend
     return covariance
+
+
+def beforehand(of: Basis, lines: Lines, habits: Habits, *, weather_known: bool) -> Beforehand:
+    """Return what is known of a scan's state: the slow motion at knots, what is faster line by line.
+
+    Where the slow motion is not straight between knots, also at the seam of a scan all round, each line has
+    what is missing for its own, so that its variance is right; the rest of its correlation is left out.
+    """
+    before_s, after_s = lines.time_s[::LINES_A_KNOT], lines.time_s[1::LINES_A_KNOT]
+    knot_s = before_s - (after_s - before_s) / 2
+    if not of.closed:
+        knot_s = np.append(knot_s, lines.time_s[-1] + (lines.time_s[-1] - lines.time_s[-2]) / 2)
+    slow = np.exp(-np.abs(np.subtract.outer(knot_s, knot_s)) / SLOW_MOTION_S)
+    first, last = len(GLOBAL), len(GLOBAL) + of.lean_count
+    knots = np.zeros((len(of.names),) * 2)
+    knots[:first, :first] = np.diag(np.square(globals_sigma(habits, weather_known=weather_known)))
+    knots[first:last, first:last] = habits.slow_motion_rad**2 * slow
+    knots[last:, last:] = bending(habits, of)
+    apart = 1 - slow[np.arange(of.intervals), (np.arange(of.intervals) + 1) % of.lean_count]
+    share = (np.arange(LINES_A_KNOT) + 0.5) / LINES_A_KNOT
+    bent = 2 * np.outer(apart, share * (1 - share)).ravel()
+    order = np.argsort(lines.time_s)
+    return Beforehand(
+        of,
+        knots,
+        OwnLeans(
+            order=order,
+            likeness=np.exp(-np.diff(lines.time_s[order]) / FAST_MOTION_S),
+            alike_rad2=habits.fast_motion_rad**2,
+            alone_rad2=habits.line_motion_rad**2 + habits.slow_motion_rad**2 * bent,
+        ),
+    )
 
 
 def covariance_without_adjustment(
