@@ -38,6 +38,7 @@ BAND_ROWS = 128  # the cells that are looked at together: what a store chunk is 
 MARGIN_ROWS = 4  # rows beyond a band that its smoothed gradient looks at
 FEW_POINTS = 3
 MOVING_MOST = 400_000  # cells of moving ground that an adjustment looks at
+STABLE_MOST = 400_000  # the same of stable ground, in whole rows; so many tell all there is to tell
 FEW_STABLE = 20  # cells, that say nothing of a spread
 HIGH_INCIDENCE_COS = float(np.cos(np.radians(80.0)))
 
@@ -143,15 +144,15 @@ def level(gridder: Gridder, setup: Setup, told: Told, reference: Reference, stab
 
 
 def _cells(gridder: Gridder, setup: Setup, of: Basis, reference: Reference, stable: Bools) -> Iterator[Cells]:
-    """Give the cells of a scan that the reference knows, band by band; of too many moving ones a part."""
+    """Give the cells of a scan that the reference knows, band by band; of too many a part."""
     grid = setup.grid
     count = gridder.count.reshape(grid.shape)
-    every = 1 + np.count_nonzero(count) // MOVING_MOST
-    for band in _bands(grid):
+    step = 1 + np.count_nonzero(stable & (count > 0)) // STABLE_MOST
+    every = 1 + np.count_nonzero(count) // (step * MOVING_MOST)
+    for band in _bands(grid, step):
+        row = np.arange(*band.indices(grid.ny)) // step
         seen = (count[band] > 0) & np.isfinite(reference.elevation_m[band])
-        seen &= stable[band] | (
-            np.add.outer(np.arange(*band.indices(grid.ny)), np.arange(grid.nx)) % every == 0
-        )
+        seen &= stable[band] | (np.add.outer(row, np.arange(grid.nx)) % every == 0)
         if not seen.any():
             continue
         view = _view(setup, band, seen, reference.elevation_m)
@@ -243,9 +244,11 @@ def stable_figures(measured: Measurement) -> dict[str, float]:
     return figures
 
 
-def _bands(grid: Grid) -> Iterator[slice]:
-    for first in range(0, grid.ny, BAND_ROWS):
-        yield slice(first, min(first + BAND_ROWS, grid.ny))
+def _bands(grid: Grid, step: int = 1) -> Iterator[slice]:
+    """Give bands of so many rows, every `step`th."""
+    high = max(BAND_ROWS // step, 1) * step
+    for first in range(0, grid.ny, high):
+        yield slice(first, min(first + high, grid.ny), step)
 
 
 def _random(
@@ -355,15 +358,16 @@ def _view(
     assert setup.position_m is not None  # noqa: S101 - the callers' case
     first = max(band.start - MARGIN_ROWS, 0)
     rows = slice(first, band.stop + MARGIN_ROWS)
+    inner = slice(band.start - first, band.stop - first, band.step)
     around = elevation_m[rows]
     if better_m is not None:
         around = np.where(np.isfinite(better_m[rows]), better_m[rows], around)
     around = around - setup.position_m[2]
     east, north = (
-        np.nan_to_num(g[band.start - first :][: seen.shape[0]][seen].astype(np.float64))
-        for g in smooth_gradient(around, setup.grid.cell_m)
+        np.nan_to_num(g[seen].astype(np.float64))
+        for g in smooth_gradient(around, setup.grid.cell_m, rows=inner)
     )
     row, column = np.nonzero(seen)
-    height_m = around[band.start - first :][: seen.shape[0]][seen] + setup.position_m[2]
+    height_m = around[inner][seen] + setup.position_m[2]
     points = setup.grid.x_m[column], setup.grid.y_m[band][row], height_m
     return View.of(points, setup.position_m, east, north)

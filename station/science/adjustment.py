@@ -172,7 +172,7 @@ class _Reduced:
     normal: Floats  # (m, m)
     right: Floats  # (m,)
     own: KnownLeans
-    felt: Floats  # (lines, m) how the own leans go with the other unknowns
+    felt: sparse.csr_array  # (lines, m) how the own leans go with the other unknowns
     told: Floats  # (lines,) their right side
 
     def own_rad(self, estimate: Floats) -> Floats:
@@ -229,7 +229,7 @@ class _Normals:
         weight = np.concatenate([weight, self._log_weight])
         weighted = sparse.diags_array(weight) @ self._design
         own = self._own.given(np.bincount(self._line, weight * self._lean**2, self._lines.shape[0]))
-        felt = (self._lines @ weighted).toarray()
+        felt = self._lines @ weighted
         told = self._lines @ (weight * self._wanted)
         normal = self._prior + (self._design.T @ weighted).toarray() - own.between(felt)
         right = weighted.T @ self._wanted - felt.T @ own.times(told[:, None])[:, 0]
@@ -275,7 +275,7 @@ class Unknown:
         of = self.of
         state, lines = len(of.names), slice(len(GLOBAL), len(GLOBAL) + of.line_count)
         tied = rows_at_lines(of, np.eye(state, len(self.reduced.right)))
-        tied[lines] -= self.reduced.own.times(self.reduced.felt)
+        tied[lines] -= self.reduced.own.times(self.reduced.felt.toarray())
         half = self.whole.half(tied.T)
         covariance = half.T @ half
         covariance[lines, lines] += self.reduced.own.times(np.eye(of.line_count))
@@ -285,7 +285,7 @@ class Unknown:
         """Return what is known of the state (u,), condensed to knots."""
         of, own, between = self.of, self.reduced.own, leans_between(self.of)
         lean = slice(len(GLOBAL), len(GLOBAL) + of.lean_count)
-        felt = own.times(self.reduced.felt)
+        felt = own.times(self.reduced.felt.toarray())
         narrow = between.fit @ felt
         tied = np.eye(len(of.names), len(self.reduced.right))
         tied[lean] -= narrow

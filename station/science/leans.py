@@ -10,7 +10,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy import linalg
+from scipy import linalg, sparse
 
 from station.quantities import Floats, Ints
 
@@ -79,19 +79,28 @@ class KnownLeans:
         variance_rad2[self.order] += self.lent[self.order] ** 2 * alike
         return variance_rad2
 
-    def between(self, right: Floats) -> Floats:
-        """Return Rᵀ G R (k, k) for a matrix R (lines, k) whose columns hold only some lines each.
+    def between(self, right: sparse.csr_array) -> Floats:
+        """Return Rᵀ G R (k, k) for a matrix R (lines, k) whose columns hold few lines each.
 
-        Line by line the columns that take part are few, as what neighbours share fades.
+        Some lines after the other: what neighbours share fades, so that few columns take part at a time.
         """
-        lent = np.asfortranarray((self.lent[:, None] * right)[self.order])
-        alike, _ = linalg.lapack.dtbtrs(self.root, lent, uplo="L")
-        alone = np.sqrt(self.alone_rad2[self.order])[:, None] * right[self.order]
+        right = right[self.order]
         total = np.zeros((right.shape[1],) * 2)
-        least = FADED * np.abs(alike).max(axis=0, initial=0.0)
-        for first in range(0, len(alike), CHUNK_LINES):
+        carried, largest = np.zeros(right.shape[1]), np.zeros(right.shape[1])
+        tie = 0.0
+        for first in range(0, right.shape[0], CHUNK_LINES):
             lines = slice(first, first + CHUNK_LINES)
-            used = np.flatnonzero((np.abs(alike[lines]) > least).any(axis=0))
-            part = np.concatenate([alike[lines, used], alone[lines, used]])
-            total[np.ix_(used, used)] += part.T @ part
+            place = self.order[lines]
+            part = right[lines]
+            used = np.union1d(part.indices, np.flatnonzero(np.abs(carried) > FADED * largest))
+            here = part.toarray()[:, used]
+            alike = self.lent[place, None] * here
+            alike[0] -= tie * carried[used]
+            alike, _ = linalg.lapack.dtbtrs(self.root[:, lines], alike, uplo="L")
+            carried[:] = 0.0
+            carried[used] = alike[-1]
+            largest[used] = np.maximum(largest[used], np.abs(alike).max(axis=0))
+            tie = self.root[1, lines][-1]
+            whole = np.concatenate([alike, np.sqrt(self.alone_rad2[place, None]) * here])
+            total[np.ix_(used, used)] += whole.T @ whole
         return total
