@@ -13,8 +13,8 @@ from station.config import ScannerSection
 from station.pipeline import Setup, Told, gridder_for, level, measure
 from station.quantities import Bools, Floats, Grid, Reference
 from station.science import prior, shared
-from station.science.adjustment import LineLog
 from station.science.grid import Gridder
+from station.science.normals import LineLog
 
 GRID = Grid(west_m=0.0, north_m=5000.0, cell_m=1.0, nx=4000, ny=5000)
 RIDGE_M = (2000.0, -50.0, 700.0)  # beside the grid: the head looks over half a turn, as at Hintereisferner

@@ -25,9 +25,10 @@ from station.quantities import (
     Tilt,
 )
 from station.science import budget, change, ground, prior, shared, uncertainty
-from station.science.adjustment import Adjustment, LineLog, adjust, turned
+from station.science.adjustment import Adjustment, adjust, turned
 from station.science.air import AirCorrection, refraction_rise
 from station.science.grid import Gridder, slope_sampling_variance
+from station.science.normals import LineLog
 from station.science.patches import Cells, collect
 from station.science.pose import Frame, lean
 from station.science.shared import Basis, Sensitivities
@@ -147,8 +148,8 @@ def _cells(gridder: Gridder, setup: Setup, of: Basis, reference: Reference, stab
     """Give the cells of a scan that the reference knows, band by band; of too many a part."""
     grid = setup.grid
     count = gridder.count.reshape(grid.shape)
-    step = 1 + np.count_nonzero(stable & (count > 0)) // STABLE_MOST
-    every = 1 + np.count_nonzero(count) // (step * MOVING_MOST)
+    step = 1 + int(np.count_nonzero(stable & (count > 0))) // STABLE_MOST
+    every = 1 + int(np.count_nonzero(count)) // (step * MOVING_MOST)
     for band in _bands(grid, step):
         row = np.arange(*band.indices(grid.ny)) // step
         seen = (count[band] > 0) & np.isfinite(reference.elevation_m[band])

@@ -15,19 +15,18 @@ import numpy as np
 from scipy import linalg, sparse
 
 from station.quantities import Bools, Floats, Shared
-from station.science.leans import KnownLeans, OwnLeans
-from station.science.patches import CHI2_MEDIAN, Kind, Patches
-from station.science.shared import (
-    GLOBAL,
-    Basis,
-    Sensitivities,
-    condensed,
-    interpolated,
-    leans_between,
-    lines_from_knots,
-    rows_at_knots,
-    rows_at_lines,
+from station.science.normals import (
+    Beforehand,
+    Factored,
+    LineLog,
+    Normals,
+    Reduced,
+    Unknown,
+    log_determinant,
+    root_of,
 )
+from station.science.patches import CHI2_MEDIAN, Kind, Patches
+from station.science.shared import GLOBAL, Basis, Sensitivities, rows_at_lines
 
 ROUNDS = 8
 SETTLED_M = 0.0001  # a round that moves the patches by less is the last
@@ -47,42 +46,6 @@ ALIKE_CHANGES = (0.0, 1.0, 3.0, 10.0)
 # smooth snowfall with hundreds.
 ALIKE_ODDS = (0.0, 0.0, 12.0, 24.0)
 ALIKE_AZIMUTH_KNOTS, ALIKE_RANGE_KNOTS = 10.0, 6.0
-
-
-@dataclass(frozen=True)
-class LineLog:
-    """What the inclination log says of each group of lines, and what it may get wrong."""
-
-    lean_rad: Floats  # (lines,) along the line of sight
-    weight: Floats  # (lines,) 1 / rad², nought where there is none
-    faults: Floats  # (lines, f) effect of one sigma of each of its common errors [rad]
-
-
-@dataclass(frozen=True)
-class Beforehand:
-    """What is known of the scanner's state before a scan is looked at.
-
-    The lean of a line is what is straight between the knots beside it, and its own.
-    """
-
-    of: Basis
-    knots: Floats  # (p, p) covariance of the globals, the lean at knots, the refraction
-    own: OwnLeans
-
-    def against(self, reference: Shared | None) -> Beforehand:
-        """Return the same for the difference to the state of the reference, which is wrong itself."""
-        if reference is None:
-            return self
-        if reference.names != self.of.names:  # the scanner has been moved: it is as unsure as a scan
-            return Beforehand(self.of, 2 * self.knots, self.own.twice())
-        return Beforehand(self.of, self.knots + reference.covariance, self.own)
-
-    def by_line(self) -> Floats:
-        """Covariance (u, u) of globals, leans of lines and refraction knots."""
-        covariance = lines_from_knots(self.of, self.knots)
-        lines = slice(len(GLOBAL), len(GLOBAL) + self.of.line_count)
-        covariance[lines, lines] += self.own.covariance()
-        return covariance
 
 
 @dataclass(frozen=True)
@@ -142,7 +105,7 @@ def adjust(patches: Patches, assumed_rad: Floats, before: Beforehand, log: LineL
     moving = patches.kind == Kind.MOVING
     wanted_m = patches.residual_m + turned(patches.felt, assumed_rad)
     field, changes = _change_field(patches, moving)
-    normals = _Normals(patches.felt, field, wanted_m, before, log)
+    normals = Normals(patches.felt, field, wanted_m, before, log)
     scatter_m2 = np.full(len(patches), SCATTER_M[0] ** 2)
     trust = np.ones(len(patches))
     left_m = wanted_m
@@ -151,154 +114,19 @@ def adjust(patches: Patches, assumed_rad: Floats, before: Beforehand, log: LineL
         last, last_m = solved, left_m
         reduced = normals.weighted(trust / (patches.variance_m2 + scatter_m2))
         solved = _solve(reduced, normals.size, changes, last.place if last else None)
-        left_m = wanted_m - normals.effect(solved)
+        left_m = wanted_m - normals.effect(solved.estimate, reduced.own_rad(solved.estimate))
         scatter_m2 = _scatter(patches, left_m, moving)
         if round_ >= ROUNDS_TRUSTING:
             ratio = left_m / np.sqrt(patches.variance_m2 + scatter_m2) / TUKEY
             trust = np.where(np.abs(ratio) < 1, (1 - ratio**2) ** 2, 0.0)
-            if last is not None and last.place == solved.place and round_ > ROUNDS_TRUSTING + 1:
-                if np.linalg.norm(left_m - last_m) <= SETTLED_M * np.sqrt(len(left_m)):
-                    break
+            moved_m = np.linalg.norm(left_m - last_m)
+            settled = last is not None and last.place == solved.place and round_ > ROUNDS_TRUSTING + 1
+            if settled and moved_m <= SETTLED_M * np.sqrt(len(left_m)):
+                break
     assert solved is not None  # noqa: S101 - there is a first round
     return Adjustment(
         of, solved.by_line(of), Unknown(of, solved.reduced, solved.whole()), solved.step_m, trust[~moving]
     )
-
-
-@dataclass(frozen=True)
-class _Reduced:
-    """Normal equations after the own leans of the lines were taken out of them."""
-
-    normal: Floats  # (m, m)
-    right: Floats  # (m,)
-    own: KnownLeans
-    felt: sparse.csr_array  # (lines, m) how the own leans go with the other unknowns
-    told: Floats  # (lines,) their right side
-
-    def own_rad(self, estimate: Floats) -> Floats:
-        """Own leans (lines,) that go with the other unknowns (m,)."""
-        return self.own.times((self.told - self.felt @ estimate)[:, None])[:, 0]
-
-
-class _Normals:
-    """Normal equations of the state by knots, the log's own faults and the change: m unknowns.
-
-    Each line's own lean is an unknown too, which is taken out at once.
-    """
-
-    def __init__(
-        self,
-        felt: Sensitivities,
-        field: sparse.csr_array,
-        wanted_m: Floats,
-        before: Beforehand,
-        log: LineLog | None,
-    ) -> None:
-        of = felt.of
-        seen, state = _design(felt), len(before.knots)
-        self._patches = len(felt)
-        self._lean, self._line, self._wanted = felt.lean, felt.line, wanted_m
-        faults = 0 if log is None else log.faults.shape[1]
-        self.size = state + faults
-        self._design = sparse.hstack([seen, sparse.csr_array((len(felt), faults)), field], format="csr")
-        self._log_weight = np.empty(0)
-        if log is not None:
-            self._add(log, interpolated(of, np.eye(of.lean_count)), of.line_azimuth_rad)
-        self._prior = np.zeros((self._design.shape[1],) * 2)
-        self._prior[:state, :state] = _Factored(before.knots).inverse()
-        self._prior[range(state, self.size), range(state, self.size)] = 1.0
-        self._own = before.own
-        rows = np.arange(len(self._line))
-        shape = of.line_count, len(rows)
-        self._lines = sparse.csr_array((self._lean, (self._line, rows)), shape=shape)
-
-    def _add(self, log: LineLog, knots: Floats, azimuth_rad: Floats) -> None:
-        """Add what the log says of each line, as further observations."""
-        felt = np.zeros((len(knots), self._design.shape[1]))
-        felt[:, 0], felt[:, 1] = np.cos(azimuth_rad), -np.sin(azimuth_rad)
-        felt[:, len(GLOBAL) : len(GLOBAL) + knots.shape[1]] = knots
-        felt[:, self.size - log.faults.shape[1] : self.size] = log.faults
-        self._design = sparse.vstack([self._design, sparse.csr_array(felt)], format="csr")
-        self._lean = np.concatenate([self._lean, np.ones(len(knots))])
-        self._line = np.concatenate([self._line, np.arange(len(knots))])
-        self._wanted = np.concatenate([self._wanted, log.lean_rad])
-        self._log_weight = log.weight
-
-    def weighted(self, weight: Floats) -> _Reduced:
-        """Return the equations for a weight of each patch (n,)."""
-        weight = np.concatenate([weight, self._log_weight])
-        weighted = sparse.diags_array(weight) @ self._design
-        own = self._own.given(np.bincount(self._line, weight * self._lean**2, self._lines.shape[0]))
-        felt = self._lines @ weighted
-        told = self._lines @ (weight * self._wanted)
-        normal = self._prior + (self._design.T @ weighted).toarray() - own.between(felt)
-        right = weighted.T @ self._wanted - felt.T @ own.times(told[:, None])[:, 0]
-        return _Reduced(normal, right, own, felt, told)
-
-    def effect(self, solved: _Solved) -> Floats:
-        """Effect of a solution on the patches (n,) [m]."""
-        own_rad = solved.reduced.own_rad(solved.estimate)
-        effect = self._design @ solved.estimate + self._lean * own_rad[self._line]
-        return np.asarray(effect[: self._patches])
-
-
-def _design(felt: Sensitivities) -> sparse.csr_array:
-    """Matrix J (n, p), by knots."""
-    of, count = felt.of, len(felt)
-    row = np.arange(count)
-    rows, columns, values = (
-        [np.tile(row, len(GLOBAL))],
-        [np.repeat(np.arange(len(GLOBAL)), count)],
-        [felt.globals_.ravel()],
-    )
-    for effect, (before, after, share), first in (
-        (felt.lean, felt.lean_knot(), len(GLOBAL)),
-        (felt.refraction, felt.refraction_knot(), len(GLOBAL) + of.lean_count),
-    ):
-        rows += [row, row]
-        columns += [first + before, first + after]
-        values += [effect * (1 - share), effect * share]
-    placed = np.concatenate(values), (np.concatenate(rows), np.concatenate(columns))
-    return sparse.csr_array(placed, shape=(count, len(of.names)))
-
-
-@dataclass(frozen=True)
-class Unknown:
-    """What an adjustment leaves unknown: own leans of the lines, given the other unknowns, and these."""
-
-    of: Basis
-    reduced: _Reduced
-    whole: _Factored  # (m, m)
-
-    def by_line(self) -> Floats:
-        """Covariance (u, u) of the state."""
-        of = self.of
-        state, lines = len(of.names), slice(len(GLOBAL), len(GLOBAL) + of.line_count)
-        tied = rows_at_lines(of, np.eye(state, len(self.reduced.right)))
-        tied[lines] -= self.reduced.own.times(self.reduced.felt.toarray())
-        half = self.whole.half(tied.T)
-        covariance = half.T @ half
-        covariance[lines, lines] += self.reduced.own.times(np.eye(of.line_count))
-        return np.asarray(covariance)
-
-    def by_knots(self, estimate: Floats) -> Shared:
-        """Return what is known of the state (u,), condensed to knots."""
-        of, own, between = self.of, self.reduced.own, leans_between(self.of)
-        lean = slice(len(GLOBAL), len(GLOBAL) + of.lean_count)
-        felt = own.times(self.reduced.felt.toarray())
-        narrow = between.fit @ felt
-        tied = np.eye(len(of.names), len(self.reduced.right))
-        tied[lean] -= narrow
-        half = self.whole.half(tied.T)
-        covariance = half.T @ half
-        beside = own.times(between.fit.T)
-        at_knots = between.fit @ beside
-        covariance[lean, lean] += at_knots
-        left_rad2 = own.variance() - np.einsum(
-            "ij,ij->i", between.knots, 2 * beside - interpolated(of, at_knots)
-        )
-        left_rad2 += np.sum(self.whole.half((felt - interpolated(of, narrow)).T) ** 2, axis=0)
-        return condensed(of, rows_at_knots(of, estimate[:, None])[:, 0], covariance, left_rad2)
 
 
 @dataclass(frozen=True)
@@ -331,59 +159,17 @@ def _change_field(patches: Patches, moving: Bools) -> tuple[sparse.csr_array, _C
     apart = np.abs(np.subtract.outer(across, across)) / ALIKE_AZIMUTH_KNOTS
     apart += np.abs(np.subtract.outer(out, out)) / ALIKE_RANGE_KNOTS
     own = np.eye(len(knots)) + UNIFORM_CHANGE**2
-    covariances = [_Factored(own + alike**2 * np.exp(-apart)) for alike in ALIKE_CHANGES]
+    covariances = [Factored(own + alike**2 * np.exp(-apart)) for alike in ALIKE_CHANGES]
     return field, _Changes(
         [one.inverse() for one in covariances], [one.log_determinant() for one in covariances]
     )
-
-
-class _Factored:
-    """A covariance or normal matrix (n, n), factored; its unknowns may have units of very different size."""
-
-    def __init__(self, matrix: Floats) -> None:
-        self._scale = 1 / np.sqrt(np.diag(matrix))
-        self._root = _root(matrix * self._scale[:, None] * self._scale)
-
-    def half(self, right: Floats) -> Floats:
-        """Return H (n, k) so that HᵀH is the right side (n, k) both sides of the inverse."""
-        scaled = right * self._scale[:, None]
-        return np.asarray(
-            linalg.solve_triangular(self._root, scaled, lower=True, overwrite_b=True, check_finite=False)
-        )
-
-    def solve(self, right: Floats) -> Floats:
-        """Solution (n,)."""
-        solved = linalg.cho_solve((self._root, True), right * self._scale, check_finite=False)
-        return np.asarray(solved * self._scale)
-
-    def inverse(self) -> Floats:
-        """Inverse (n, n)."""
-        if not len(self._scale):
-            return np.empty((0, 0))
-        half = np.tril(linalg.lapack.dpotri(self._root, lower=True)[0])
-        whole = half + np.tril(half, -1).T
-        return np.asarray(whole * self._scale[:, None] * self._scale)
-
-    def log_determinant(self) -> float:
-        """Logarithm of the determinant."""
-        return _log_determinant(self._root) - float(2 * np.log(self._scale).sum())
-
-
-def _root(matrix: Floats) -> Floats:
-    """Return the lower triangular root of a symmetric matrix (n, n), which it overwrites."""
-    root, _ = linalg.cho_factor(matrix.T, lower=True, overwrite_a=True, check_finite=False)
-    return np.asarray(root)
-
-
-def _log_determinant(root: Floats) -> float:
-    return float(2 * np.log(np.diag(root)).sum())
 
 
 @dataclass(frozen=True)
 class _Solved:
     """Solution of normal equations whose last unknowns have the prior that makes the data most likely."""
 
-    reduced: _Reduced
+    reduced: Reduced
     estimate: Floats  # (m,)
     place: tuple[int, int]  # of the change's prior
     precision: Floats  # (knots, knots) of that
@@ -400,20 +186,20 @@ class _Solved:
         state[len(GLOBAL) : len(GLOBAL) + of.line_count] += self.reduced.own_rad(self.estimate)
         return np.asarray(state)
 
-    def whole(self) -> _Factored:
+    def whole(self) -> Factored:
         """Return the normal equations with the prior that was chosen."""
         normal, first = self.reduced.normal.copy(), len(self.estimate) - len(self.precision)
         normal[first:, first:] += self.precision
-        return _Factored(normal)
+        return Factored(normal)
 
 
-def _solve(reduced: _Reduced, size: int, changes: _Changes, near: tuple[int, int] | None) -> _Solved:
+def _solve(reduced: Reduced, size: int, changes: _Changes, near: tuple[int, int] | None) -> _Solved:
     """Solve; how much the moving ground changed, and how smoothly, is chosen by the likelihood.
 
     With a prior chosen before, neighbours are taken to be about as alike as then.
     """
     normal, right = reduced.normal, reduced.right
-    state = _Factored(normal[:size, :size])
+    state = Factored(normal[:size, :size])
     half = state.half(normal[:size, size:])
     left = normal[size:, size:] - half.T @ half
     told = right[size:] - half.T @ state.half(right[:size, None])[:, 0]
@@ -427,18 +213,18 @@ def _solve(reduced: _Reduced, size: int, changes: _Changes, near: tuple[int, int
     step = (len(CHANGE_STEPS_M) - 1) // 2 if near is None else near[1]
     for alike in range(len(ALIKE_CHANGES)):
         if near is None or abs(alike - near[0]) <= 1:
-            step = _climbed(lambda step, alike=alike: odds((alike, step)), step)
+            step = _climbed(odds, alike, step)
     place = max(tried, key=odds)
     change_m = tried[place][1]
     estimate = np.concatenate([state.solve(right[:size] - normal[:size, size:] @ change_m), change_m])
     return _Solved(reduced, estimate, place, changes.precision[place[0]] / CHANGE_STEPS_M[place[1]] ** 2)
 
 
-def _climbed(odds: Callable[[int], float], step: int) -> int:
+def _climbed(odds: Callable[[tuple[int, int]], float], alike: int, step: int) -> int:
     """Return the place among CHANGE_STEPS_M from which the odds fall to either side."""
     while True:
-        beside = [s for s in (step - 1, step, step + 1) if 0 <= s < len(CHANGE_STEPS_M)]
-        best = max(beside, key=odds)
+        beside = [(alike, s) for s in (step - 1, step, step + 1) if 0 <= s < len(CHANGE_STEPS_M)]
+        _, best = max(beside, key=odds)
         if best == step:
             return step
         step = best
@@ -452,9 +238,9 @@ def _likelihood(
     step_m = CHANGE_STEPS_M[step]
     if not len(told):
         return -ALIKE_ODDS[alike], told
-    root = _root(left + changes.precision[alike] / step_m**2)
+    root = root_of(left + changes.precision[alike] / step_m**2)
     change_m = linalg.cho_solve((root, True), told, check_finite=False)
-    spread = (_log_determinant(root) + changes.log_determinant[alike]) / 2 + len(told) * np.log(step_m)
+    spread = (log_determinant(root) + changes.log_determinant[alike]) / 2 + len(told) * np.log(step_m)
     return float(told @ change_m / 2 - spread) - ALIKE_ODDS[alike], change_m
 
 

@@ -96,7 +96,7 @@ class KnownLeans:
             here = part.toarray()[:, used]
             alike = self.lent[place, None] * here
             alike[0] -= tie * carried[used]
-            alike, _ = linalg.lapack.dtbtrs(self.root[:, lines], alike, uplo="L")
+            alike = linalg.solve_banded((1, 0), self.root[:, lines], alike, check_finite=False)
             carried[:] = 0.0
             carried[used] = alike[-1]
             largest[used] = np.maximum(largest[used], np.abs(alike).max(axis=0))

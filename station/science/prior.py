@@ -8,9 +8,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from station.quantities import Floats, Habits, HeadTrack, Shared, Tilt
-from station.science.adjustment import Beforehand, LineLog
 from station.science.inclination import SENSOR_STEP_RAD, Cycle, Lean
 from station.science.leans import OwnLeans
+from station.science.normals import Beforehand, LineLog
 from station.science.shared import GLOBAL, LINES_A_KNOT, Basis, by_knots
 
 REFRACTION_MEMORY_RAD = math.radians(15.0)

@@ -42,7 +42,9 @@ def smooth(values: Floats | Floats32, cells: float, rows: slice = ALL) -> Floats
     """
     known = np.isfinite(values)
     weight = _under_gaussian(known.astype(np.float32), cells, rows)
-    total = _under_gaussian(np.where(known, values, np.float32(0)).astype(np.float32, copy=False), cells, rows)
+    total = _under_gaussian(
+        np.where(known, values, np.float32(0)).astype(np.float32, copy=False), cells, rows
+    )
     total[weight <= 1e-3] = np.nan
     total /= np.maximum(weight, 1e-3, out=weight)
     return total
@@ -60,9 +62,7 @@ def _under_gaussian(values: Floats32, cells: float, rows: slice) -> Floats32:
         start, stop, step = wanted.indices(values.shape[axis])
         margin = ((0, 0),) * axis + ((reach, reach),) + ((0, 0),) * (1 - axis)
         around = np.pad(values, margin)
-        here = [
-            (ALL,) * axis + (slice(start + at, stop + at, step),) for at in range(2 * reach + 1)
-        ]
+        here = [(ALL,) * axis + (slice(start + at, stop + at, step),) for at in range(2 * reach + 1)]
         values = around[here[reach]] * share[0]
         beside = np.empty_like(values)
         for apart in range(1, reach + 1):
