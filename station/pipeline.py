@@ -39,7 +39,7 @@ BAND_ROWS = 128  # the cells that are looked at together: what a store chunk is 
 MARGIN_ROWS = 4  # rows beyond a band that its smoothed gradient looks at
 FEW_POINTS = 3
 MOVING_MOST = 400_000  # cells of moving ground that an adjustment looks at
-STABLE_MOST = 400_000  # the same of stable ground, in whole rows; so many tell all there is to tell
+STABLE_MOST = 800_000  # the same of stable ground, in whole rows; so many tell all there is to tell
 FEW_STABLE = 20  # cells, that say nothing of a spread
 HIGH_INCIDENCE_COS = float(np.cos(np.radians(80.0)))
 
@@ -152,8 +152,9 @@ def _cells(gridder: Gridder, setup: Setup, of: Basis, reference: Reference, stab
     every = 1 + int(np.count_nonzero(count)) // (step * MOVING_MOST)
     for band in _bands(grid, step):
         row = np.arange(*band.indices(grid.ny)) // step
-        seen = (count[band] > 0) & np.isfinite(reference.elevation_m[band])
-        seen &= stable[band] | (np.add.outer(row, np.arange(grid.nx)) % every == 0)
+        seen = np.equal.outer(-row % every, np.arange(grid.nx) % every)
+        seen |= stable[band]
+        seen &= (count[band] > 0) & np.isfinite(reference.elevation_m[band])
         if not seen.any():
             continue
         view = _view(setup, band, seen, reference.elevation_m)

@@ -92,7 +92,9 @@ class KnownLeans:
             lines = slice(first, first + CHUNK_LINES)
             place = self.order[lines]
             part = right[lines]
-            used = np.union1d(part.indices, np.flatnonzero(np.abs(carried) > FADED * largest))
+            taking_part = np.abs(carried) > FADED * largest
+            taking_part[part.indices] = True
+            used = np.flatnonzero(taking_part)
             here = part.toarray()[:, used]
             alike = self.lent[place, None] * here
             alike[0] -= tie * carried[used]

@@ -324,7 +324,7 @@ class LeansBetween:
 def leans_between(of: Basis) -> LeansBetween:
     """Return the matrices of a basis; made once."""
     knots = interpolated(of, np.eye(of.lean_count))
-    fit = np.asarray(np.linalg.solve(knots.T @ knots, knots.T))
+    fit = np.linalg.inv(knots.T @ knots) @ knots.T
     return LeansBetween(knots, fit, np.eye(of.line_count) - interpolated(of, fit))
 
 
