@@ -201,42 +201,29 @@ class Sensitivities:
 
     def variance(self, unknown: Shared) -> Floats:
         """Variance of each cell's height (n,) [m²]: the diagonal of J C Jᵀ, and what its line adds."""
-        variance_m2 = np.empty(len(self))
-        of = self.of
-        before, _, share = self.lean_knot()
-        _, _, bend_share = self.refraction_knot()
-        order = np.argsort(before.astype(np.int16), kind="stable")
+        of, first = self.of, len(GLOBAL)
+        before = self.passed.astype(np.int16)
+        order = np.argsort(before, kind="stable")
         bounds = np.searchsorted(before[order], np.arange(of.intervals + 1))
         own = leans_between(of).left ** 2 @ line_variances(of, unknown)
+        variance_m2 = self.lean**2 * own[self.line]
         for knot in np.flatnonzero(np.diff(bounds)):
             cells = order[bounds[knot] : bounds[knot + 1]]
             bend = knot // LEAN_PER_REFRACTION
             knots = (
-                len(GLOBAL) + knot,
-                len(GLOBAL) + (knot + 1) % of.lean_count,
-                len(GLOBAL) + of.lean_count + bend,
-                len(GLOBAL) + of.lean_count + (bend + 1) % of.refraction_count,
+                first + knot,
+                first + (knot + 1) % of.lean_count,
+                first + of.lean_count + bend,
+                first + of.lean_count + (bend + 1) % of.refraction_count,
             )
-            felt = [*range(len(GLOBAL)), *knots]
-            along, bent = self.lean[cells], self.refraction[cells]
-            columns = np.vstack(
-                [
-                    self.globals_[:, cells],
-                    along * (1 - share[cells]),
-                    along * share[cells],
-                    bent * (1 - bend_share[cells]),
-                    bent * bend_share[cells],
-                ]
-            )
-            root = _root(unknown.covariance[np.ix_(felt, felt)])
-            variance_m2[cells] = np.sum((root @ columns) ** 2, axis=0)
-        return variance_m2 + self.lean**2 * own[self.line]
-
-
-def _root(covariance: Floats) -> Floats:
-    """Return R with RᵀR = C (p, p), also where C is singular."""
-    values, vectors = np.linalg.eigh(covariance)
-    return np.asarray((vectors * np.sqrt(np.maximum(values, 0.0))).T)
+            felt = [*range(first), *knots]
+            passed, along, bent = self.passed[cells], self.lean[cells], self.refraction[cells]
+            after, bent_after = along * (passed - knot), bent * (passed / LEAN_PER_REFRACTION - bend)
+            beside = np.stack([along - after, after, bent - bent_after, bent_after])
+            columns = np.concatenate([self.globals_[:, cells], beside])
+            told_m2 = np.einsum("ij,ij->j", columns, unknown.covariance[np.ix_(felt, felt)] @ columns)
+            variance_m2[cells] += np.maximum(told_m2, 0.0)  # rounding, where the covariance is singular
+        return variance_m2
 
 
 def line_variances(of: Basis, unknown: Shared) -> Floats:
