@@ -124,9 +124,9 @@ def adjust(patches: Patches, assumed_rad: Floats, before: Beforehand, log: LineL
             if settled and moved_m <= SETTLED_M * np.sqrt(len(left_m)):
                 break
     assert solved is not None  # noqa: S101 - there is a first round
-    return Adjustment(
-        of, solved.by_line(of), Unknown(of, solved.reduced, solved.whole()), solved.step_m, trust[~moving]
-    )
+    reduced = solved.reduced
+    unknown = Unknown(of, reduced.own, reduced.felt, solved.whole())
+    return Adjustment(of, solved.by_line(of), unknown, solved.step_m, trust[~moving])
 
 
 @dataclass(frozen=True)

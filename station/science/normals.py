@@ -108,6 +108,7 @@ class Normals:
         rows = np.arange(len(self._line))
         shape = of.line_count, len(rows)
         self._lines = sparse.csr_array((self._lean, (self._line, rows)), shape=shape)
+        self._across = self._design.T.tocsr()
 
     def _add(self, log: LineLog, knots: Floats, azimuth_rad: Floats) -> None:
         """Add what the log says of each line, as further observations."""
@@ -128,8 +129,8 @@ class Normals:
         own = self._own.given(np.asarray(self._lines @ (weight * self._lean)))
         felt: sparse.csr_array = self._lines @ weighted
         told = np.asarray(self._lines @ (weight * self._wanted))
-        normal = self._prior + (self._design.T @ weighted).toarray() - own.between(felt)
-        right = weighted.T @ self._wanted - felt.T @ own.times(told[:, None])[:, 0]
+        normal = self._prior + (self._across @ weighted).toarray() - own.between(felt)
+        right = self._across @ (weight * self._wanted) - felt.T @ own.times(told[:, None])[:, 0]
         return Reduced(normal, right, own, felt, told)
 
     def effect(self, estimate: Floats, own_rad: Floats) -> Floats:
@@ -163,27 +164,28 @@ class Unknown:
     """What an adjustment leaves unknown: own leans of the lines, given the other unknowns, and these."""
 
     of: Basis
-    reduced: Reduced
+    own: KnownLeans
+    felt: sparse.csr_array  # (lines, m) how the own leans go with the other unknowns
     whole: Factored  # (m, m)
 
     def by_line(self) -> Floats:
         """Covariance (u, u) of the state."""
         of = self.of
         state, lines = len(of.names), slice(len(GLOBAL), len(GLOBAL) + of.line_count)
-        tied = rows_at_lines(of, np.eye(state, len(self.reduced.right)))
-        tied[lines] -= self.reduced.own.times(self.reduced.felt.toarray())
+        tied = rows_at_lines(of, np.eye(state, self.felt.shape[1]))
+        tied[lines] -= self.own.times(self.felt.toarray())
         half = self.whole.half(tied.T)
         covariance = half.T @ half
-        covariance[lines, lines] += self.reduced.own.times(np.eye(of.line_count))
+        covariance[lines, lines] += self.own.times(np.eye(of.line_count))
         return np.asarray(covariance)
 
     def by_knots(self, estimate: Floats) -> Shared:
         """Return what is known of the state (u,), condensed to knots."""
-        of, own, between = self.of, self.reduced.own, leans_between(self.of)
+        of, own, between = self.of, self.own, leans_between(self.of)
         lean = slice(len(GLOBAL), len(GLOBAL) + of.lean_count)
-        felt = own.times(self.reduced.felt.toarray())
+        felt = own.times(self.felt.toarray())
         narrow = between.fit @ felt
-        tied = np.eye(len(of.names), len(self.reduced.right))
+        tied = np.eye(len(of.names), self.felt.shape[1])
         tied[lean] -= narrow
         half = self.whole.half(tied.T)
         covariance = half.T @ half

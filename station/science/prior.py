@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -228,30 +229,36 @@ def cycle_changes(lines: Lines, zero: Cycle) -> Floats:
     return CYCLE_CHANGE_SHARE * np.stack(waves, axis=-1)
 
 
-def learned(start: Habits, of: Basis, scans: list[tuple[Lines, Floats, Floats]]) -> Habits:
+def learned(start: Habits, of: Basis, scans: Iterable[tuple[Lines, Floats, Floats]]) -> Habits:
     """Return the habits that estimates (u,) and covariances (u, u) of several scans speak for.
 
     Each variance is what the scans show (estimate squared plus what is unknown of it), drawn to its start
     value as if that came from `SCANS_WORTH` scans. Motions are told apart by their correlation in time, by
     steps of the expectation-maximisation of variance components.
     """
-    if len(scans) < 2:
-        return start
     first, last = len(GLOBAL), len(GLOBAL) + of.line_count
-    shown = np.mean([e**2 + np.diag(c) for _, e, c in scans], axis=0) * len(scans) / (len(scans) - 1)
+    lean = slice(first, last)
+    shown, moved = np.zeros(last + of.refraction_count), np.zeros((of.line_count,) * 2)
+    passed: list[Lines] = []
+    for lines, estimate, covariance in scans:  # one after the other: covariances are large
+        passed.append(lines)
+        shown += estimate**2 + np.diag(covariance)
+        moved += np.outer(estimate[lean], estimate[lean]) + covariance[lean, lean]
+    count = len(passed)
+    if count < 2:
+        return start
+    shown, moved = shown / (count - 1), moved / count
 
     def drawn(name: str, variance: float) -> float:
-        mass = len(scans) + SCANS_WORTH
-        return math.sqrt((variance * len(scans) + getattr(start, name) ** 2 * SCANS_WORTH) / mass)
+        mass = count + SCANS_WORTH
+        return math.sqrt((variance * count + getattr(start, name) ** 2 * SCANS_WORTH) / mass)
 
     seen = {name: float(shown[place].mean()) for name, place in SHOWN.items()}
     seen["refraction_by_azimuth"] = float(shown[last:].mean())
-    lean = slice(first, last)
-    moved = np.mean([np.outer(e[lean], e[lean]) + c[lean, lean] for _, e, c in scans], axis=0)
-    kernels = motions(scans[0][0])
+    kernels = motions(passed[0])
     now = start
     for _ in range(MOTION_STEPS):
-        weight = np.linalg.inv(motion(now, scans[0][0]))
+        weight = np.linalg.inv(motion(now, passed[0]))
         shown_by = weight @ moved @ weight
         for name, kernel in zip(MOTIONS, kernels, strict=True):
             seen[name] = getattr(now, name) ** 2 * float(np.sum(shown_by * kernel) / np.sum(weight * kernel))
