@@ -12,8 +12,8 @@ from scipy import ndimage
 from station.pipeline import Setup, Told, gridder_for, level, measure
 from station.quantities import Bools, Floats, Grid, Reference
 from station.science import prior, shared
-from station.science.adjustment import LineLog
 from station.science.grid import Gridder
+from station.science.normals import LineLog
 from station.sections import ScannerSection
 
 GRID = Grid(west_m=0.0, north_m=5000.0, cell_m=1.0, nx=4000, ny=5000)

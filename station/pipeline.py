@@ -25,9 +25,10 @@ from station.quantities import (
     Tilt,
 )
 from station.science import budget, change, ground, prior, shared, uncertainty
-from station.science.adjustment import Adjustment, LineLog, adjust, prior_of_difference, turned
+from station.science.adjustment import Adjustment, adjust, turned
 from station.science.air import AirCorrection, refraction_rise
 from station.science.grid import Gridder, slope_sampling_variance
+from station.science.normals import LineLog
 from station.science.patches import Cells, collect
 from station.science.pose import Frame, lean
 from station.science.shared import Basis, Sensitivities
@@ -38,6 +39,7 @@ BAND_ROWS = 128  # the cells that are looked at together: what a store chunk is 
 MARGIN_ROWS = 4  # rows beyond a band that its smoothed gradient looks at
 FEW_POINTS = 3
 MOVING_MOST = 400_000  # cells of moving ground that an adjustment looks at
+STABLE_MOST = 800_000  # the same of stable ground, in whole rows; so many tell all there is to tell
 FEW_STABLE = 20  # cells, that say nothing of a spread
 HIGH_INCIDENCE_COS = float(np.cos(np.radians(80.0)))
 
@@ -136,25 +138,23 @@ class Told:
 
 def level(gridder: Gridder, setup: Setup, told: Told, reference: Reference, stable: Bools) -> Adjustment:
     """Estimate the state of the scanner from a scan on its grid; `stable` (ny, nx) is ground known for it."""
-    habits = reference.habits
-    sigma = prior.globals_sigma(habits, weather_known=told.weather_known)
-    motion, bend = prior.motion(habits, told.lines), prior.bending(habits, told.of)
-    state = prior_of_difference(told.of, prior.by_line(told.of, sigma, motion, bend), reference.shared)
+    state = prior.beforehand(told.of, told.lines, reference.habits, weather_known=told.weather_known)
     bands = _cells(gridder, setup, told.of, reference, stable)
     patches = collect(told.of, bands, setup.scanner.range_max_m)
-    return adjust(patches, told.assumed_rad, state, told.log)
+    return adjust(patches, told.assumed_rad, state.against(reference.shared), told.log)
 
 
 def _cells(gridder: Gridder, setup: Setup, of: Basis, reference: Reference, stable: Bools) -> Iterator[Cells]:
-    """Give the cells of a scan that the reference knows, band by band; of too many moving ones a part."""
+    """Give the cells of a scan that the reference knows, band by band; of too many a part."""
     grid = setup.grid
     count = gridder.count.reshape(grid.shape)
-    every = 1 + np.count_nonzero(count) // MOVING_MOST
-    for band in _bands(grid):
-        seen = (count[band] > 0) & np.isfinite(reference.elevation_m[band])
-        seen &= stable[band] | (
-            np.add.outer(np.arange(*band.indices(grid.ny)), np.arange(grid.nx)) % every == 0
-        )
+    step = 1 + int(np.count_nonzero(stable & (count > 0))) // STABLE_MOST
+    every = 1 + int(np.count_nonzero(count)) // (step * MOVING_MOST)
+    for band in _bands(grid, step):
+        row = np.arange(*band.indices(grid.ny)) // step
+        seen = np.equal.outer(-row % every, np.arange(grid.nx) % every)
+        seen |= stable[band]
+        seen &= (count[band] > 0) & np.isfinite(reference.elevation_m[band])
         if not seen.any():
             continue
         view = _view(setup, band, seen, reference.elevation_m)
@@ -246,9 +246,11 @@ def stable_figures(measured: Measurement) -> dict[str, float]:
     return figures
 
 
-def _bands(grid: Grid) -> Iterator[slice]:
-    for first in range(0, grid.ny, BAND_ROWS):
-        yield slice(first, min(first + BAND_ROWS, grid.ny))
+def _bands(grid: Grid, step: int = 1) -> Iterator[slice]:
+    """Give bands of so many rows, every `step`th."""
+    high = max(BAND_ROWS // step, 1) * step
+    for first in range(0, grid.ny, high):
+        yield slice(first, min(first + high, grid.ny), step)
 
 
 def _random(
@@ -358,15 +360,16 @@ def _view(
     assert setup.position_m is not None  # noqa: S101 - the callers' case
     first = max(band.start - MARGIN_ROWS, 0)
     rows = slice(first, band.stop + MARGIN_ROWS)
+    inner = slice(band.start - first, band.stop - first, band.step)
     around = elevation_m[rows]
     if better_m is not None:
         around = np.where(np.isfinite(better_m[rows]), better_m[rows], around)
     around = around - setup.position_m[2]
     east, north = (
-        np.nan_to_num(g[band.start - first :][: seen.shape[0]][seen].astype(np.float64))
-        for g in smooth_gradient(around, setup.grid.cell_m)
+        np.nan_to_num(g[seen].astype(np.float64))
+        for g in smooth_gradient(around, setup.grid.cell_m, rows=inner)
     )
     row, column = np.nonzero(seen)
-    height_m = around[band.start - first :][: seen.shape[0]][seen] + setup.position_m[2]
+    height_m = around[inner][seen] + setup.position_m[2]
     points = setup.grid.x_m[column], setup.grid.y_m[band][row], height_m
     return View.of(points, setup.position_m, east, north)

@@ -8,14 +8,25 @@ Source: EQUATIONS 6.3, ADJUSTMENT.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from collections.abc import Callable
+from dataclasses import dataclass
 
 import numpy as np
 from scipy import linalg, sparse
 
 from station.quantities import Bools, Floats, Shared
+from station.science.normals import (
+    Beforehand,
+    Factored,
+    LineLog,
+    Normals,
+    Reduced,
+    Unknown,
+    log_determinant,
+    root_of,
+)
 from station.science.patches import CHI2_MEDIAN, Kind, Patches
-from station.science.shared import GLOBAL, Basis, Sensitivities, by_knots, lines_from_knots
+from station.science.shared import GLOBAL, Basis, Sensitivities, rows_at_lines
 
 ROUNDS = 8
 SETTLED_M = 0.0001  # a round that moves the patches by less is the last
@@ -38,15 +49,6 @@ ALIKE_AZIMUTH_KNOTS, ALIKE_RANGE_KNOTS = 10.0, 6.0
 
 
 @dataclass(frozen=True)
-class LineLog:
-    """What the inclination log says of each group of lines, and what it may get wrong."""
-
-    lean_rad: Floats  # (lines,) along the line of sight
-    weight: Floats  # (lines,) 1 / rad², nought where there is none
-    faults: Floats  # (lines, f) effect of one sigma of each of its common errors [rad]
-
-
-@dataclass(frozen=True)
 class Adjustment:
     """The scanner's state against the SOP: nine globals, the lean of each group of lines, refraction.
 
@@ -56,7 +58,7 @@ class Adjustment:
 
     of: Basis
     estimate: Floats  # (u,)
-    covariance: Floats  # (u, u)
+    unknown: Unknown
     change_step_m: float
     stable_weight: Floats
 
@@ -76,9 +78,14 @@ class Adjustment:
         """Share of the stable patches that fit nothing else; nought where there is none."""
         return float(np.mean(self.stable_weight < TRUSTED)) if len(self.stable_weight) else 0.0
 
+    @property
+    def covariance(self) -> Floats:
+        """Covariance (u, u) of the estimate."""
+        return self.unknown.by_line()
+
     def shared(self) -> Shared:
         """The same by knots, for the store."""
-        return by_knots(self.of, self.estimate, self.covariance)
+        return self.unknown.by_knots(self.estimate)
 
 
 def turned(felt: Sensitivities, assumed_rad: Floats) -> Floats:
@@ -87,17 +94,8 @@ def turned(felt: Sensitivities, assumed_rad: Floats) -> Floats:
     return np.asarray(felt.globals_[0] * east + felt.globals_[1] * north - felt.globals_[2] * up)
 
 
-def prior_of_difference(of: Basis, prior: Floats, reference: Shared | None) -> Floats:
-    """Covariance of a scan's state against that of the reference, which is wrong itself."""
-    if reference is None:
-        return prior
-    if reference.names != of.names:  # the scanner has been moved: the reference is as unsure as a scan
-        return 2 * prior
-    return prior + lines_from_knots(of, reference.covariance)
-
-
-def adjust(patches: Patches, assumed_rad: Floats, prior: Floats, log: LineLog | None) -> Adjustment:
-    """Estimate the scanner's state from patches, the log and a prior covariance (u, u).
+def adjust(patches: Patches, assumed_rad: Floats, before: Beforehand, log: LineLog | None) -> Adjustment:
+    """Estimate the scanner's state from patches, the log and what is known beforehand.
 
     `assumed_rad` (3, lines) is the lean that the points were already turned by, about east, north and up.
     Withheld patches are left out.
@@ -107,84 +105,36 @@ def adjust(patches: Patches, assumed_rad: Floats, prior: Floats, log: LineLog | 
     moving = patches.kind == Kind.MOVING
     wanted_m = patches.residual_m + turned(patches.felt, assumed_rad)
     field, changes = _change_field(patches, moving)
-    aside = _Aside(of, prior, log)
-    columns = [_design(patches.felt), sparse.csr_array((len(patches), aside.faults)), field]
-    whole = sparse.csr_array(sparse.hstack(columns))
-    normal, right = (np.zeros((whole.shape[1],) * n) for n in (2, 1))
-    normal[: aside.size, : aside.size], right[: aside.size] = aside.normal, aside.right
+    normals = Normals(patches.felt, field, wanted_m, before, log)
     scatter_m2 = np.full(len(patches), SCATTER_M[0] ** 2)
     trust = np.ones(len(patches))
+    left_m = wanted_m
     solved: _Solved | None = None
     for round_ in range(ROUNDS):
-        before = solved
-        weight = trust / (patches.variance_m2 + scatter_m2)
-        sums = (whole.T @ sparse.csr_array(whole.multiply(weight[:, None]))).toarray()
-        near = changes if before is None else changes.near(before.place)
-        solved = _solve(normal + sums, right + whole.T @ (weight * wanted_m), aside.size, near)
-        left_m = wanted_m - whole @ solved.estimate
+        last, last_m = solved, left_m
+        reduced = normals.weighted(trust / (patches.variance_m2 + scatter_m2))
+        solved = _solve(reduced, normals.size, changes, last.place if last else None)
+        left_m = wanted_m - normals.effect(solved.estimate, reduced.own_rad(solved.estimate))
         scatter_m2 = _scatter(patches, left_m, moving)
         if round_ >= ROUNDS_TRUSTING:
             ratio = left_m / np.sqrt(patches.variance_m2 + scatter_m2) / TUKEY
             trust = np.where(np.abs(ratio) < 1, (1 - ratio**2) ** 2, 0.0)
-            if before is not None and before.place == solved.place and round_ > ROUNDS_TRUSTING + 1:
-                moved_m = whole @ (solved.estimate - before.estimate)
-                if np.linalg.norm(moved_m) <= SETTLED_M * np.sqrt(len(moved_m)):
-                    break
+            moved_m = np.linalg.norm(left_m - last_m)
+            settled = last is not None and last.place == solved.place and round_ > ROUNDS_TRUSTING + 1
+            if settled and moved_m <= SETTLED_M * np.sqrt(len(left_m)):
+                break
     assert solved is not None  # noqa: S101 - there is a first round
-    states = slice(len(prior))
-    covariance = solved.covariance()[states, states]
-    return Adjustment(of, solved.estimate[states], covariance, solved.step_m, trust[~moving])
-
-
-class _Aside:
-    """What prior and log alone say: normal equations of the state and the log's own faults."""
-
-    def __init__(self, of: Basis, prior: Floats, log: LineLog | None) -> None:
-        self.faults = 0 if log is None else log.faults.shape[1]
-        state = len(prior)
-        self.size = state + self.faults
-        self.normal = np.eye(self.size)
-        self.normal[:state, :state] = _Factored(prior).inverse()
-        self.right = np.zeros(self.size)
-        if log is None:
-            return
-        felt = np.zeros((of.line_count, self.size))
-        azimuth_rad = of.line_azimuth_rad
-        felt[:, 0], felt[:, 1] = np.cos(azimuth_rad), -np.sin(azimuth_rad)
-        felt[:, len(GLOBAL) : len(GLOBAL) + of.line_count] = np.eye(of.line_count)
-        felt[:, state:] = log.faults
-        weighted = felt * log.weight[:, None]
-        self.normal += felt.T @ weighted
-        self.right = weighted.T @ log.lean_rad
-
-
-def _design(felt: Sensitivities) -> sparse.csr_array:
-    """Matrix J (n, u)."""
-    of, count = felt.of, len(felt)
-    before, after, share = felt.refraction_knot()
-    last = len(GLOBAL) + of.line_count
-    rows = np.tile(np.arange(count), len(GLOBAL) + 3)
-    columns = np.concatenate(
-        [np.repeat(np.arange(len(GLOBAL)), count), len(GLOBAL) + felt.line, last + before, last + after]
-    )
-    values = np.concatenate(
-        [felt.globals_.ravel(), felt.lean, felt.refraction * (1 - share), felt.refraction * share]
-    )
-    return sparse.csr_array((values, (rows, columns)), shape=(count, last + of.refraction_count))
+    reduced = solved.reduced
+    unknown = Unknown(of, reduced.own, reduced.felt, solved.whole())
+    return Adjustment(of, solved.by_line(of), unknown, solved.step_m, trust[~moving])
 
 
 @dataclass(frozen=True)
 class _Changes:
-    """Priors of the change at its knots, for a step of one, by how alike neighbours are; which are tried."""
+    """Priors of the change at its knots, for a step of one, by how alike neighbours are."""
 
     precision: list[Floats]  # (knots, knots)
     log_determinant: list[float]  # of the covariance
-    tried: list[tuple[int, int]]  # places among ALIKE_CHANGES and CHANGE_STEPS_M
-
-    def near(self, place: tuple[int, int]) -> _Changes:
-        """Return the same with only those tried that lie next to a place."""
-        around = [p for p in self.tried if max(abs(p[0] - place[0]), abs(p[1] - place[1])) <= 1]
-        return replace(self, tried=around)
 
 
 def _change_field(patches: Patches, moving: Bools) -> tuple[sparse.csr_array, _Changes]:
@@ -209,73 +159,89 @@ def _change_field(patches: Patches, moving: Bools) -> tuple[sparse.csr_array, _C
     apart = np.abs(np.subtract.outer(across, across)) / ALIKE_AZIMUTH_KNOTS
     apart += np.abs(np.subtract.outer(out, out)) / ALIKE_RANGE_KNOTS
     own = np.eye(len(knots)) + UNIFORM_CHANGE**2
-    covariances = [_Factored(own + alike**2 * np.exp(-apart)) for alike in ALIKE_CHANGES]
-    tried = [(alike, step) for alike in range(len(ALIKE_CHANGES)) for step in range(len(CHANGE_STEPS_M))]
+    covariances = [Factored(own + alike**2 * np.exp(-apart)) for alike in ALIKE_CHANGES]
     return field, _Changes(
-        [one.inverse() for one in covariances], [one.log_determinant() for one in covariances], tried
+        [one.inverse() for one in covariances], [one.log_determinant() for one in covariances]
     )
-
-
-class _Factored:
-    """A covariance or normal matrix (n, n), factored; its unknowns may have units of very different size."""
-
-    def __init__(self, matrix: Floats) -> None:
-        self._scale = 1 / np.sqrt(np.diag(matrix))
-        scaled = matrix * self._scale[:, None] * self._scale
-        self._root, _ = linalg.cho_factor(scaled, lower=True, overwrite_a=True, check_finite=False)
-
-    def solve(self, right: Floats) -> Floats:
-        """Solution for right sides (n,) or (n, k)."""
-        scale = self._scale if right.ndim == 1 else self._scale[:, None]
-        return np.asarray(linalg.cho_solve((self._root, True), right * scale, check_finite=False) * scale)
-
-    def inverse(self) -> Floats:
-        """Inverse (n, n)."""
-        if not len(self._scale):
-            return np.empty((0, 0))
-        half = np.tril(linalg.lapack.dpotri(self._root, lower=True)[0])
-        whole = half + np.tril(half, -1).T
-        return np.asarray(whole * self._scale[:, None] * self._scale)
-
-    def log_determinant(self) -> float:
-        """Logarithm of the determinant."""
-        return float(2 * (np.log(np.diag(self._root)).sum() - np.log(self._scale).sum()))
 
 
 @dataclass(frozen=True)
 class _Solved:
     """Solution of normal equations whose last unknowns have the prior that makes the data most likely."""
 
-    estimate: Floats
+    reduced: Reduced
+    estimate: Floats  # (m,)
     place: tuple[int, int]  # of the change's prior
-    step_m: float
-    state: _Factored  # the block of the state and the log's faults
-    across: Floats  # what a unit of change does to these
-    change: _Factored
+    precision: Floats  # (knots, knots) of that
 
-    def covariance(self) -> Floats:
-        """Covariance of the state and the log's faults."""
-        return self.state.inverse() + self.across @ self.change.solve(self.across.T)
+    @property
+    def step_m(self) -> float:
+        """One sigma of the change between its knots."""
+        alike, step = self.place
+        return CHANGE_STEPS_M[step] * float(np.hypot(1.0, ALIKE_CHANGES[alike]))
+
+    def by_line(self, of: Basis) -> Floats:
+        """State (u,) with the leans of the lines."""
+        state = rows_at_lines(of, self.estimate[: len(of.names), None])[:, 0]
+        state[len(GLOBAL) : len(GLOBAL) + of.line_count] += self.reduced.own_rad(self.estimate)
+        return np.asarray(state)
+
+    def whole(self) -> Factored:
+        """Return the normal equations with the prior that was chosen."""
+        normal, first = self.reduced.normal.copy(), len(self.estimate) - len(self.precision)
+        normal[first:, first:] += self.precision
+        return Factored(normal)
 
 
-def _solve(normal: Floats, right: Floats, size: int, changes: _Changes) -> _Solved:
-    """Solve; how much the moving ground changed, and how smoothly, is chosen by the likelihood."""
-    state = _Factored(normal[:size, :size])
-    across = -state.solve(normal[:size, size:])
-    reduced = normal[size:, size:] + normal[size:, :size] @ across
-    told = right[size:] + across.T @ right[:size]
-    found = []
-    for alike, step in changes.tried:
-        step_m = CHANGE_STEPS_M[step]
-        change = _Factored(reduced + changes.precision[alike] / step_m**2)
-        change_m = change.solve(told)
-        spread = (change.log_determinant() + changes.log_determinant[alike]) / 2 + len(told) * np.log(step_m)
-        odds = float(told @ change_m / 2 - spread) - ALIKE_ODDS[alike]
-        found.append((odds, (alike, step), change_m, change))
-    _, place, change_m, change = max(found, key=lambda one: one[0])
-    estimate = np.concatenate([state.solve(right[:size]) + across @ change_m, change_m])
-    step_m = CHANGE_STEPS_M[place[1]] * float(np.hypot(1.0, ALIKE_CHANGES[place[0]]))
-    return _Solved(estimate, place, step_m, state, across, change)
+def _solve(reduced: Reduced, size: int, changes: _Changes, near: tuple[int, int] | None) -> _Solved:
+    """Solve; how much the moving ground changed, and how smoothly, is chosen by the likelihood.
+
+    With a prior chosen before, neighbours are taken to be about as alike as then.
+    """
+    normal, right = reduced.normal, reduced.right
+    state = Factored(normal[:size, :size])
+    half = state.half(normal[:size, size:])
+    left = normal[size:, size:] - half.T @ half
+    told = right[size:] - half.T @ state.half(right[:size, None])[:, 0]
+    tried: dict[tuple[int, int], tuple[float, Floats]] = {}
+
+    def odds(place: tuple[int, int]) -> float:
+        if place not in tried:
+            tried[place] = _likelihood(left, told, changes, place)
+        return tried[place][0]
+
+    step = (len(CHANGE_STEPS_M) - 1) // 2 if near is None else near[1]
+    for alike in range(len(ALIKE_CHANGES)):
+        if near is None or abs(alike - near[0]) <= 1:
+            step = _climbed(odds, alike, step)
+    place = max(tried, key=odds)
+    change_m = tried[place][1]
+    estimate = np.concatenate([state.solve(right[:size] - normal[:size, size:] @ change_m), change_m])
+    return _Solved(reduced, estimate, place, changes.precision[place[0]] / CHANGE_STEPS_M[place[1]] ** 2)
+
+
+def _climbed(odds: Callable[[tuple[int, int]], float], alike: int, step: int) -> int:
+    """Return the place among CHANGE_STEPS_M from which the odds fall to either side."""
+    while True:
+        beside = [(alike, s) for s in (step - 1, step, step + 1) if 0 <= s < len(CHANGE_STEPS_M)]
+        _, best = max(beside, key=odds)
+        if best == step:
+            return step
+        step = best
+
+
+def _likelihood(
+    left: Floats, told: Floats, changes: _Changes, place: tuple[int, int]
+) -> tuple[float, Floats]:
+    """Log likelihood of a prior of the change, and the change (knots,) [m] with it."""
+    alike, step = place
+    step_m = CHANGE_STEPS_M[step]
+    if not len(told):
+        return -ALIKE_ODDS[alike], told
+    root = root_of(left + changes.precision[alike] / step_m**2)
+    change_m = linalg.cho_solve((root, True), told, check_finite=False)
+    spread = (log_determinant(root) + changes.log_determinant[alike]) / 2 + len(told) * np.log(step_m)
+    return float(told @ change_m / 2 - spread) - ALIKE_ODDS[alike], change_m
 
 
 def _scatter(patches: Patches, left_m: Floats, moving: Bools) -> Floats:

@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from station.quantities import Floats, Habits, HeadTrack, Shared, Tilt
-from station.science.adjustment import LineLog
 from station.science.inclination import SENSOR_STEP_RAD, Cycle, Lean
-from station.science.shared import GLOBAL, Basis, by_knots
+from station.science.leans import OwnLeans
+from station.science.normals import Beforehand, LineLog
+from station.science.shared import GLOBAL, LINES_A_KNOT, Basis, by_knots
 
 REFRACTION_MEMORY_RAD = math.radians(15.0)
 RANGE_SCALE_UNKNOWN_PPM = 4.0  # no weather: 5 K and 5 hPa off, 0.737 ppm/K, 0.290 ppm/hPa, EQUATIONS 5.8
@@ -142,6 +144,38 @@ def by_line(of: Basis, globals_sigma: Floats, lean: Floats, bend: Floats) -> Flo
     return covariance
 
 
+def beforehand(of: Basis, lines: Lines, habits: Habits, *, weather_known: bool) -> Beforehand:
+    """Return what is known of a scan's state: the slow motion at knots, what is faster line by line.
+
+    Where the slow motion is not straight between knots, also at the seam of a scan all round, each line has
+    what is missing for its own, so that its variance is right; the rest of its correlation is left out.
+    """
+    before_s, after_s = lines.time_s[::LINES_A_KNOT], lines.time_s[1::LINES_A_KNOT]
+    knot_s = before_s - (after_s - before_s) / 2
+    if not of.closed:
+        knot_s = np.append(knot_s, lines.time_s[-1] + (lines.time_s[-1] - lines.time_s[-2]) / 2)
+    slow = np.exp(-np.abs(np.subtract.outer(knot_s, knot_s)) / SLOW_MOTION_S)
+    first, last = len(GLOBAL), len(GLOBAL) + of.lean_count
+    knots = np.zeros((len(of.names),) * 2)
+    knots[:first, :first] = np.diag(np.square(globals_sigma(habits, weather_known=weather_known)))
+    knots[first:last, first:last] = habits.slow_motion_rad**2 * slow
+    knots[last:, last:] = bending(habits, of)
+    apart = 1 - slow[np.arange(of.intervals), (np.arange(of.intervals) + 1) % of.lean_count]
+    share = (np.arange(LINES_A_KNOT) + 0.5) / LINES_A_KNOT
+    bent = 2 * np.outer(apart, share * (1 - share)).ravel()
+    order = np.argsort(lines.time_s)
+    return Beforehand(
+        of,
+        knots,
+        OwnLeans(
+            order=order,
+            likeness=np.exp(-np.diff(lines.time_s[order]) / FAST_MOTION_S),
+            alike_rad2=habits.fast_motion_rad**2,
+            alone_rad2=habits.line_motion_rad**2 + habits.slow_motion_rad**2 * bent,
+        ),
+    )
+
+
 def covariance_without_adjustment(
     of: Basis, lines: Lines, lean: Lean | None, zero: Cycle, habits: Habits, *, weather_known: bool
 ) -> Shared:
@@ -195,30 +229,36 @@ def cycle_changes(lines: Lines, zero: Cycle) -> Floats:
     return CYCLE_CHANGE_SHARE * np.stack(waves, axis=-1)
 
 
-def learned(start: Habits, of: Basis, scans: list[tuple[Lines, Floats, Floats]]) -> Habits:
+def learned(start: Habits, of: Basis, scans: Iterable[tuple[Lines, Floats, Floats]]) -> Habits:
     """Return the habits that estimates (u,) and covariances (u, u) of several scans speak for.
 
     Each variance is what the scans show (estimate squared plus what is unknown of it), drawn to its start
     value as if that came from `SCANS_WORTH` scans. Motions are told apart by their correlation in time, by
     steps of the expectation-maximisation of variance components.
     """
-    if len(scans) < 2:
-        return start
     first, last = len(GLOBAL), len(GLOBAL) + of.line_count
-    shown = np.mean([e**2 + np.diag(c) for _, e, c in scans], axis=0) * len(scans) / (len(scans) - 1)
+    lean = slice(first, last)
+    shown, moved = np.zeros(last + of.refraction_count), np.zeros((of.line_count,) * 2)
+    passed: list[Lines] = []
+    for lines, estimate, covariance in scans:  # one after the other: covariances are large
+        passed.append(lines)
+        shown += estimate**2 + np.diag(covariance)
+        moved += np.outer(estimate[lean], estimate[lean]) + covariance[lean, lean]
+    count = len(passed)
+    if count < 2:
+        return start
+    shown, moved = shown / (count - 1), moved / count
 
     def drawn(name: str, variance: float) -> float:
-        mass = len(scans) + SCANS_WORTH
-        return math.sqrt((variance * len(scans) + getattr(start, name) ** 2 * SCANS_WORTH) / mass)
+        mass = count + SCANS_WORTH
+        return math.sqrt((variance * count + getattr(start, name) ** 2 * SCANS_WORTH) / mass)
 
     seen = {name: float(shown[place].mean()) for name, place in SHOWN.items()}
     seen["refraction_by_azimuth"] = float(shown[last:].mean())
-    lean = slice(first, last)
-    moved = np.mean([np.outer(e[lean], e[lean]) + c[lean, lean] for _, e, c in scans], axis=0)
-    kernels = motions(scans[0][0])
+    kernels = motions(passed[0])
     now = start
     for _ in range(MOTION_STEPS):
-        weight = np.linalg.inv(motion(now, scans[0][0]))
+        weight = np.linalg.inv(motion(now, passed[0]))
         shown_by = weight @ moved @ weight
         for name, kernel in zip(MOTIONS, kernels, strict=True):
             seen[name] = getattr(now, name) ** 2 * float(np.sum(shown_by * kernel) / np.sum(weight * kernel))

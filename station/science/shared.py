@@ -201,42 +201,29 @@ class Sensitivities:
 
     def variance(self, unknown: Shared) -> Floats:
         """Variance of each cell's height (n,) [m²]: the diagonal of J C Jᵀ, and what its line adds."""
-        variance_m2 = np.empty(len(self))
-        of = self.of
-        before, _, share = self.lean_knot()
-        _, _, bend_share = self.refraction_knot()
-        order = np.argsort(before.astype(np.int16), kind="stable")
+        of, first = self.of, len(GLOBAL)
+        before = self.passed.astype(np.int16)
+        order = np.argsort(before, kind="stable")
         bounds = np.searchsorted(before[order], np.arange(of.intervals + 1))
         own = leans_between(of).left ** 2 @ line_variances(of, unknown)
+        variance_m2 = self.lean**2 * own[self.line]
         for knot in np.flatnonzero(np.diff(bounds)):
             cells = order[bounds[knot] : bounds[knot + 1]]
             bend = knot // LEAN_PER_REFRACTION
             knots = (
-                len(GLOBAL) + knot,
-                len(GLOBAL) + (knot + 1) % of.lean_count,
-                len(GLOBAL) + of.lean_count + bend,
-                len(GLOBAL) + of.lean_count + (bend + 1) % of.refraction_count,
+                first + knot,
+                first + (knot + 1) % of.lean_count,
+                first + of.lean_count + bend,
+                first + of.lean_count + (bend + 1) % of.refraction_count,
             )
-            felt = [*range(len(GLOBAL)), *knots]
-            along, bent = self.lean[cells], self.refraction[cells]
-            columns = np.vstack(
-                [
-                    self.globals_[:, cells],
-                    along * (1 - share[cells]),
-                    along * share[cells],
-                    bent * (1 - bend_share[cells]),
-                    bent * bend_share[cells],
-                ]
-            )
-            root = _root(unknown.covariance[np.ix_(felt, felt)])
-            variance_m2[cells] = np.sum((root @ columns) ** 2, axis=0)
-        return variance_m2 + self.lean**2 * own[self.line]
-
-
-def _root(covariance: Floats) -> Floats:
-    """Return R with RᵀR = C (p, p), also where C is singular."""
-    values, vectors = np.linalg.eigh(covariance)
-    return np.asarray((vectors * np.sqrt(np.maximum(values, 0.0))).T)
+            felt = [*range(first), *knots]
+            passed, along, bent = self.passed[cells], self.lean[cells], self.refraction[cells]
+            after, bent_after = along * (passed - knot), bent * (passed / LEAN_PER_REFRACTION - bend)
+            beside = np.stack([along - after, after, bent - bent_after, bent_after])
+            columns = np.concatenate([self.globals_[:, cells], beside])
+            told_m2 = np.einsum("ij,ij->j", columns, unknown.covariance[np.ix_(felt, felt)] @ columns)
+            variance_m2[cells] += np.maximum(told_m2, 0.0)  # rounding, where the covariance is singular
+        return variance_m2
 
 
 def line_variances(of: Basis, unknown: Shared) -> Floats:
@@ -323,13 +310,16 @@ class LeansBetween:
 @lru_cache(maxsize=4)
 def leans_between(of: Basis) -> LeansBetween:
     """Return the matrices of a basis; made once."""
+    knots = interpolated(of, np.eye(of.lean_count))
+    fit = np.linalg.inv(knots.T @ knots) @ knots.T
+    return LeansBetween(knots, fit, np.eye(of.line_count) - interpolated(of, fit))
+
+
+def interpolated(of: Basis, at_knots: Floats) -> Floats:
+    """Return at lines (lines, k) what is straight between the knots of the lean (knots, k)."""
     before = np.arange(of.line_count) // LINES_A_KNOT
-    share = (np.arange(of.line_count) % LINES_A_KNOT + 0.5) / LINES_A_KNOT
-    knots = np.zeros((of.line_count, of.lean_count))
-    knots[np.arange(of.line_count), before] = 1 - share
-    knots[np.arange(of.line_count), (before + 1) % of.lean_count] += share
-    fit = np.asarray(np.linalg.pinv(knots), dtype=np.float64)
-    return LeansBetween(knots, fit, np.eye(of.line_count) - knots @ fit)
+    share = ((np.arange(of.line_count) % LINES_A_KNOT + 0.5) / LINES_A_KNOT)[:, None]
+    return np.asarray(at_knots[before] * (1 - share) + at_knots[(before + 1) % of.lean_count] * share)
 
 
 def against(unknown: Shared, common: Shared | None) -> Shared:
@@ -344,32 +334,41 @@ def against(unknown: Shared, common: Shared | None) -> Shared:
 
 def lines_from_knots(of: Basis, unknown: Floats) -> Floats:
     """Covariance by line (9 + lines + refraction knots) of one by knot (p, p)."""
-    wide = _beside(leans_between(of).knots, len(GLOBAL), of.refraction_count)
-    return np.asarray(wide @ unknown @ wide.T)
+    wide = rows_at_lines(of, unknown)
+    return rows_at_lines(of, wide.T)
+
+
+def rows_at_lines(of: Basis, rows: Floats) -> Floats:
+    """Rows by line of rows by knot (p, k)."""
+    first, last = len(GLOBAL), len(GLOBAL) + of.lean_count
+    return np.concatenate([rows[:first], interpolated(of, rows[first:last]), rows[last:]])
+
+
+def rows_at_knots(of: Basis, rows: Floats) -> Floats:
+    """Rows by knot of rows by line (9 + lines + refraction knots, k)."""
+    first, last = len(GLOBAL), len(GLOBAL) + of.line_count
+    return np.concatenate([rows[:first], leans_between(of).fit @ rows[first:last], rows[last:]])
 
 
 def by_knots(of: Basis, estimate: Floats, covariance: Floats) -> Shared:
-    """Return what is known by line (9 + lines + refraction knots), condensed to knots.
+    """Return what is known by line (9 + lines + refraction knots), condensed to knots."""
+    lines = slice(len(GLOBAL), len(GLOBAL) + of.line_count)
+    narrow = rows_at_knots(of, covariance)
+    left = covariance[lines, lines] - interpolated(
+        of, narrow[lines.start : lines.start + of.lean_count, lines]
+    )
+    own = np.einsum("ij,ij->i", left, leans_between(of).left)
+    return condensed(of, rows_at_knots(of, estimate[:, None])[:, 0], rows_at_knots(of, narrow.T), own)
+
+
+def condensed(of: Basis, estimate: Floats, covariance: Floats, left_rad2: Floats) -> Shared:
+    """Return what is known by knots (p,), and by how much each line's lean varies about them (lines,).
 
     What the knots cannot hold of a line's lean is kept as the variance of independent leans from which the
     knots have taken their part; that loses less than 5 % of the sigma of boxes and areas.
     """
-    between = leans_between(of)
-    narrow = _beside(between.fit, len(GLOBAL), of.refraction_count)
-    lines = slice(len(GLOBAL), len(GLOBAL) + of.line_count)
-    left = between.left
-    own = np.maximum(np.einsum("ij,ij->i", left @ covariance[lines, lines], left), 0.0)
-    own /= np.diag(left)  # a projection: the square of each row sums up to its diagonal
-    noise = np.zeros(len(narrow))
+    # A projection: the square of each row sums up to its diagonal.
+    own = np.maximum(left_rad2, 0.0) / np.diag(leans_between(of).left)
+    noise = np.zeros(len(estimate))
     noise[len(GLOBAL) : len(GLOBAL) + of.intervals] = own.reshape(of.intervals, LINES_A_KNOT).mean(axis=1)
-    return Shared(of.names, of.units, narrow @ estimate, np.asarray(narrow @ covariance @ narrow.T), noise)
-
-
-def _beside(lean: Floats, before: int, after: int) -> Floats:
-    """Block matrix of identities around a block."""
-    rows, columns = lean.shape
-    whole = np.zeros((before + rows + after, before + columns + after))
-    whole[:before, :before] = np.eye(before)
-    whole[before : before + rows, before : before + columns] = lean
-    whole[before + rows :, before + columns :] = np.eye(after)
-    return whole
+    return Shared(of.names, of.units, estimate, covariance, noise)

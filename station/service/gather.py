@@ -5,8 +5,10 @@ from __future__ import annotations
 import hashlib
 import json
 import math
+from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from datetime import datetime, timedelta
+from functools import cached_property, partial
 from pathlib import Path
 
 import numpy as np
@@ -39,12 +41,17 @@ class Gathered:
 
     setup: Setup
     pose: Pose
-    unknown: Shared | None
+    unadjusted: Callable[[], Shared] | None
     told: Told | None
     lean: Lean | None
     air: Air | None
     lacking: tuple[str, ...]
     provenance: dict[str, str]
+
+    @cached_property
+    def unknown(self) -> Shared | None:
+        """What all points share without an adjustment; worked out where there is none."""
+        return self.unadjusted() if self.unadjusted else None
 
 
 def gather(
@@ -64,15 +71,15 @@ def gather(
     """
     if site.scans.frame == "map":
         position_m = _map_position(site)
-        setup, unknown, told = setup_of(site, position_m), None, None
+        setup, unadjusted, told = setup_of(site, position_m), None, None
         if position_m is not None:  # registered by others: how well, nobody tells
             of = shared.basis(setup.grid, position_m)
             lines = prior.lines_of(of, np.eye(3), None)
             told = Told(of, lines, np.zeros((3, of.line_count)), None, weather_known=False)
-            unknown = prior.covariance_without_adjustment(
-                of, lines, None, LEVEL, Habits(), weather_known=False
+            unadjusted = partial(
+                prior.covariance_without_adjustment, of, lines, None, LEVEL, Habits(), weather_known=False
             )
-        return Gathered(setup, Pose(None, None, None), unknown, told, None, None, (), {})
+        return Gathered(setup, Pose(None, None, None), unadjusted, told, None, None, (), {})
     sop = sop_for(site.sop, start)
     frame, sop_id = frame_of(site, sop), sop_identity(sop)
     lacking: list[str] = []
@@ -94,9 +101,6 @@ def gather(
         raise NotReadyError(lacking[-1])
     of = shared.basis(setup.grid, frame.position_m, axis)
     lines = prior.lines_of(of, rotation, track)
-    unknown = prior.covariance_without_adjustment(
-        of, lines, lean, zero or LEVEL, Habits(), weather_known=weather_known
-    )
     assumed_rad, line_log = np.zeros((3, of.line_count)), None
     if lean is not None:
         assumed_rad = prior.turn_of(lean.tilt, rotation, lines.time_s)
@@ -114,7 +118,15 @@ def gather(
     return Gathered(
         setup,
         Pose(frame, tilt, correction),
-        unknown,
+        partial(
+            prior.covariance_without_adjustment,
+            of,
+            lines,
+            lean,
+            zero or LEVEL,
+            Habits(),
+            weather_known=weather_known,
+        ),
         Told(of, lines, assumed_rad, line_log, weather_known=weather_known),
         lean,
         air if weather_known else None,

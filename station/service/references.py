@@ -125,11 +125,11 @@ class _Laid:
 
 def _learned(habits: Habits, laid: list[_Laid]) -> Habits:
     """Return what adjusted scans show of the station's habits."""
-    found = [
+    found = (
         (one.gathered.told.lines, one.adjustment.estimate, one.adjustment.covariance)
         for one in laid
         if one.gathered.told is not None and one.adjustment is not None
-    ]
+    )
     told = laid[0].gathered.told
     return habits if told is None else learned(habits, told.of, found)
 

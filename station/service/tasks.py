@@ -207,12 +207,10 @@ def _measure(
     progress()
     levelled = levelled_to(site, gridder, gathered, reference)
     flag = flag_of(site, start.timestamp(), end.timestamp())
-    unknown, found = gathered.unknown, levelled[1] if levelled else None
-    if levelled is not None:
-        if levelled[1].refused > MOST_REFUSED:
-            levelled = None
-        else:
-            unknown = levelled[1].shared()
+    found = levelled[1] if levelled else None
+    if levelled is not None and levelled[1].refused > MOST_REFUSED:
+        levelled = None
+    unknown = levelled[1].shared() if levelled is not None else gathered.unknown
     measured = measure(gridder, gathered.setup, unknown, reference, levelled)
     progress()
     numbers = _numbers(measured, gathered, reader.header.point_count, levelled)

@@ -376,8 +376,7 @@ def by_line(felt, weights):
 def known(scene):
     """Covariance by line before a scan, and after it was adjusted to some ground, at rest, of 3 mm."""
     habits, lines = Habits(), prior.lines_of(SECTOR, np.eye(3), None)
-    sigma = prior.globals_sigma(habits, weather_known=True)
-    covariance = prior.by_line(SECTOR, sigma, prior.motion(habits, lines), prior.bending(habits, SECTOR))
+    before = prior.beforehand(SECTOR, lines, habits, weather_known=True)
     rng = np.random.default_rng(8)
     seen, stable = {
         "nothing": (FAR & ~FAR, FAR),
@@ -390,7 +389,7 @@ def known(scene):
     felt = places(20 + 0.2 * (line + 0.5), 80 * (stretch + 0.5))
     count = len(line)
     told = Patches(felt, stretch, kind, rng.normal(0, 0.003, count), np.full(count, 9e-6), np.ones(count))
-    return adjust(told, np.zeros((3, SECTOR.line_count)), covariance, None)
+    return adjust(told, np.zeros((3, SECTOR.line_count)), before, None)
 
 
 def products(size_m, count=40):

@@ -10,7 +10,8 @@ from scipy.spatial.transform import Rotation
 
 from station.quantities import Habits
 from station.science import adjustment, prior, shared
-from station.science.adjustment import LineLog, adjust
+from station.science.adjustment import adjust
+from station.science.normals import LineLog
 from station.science.patches import Kind, Patches
 from station.science.verdict import distrust
 
@@ -24,13 +25,18 @@ GLOBALS = 9
 
 
 @cache
-def prior_of(of, **habits):
+def prior_of(of):
     """Covariance (u, u) of a scan's state before anything is seen, and a root of it."""
     lines = prior.lines_of(of, np.eye(3), None)
-    station = replace(HABITS, **habits)
-    sigma = prior.globals_sigma(station, weather_known=True)
-    covariance = prior.by_line(of, sigma, prior.motion(station, lines), prior.bending(station, of))
+    sigma = prior.globals_sigma(HABITS, weather_known=True)
+    covariance = prior.by_line(of, sigma, prior.motion(HABITS, lines), prior.bending(HABITS, of))
     return covariance, np.linalg.cholesky(covariance)
+
+
+@cache
+def known_before(of):
+    """The same as the adjustment takes it: the slow motion straight between knots."""
+    return prior.beforehand(of, prior.lines_of(of, np.eye(3), None), HABITS, weather_known=True)
 
 
 @dataclass
@@ -155,7 +161,7 @@ def sigmas(found, cells):
 def simulated(seed, stable, *, log=False, moving=0, change_m=None, sigma_m=0.01):
     """Errors of the adjusted heights all over the sector, and their stated sigmas, in one scan."""
     rng = np.random.default_rng(seed)
-    covariance, root = prior_of(OF)
+    _, root = prior_of(OF)
     state = root @ rng.normal(size=len(root))
     seen = stable.patches(stable.matrix() @ state + rng.normal(0, sigma_m, len(stable.line)), sigma_m)
     if moving:
@@ -163,7 +169,7 @@ def simulated(seed, stable, *, log=False, moving=0, change_m=None, sigma_m=0.01)
         raised_m = snow.matrix() @ state + rng.normal(0, sigma_m, moving)
         raised_m += 0.0 if change_m is None else change_m(snow, rng)
         seen = together(seen, snow.patches(raised_m, sigma_m, Kind.MOVING))
-    found = adjust(seen, STILL, covariance, log_of(state, rng) if log else None)
+    found = adjust(seen, STILL, known_before(OF), log_of(state, rng) if log else None)
     cells = ground(seed + 20_000, 200)
     return cells.matrix() @ state - found.effect(cells.felt()), sigmas(found, cells), found
 
@@ -194,36 +200,50 @@ def dense(design, residual_m, variance_m2, covariance):
 
 @pytest.mark.parametrize("with_log", [False, True], ids=["no log", "log"])
 @pytest.mark.parametrize("of", [OF, ROUND], ids=["sector", "all round"])
-def test_estimate_and_covariance_are_those_of_dense_least_squares(of, with_log):
+def test_estimate_and_covariance_are_those_of_dense_least_squares(of, with_log, monkeypatch):
+    monkeypatch.setattr(adjustment, "ROUNDS", 1)  # weights as they are at first
     rng = np.random.default_rng(1)
-    covariance, root = prior_of(of)
+    motion, root = prior_of(of)
+    covariance = known_before(of).by_line()
     stable = ground(2, 2000)
     design, variance_m2 = stable.matrix(of), np.full(2000, 0.02**2)
-    state = 0.05 * root @ rng.normal(size=len(root))  # so little that no patch is doubted
-    residual_m = design @ state + rng.normal(0, 0.0002, 2000)
+    state = root @ rng.normal(size=len(root))
+    residual_m = design @ state + rng.normal(0, 0.02, 2000)
     lines = line_of_sight(of)
-    log = None
+    faults, lean_rad = log_faults(of), lines @ state
+    log = LineLog(lean_rad, np.full(of.line_count, LOG_SIGMA_RAD**-2), faults) if with_log else None
+    found = adjust(stable.patches(residual_m, 0.02, of=of), STILL, known_before(of), log)
     # What differs between stable patches beyond their random errors is taken to be 2 mm at least.
-    wide, wanted, spread = design, residual_m, variance_m2 + 0.002**2
-    before = covariance
+    spread = variance_m2 + 0.002**2
+    wide, wanted, known = design, residual_m, covariance
     if with_log:
-        faults = log_faults(of)
-        lean_rad = lines @ state
-        log = LineLog(lean_rad, np.full(of.line_count, LOG_SIGMA_RAD**-2), faults)
-        before = np.block(
+        known = np.block(
             [[covariance, np.zeros((len(covariance), 4))], [np.zeros((4, len(covariance))), np.eye(4)]]
         )
         wide = np.block([[design, np.zeros((2000, 4))], [lines, faults]])
         wanted = np.concatenate([residual_m, lean_rad])
         spread = np.concatenate([spread, np.full(of.line_count, LOG_SIGMA_RAD**2)])
-    estimate, unknown = dense(wide, wanted, spread, before)
-    found = adjust(stable.patches(residual_m, 0.02, of=of), STILL, covariance, log)
-    assert found.stable_weight.min() > 0.995
+    estimate, unknown = dense(wide, wanted, spread, known)
     sigma = np.sqrt(np.diag(unknown))[: len(covariance)]
-    assert np.abs((found.estimate - estimate[: len(covariance)]) / sigma).max() < 2e-3
-    told = found.covariance / np.outer(sigma, sigma)
-    assert np.abs(told - unknown[: len(sigma), : len(sigma)] / np.outer(sigma, sigma)).max() < 2e-3
+    told, unknown = (
+        c[: len(sigma), : len(sigma)] / np.outer(sigma, sigma) for c in (found.covariance, unknown)
+    )
+    assert np.abs((found.estimate - estimate[: len(covariance)]) / sigma).max() < 1e-8
+    assert np.abs(told - unknown).max() < 1e-8
     assert np.abs(found.effect(stable.felt(of)) - design @ found.estimate).max() < 1e-9
+    # The slow motion is straight between knots there. Line by line, as it is, the answer is the same but for
+    # the seam, where the head begins and ends: here a fortieth of all.
+    wave = np.zeros_like(known)
+    wave[: len(motion), : len(motion)] = motion - covariance
+    estimate, unknown = dense(wide, wanted, spread, known + wave)
+    assert np.abs((found.estimate - estimate[: len(covariance)]) / sigma).max() < (
+        0.15 if of.closed else 0.01
+    )
+    assert np.diag(unknown)[: len(sigma)] == pytest.approx(sigma**2, rel=0.02 if of.closed else 0.01)
+    kept = shared.by_knots(of, found.estimate, found.covariance)
+    assert found.shared().covariance == pytest.approx(kept.covariance, rel=1e-6, abs=1e-9 * sigma[0] ** 2)
+    assert found.shared().noise_variance == pytest.approx(kept.noise_variance, rel=1e-6)
+    assert found.shared().estimate == pytest.approx(kept.estimate, rel=1e-6, abs=1e-12)
 
 
 @pytest.mark.parametrize(
@@ -245,7 +265,7 @@ def test_stated_sigmas_are_those_of_simulated_scans(stable, scan):
 
 def test_what_the_points_were_turned_by_before_changes_no_height():
     rng = np.random.default_rng(4)
-    covariance, root = prior_of(OF)
+    _, root = prior_of(OF)
     stable, cells = ground(5, 300), ground(6, 200)
     raw_m = stable.matrix() @ (root @ rng.normal(size=len(root))) + rng.normal(0, 0.01, 300)
     assumed_rad = np.radians(rng.normal(0, 0.003, (3, OF.line_count)))
@@ -256,8 +276,8 @@ def test_what_the_points_were_turned_by_before_changes_no_height():
         moved = Rotation.from_rotvec(assumed_rad[:, places.line].T).apply(before) - before
         return moved[:, 2] - places.east * moved[:, 0] - places.north * moved[:, 1]
 
-    plain = adjust(stable.patches(raw_m), STILL, covariance, None)
-    turned = adjust(stable.patches(raw_m + raised_by_turning(stable)), assumed_rad, covariance, None)
+    plain = adjust(stable.patches(raw_m), STILL, known_before(OF), None)
+    turned = adjust(stable.patches(raw_m + raised_by_turning(stable)), assumed_rad, known_before(OF), None)
     assert np.abs(raised_by_turning(cells)).max() > 0.1
     # The corrected height of a turned cell: up by the turn, down by the state beyond the turn.
     corrected_m = raised_by_turning(cells) - (
@@ -272,7 +292,7 @@ def test_a_log_alone_gives_the_lean_it_shows_no_better_than_it_is():
     shown = np.zeros(len(covariance))
     shown[0] = np.radians(0.01)
     log = LineLog(lines @ shown, np.full(OF.line_count, LOG_SIGMA_RAD**-2), faults)
-    found = adjust(nothing(), STILL, covariance, log)
+    found = adjust(nothing(), STILL, known_before(OF), log)
     assert lines @ found.estimate == pytest.approx(lines @ shown, rel=0.2)
     told, before = (
         np.sqrt(np.einsum("ij,jk,ik->i", lines, c, lines)) for c in (found.covariance, covariance)
@@ -282,26 +302,25 @@ def test_a_log_alone_gives_the_lean_it_shows_no_better_than_it_is():
     assert (told > noise_rad).all()
     assert (told < 0.5 * before).all()
     cells, stable = ground(7, 200), ground(8, 300)
-    with_ground = adjust(stable.patches(np.zeros(300)), STILL, covariance, log)
+    with_ground = adjust(stable.patches(np.zeros(300)), STILL, known_before(OF), log)
     assert np.median(sigmas(found, cells)) > 3 * np.median(sigmas(with_ground, cells))
     assert distrust(found, HABITS) == ["no stable ground seen"]
 
 
 def test_a_dead_stretch_of_the_log_counts_nothing():
-    covariance, _ = prior_of(OF)
     lean_rad = np.full(OF.line_count, 1e-4)
     weight = np.where(np.arange(OF.line_count) < 100, LOG_SIGMA_RAD**-2, 0.0)
     wild_rad = np.where(weight > 0, lean_rad, 0.3)
     quiet, wild = (
-        adjust(nothing(), STILL, covariance, LineLog(told, weight, log_faults()))
+        adjust(nothing(), STILL, known_before(OF), LineLog(told, weight, log_faults()))
         for told in (lean_rad, wild_rad)
     )
     assert np.array_equal(quiet.estimate, wild.estimate)
 
 
 def test_nothing_seen_leaves_what_was_known_before():
-    covariance, _ = prior_of(OF)
-    found = adjust(nothing(), STILL, covariance, None)
+    covariance = known_before(OF).by_line()
+    found = adjust(nothing(), STILL, known_before(OF), None)
     assert np.abs(found.estimate).max() == 0.0
     sigma = np.sqrt(np.diag(covariance))
     assert found.covariance / np.outer(sigma, sigma) == pytest.approx(
@@ -340,12 +359,12 @@ def test_a_glacier_at_rest_helps():
 def wrong_by(seed, count, share):
     """Adjust to stable ground of which a share, at random, is a metre too high."""
     rng = np.random.default_rng(seed)
-    covariance, root = prior_of(OF)
+    _, root = prior_of(OF)
     stable, cells = ground(seed + 51, count), ground(seed + 500, 200)
     state = root @ rng.normal(size=len(root))
     residual_m = stable.matrix() @ state + rng.normal(0, 0.01, count)
     wrong = rng.uniform(size=count) < share
-    found = adjust(stable.patches(residual_m + wrong), STILL, covariance, None)
+    found = adjust(stable.patches(residual_m + wrong), STILL, known_before(OF), None)
     return cells.matrix() @ state - found.effect(cells.felt()), sigmas(found, cells), found, wrong
 
 
@@ -371,7 +390,7 @@ def test_stable_ground_that_disagrees_with_itself_is_distrusted():
 )
 def test_a_scanner_that_was_moved_is_told(place, size, word):
     covariance, _ = prior_of(OF)
-    at_rest = adjust(ground(54, 400).patches(np.zeros(400)), STILL, covariance, None)
+    at_rest = adjust(ground(54, 400).patches(np.zeros(400)), STILL, known_before(OF), None)
     assert distrust(at_rest, HABITS) == []
     for share, wanted in ((0.5, []), (1.0, [word])):
         moved = np.zeros(len(covariance))
@@ -382,13 +401,12 @@ def test_a_scanner_that_was_moved_is_told(place, size, word):
 
 
 def test_withheld_and_unused_patches_are_not_looked_at():
-    covariance, _ = prior_of(OF)
     rng = np.random.default_rng(60)
     stable = ground(61, 300)
     kind = rng.choice([Kind.STABLE, Kind.WITHHELD], 300, p=[0.9, 0.1])
     residual_m = rng.normal(0, 0.01, 300)
     found, again = (
-        adjust(stable.patches(told, kind=kind), STILL, covariance, None)
+        adjust(stable.patches(told, kind=kind), STILL, known_before(OF), None)
         for told in (residual_m, residual_m + 5.0 * (kind == Kind.WITHHELD))
     )
     assert np.array_equal(found.estimate, again.estimate)
@@ -398,7 +416,7 @@ def test_withheld_and_unused_patches_are_not_looked_at():
 
 def test_an_avalanche_stays_where_it_is():
     rng = np.random.default_rng(70)
-    covariance, root = prior_of(OF)
+    _, root = prior_of(OF)
     state = root @ rng.normal(size=len(root))
     stable, glacier, cells = ground(71, 100), ground(72, 3000, steep=0.3), ground(73, 400)
     path = (np.abs(glacier.line - 100) < 4) & (np.abs(glacier.stretch - 20) < 3)
@@ -406,7 +424,7 @@ def test_an_avalanche_stays_where_it_is():
     plain_m = glacier.matrix() @ state + rng.normal(0, 0.01, 3000)
     seen = stable.patches(stable.matrix() @ state + rng.normal(0, 0.01, 100))
     found, struck = (
-        adjust(together(seen, glacier.patches(told, kind=Kind.MOVING)), STILL, covariance, None)
+        adjust(together(seen, glacier.patches(told, kind=Kind.MOVING)), STILL, known_before(OF), None)
         for told in (plain_m, plain_m + 2.0 * path)
     )
     apart_m = struck.effect(cells.felt()) - found.effect(cells.felt())
@@ -416,13 +434,25 @@ def test_an_avalanche_stays_where_it_is():
 
 
 def test_a_reference_that_is_wrong_itself_makes_the_prior_wider():
-    covariance, _ = prior_of(OF)
     p = len(OF.names)
     root = np.random.default_rng(80).normal(size=(p, p)) * 1e-5
     known = shared.Shared(OF.names, OF.units, np.zeros(p), root @ root.T, np.zeros(p))
-    wider = adjustment.prior_of_difference(OF, covariance, known)
-    assert adjustment.prior_of_difference(OF, covariance, None) is covariance
+    alone = known_before(OF)
+    assert alone.against(None) is alone
     cells = ground(81, 50)
     design = cells.matrix()
-    told_m2 = np.einsum("ij,jk,ik->i", design, wider - covariance, design)
+    told_m2 = np.einsum("ij,jk,ik->i", design, alone.against(known).by_line() - alone.by_line(), design)
     assert told_m2 == pytest.approx(cells.felt().variance(known), rel=1e-6)
+    elsewhere = replace(known, names=(*OF.names[:-1], "of a scanner that stood otherwise"))
+    assert alone.against(elsewhere).by_line() == pytest.approx(2 * alone.by_line(), rel=1e-12)
+
+
+def test_what_is_known_beforehand_is_the_motion_line_by_line():
+    for of in (OF, ROUND):
+        covariance, _ = prior_of(of)
+        sigma = np.sqrt(np.diag(covariance))
+        apart = np.abs(known_before(of).by_line() - covariance) / np.outer(sigma, sigma)
+        assert np.diag(apart).max() < 1e-12
+        assert np.median(apart) < 2e-4
+        seam = 15 if of.closed else 0  # lines about the place where the head begins and ends
+        assert apart[9 + seam : -seam or None, 9 + seam : -seam or None].max() < 0.01

@@ -4,6 +4,7 @@ import math
 
 import numpy as np
 import pytest
+from scipy import ndimage
 
 from station.quantities import Grid, Reference
 from station.science import beam, change, terrain
@@ -34,6 +35,29 @@ def test_smooth_gradient_of_a_plane_with_holes():
     assert seen[11, 21]
     assert east[seen] == pytest.approx(0.4, abs=1e-4)
     assert north[seen] == pytest.approx(-0.1, abs=1e-4)
+
+
+def test_smoothing_is_a_normalised_gaussian_also_of_some_rows():
+    rng = np.random.default_rng(3)
+    values = rng.normal(size=(41, 33)).astype(np.float32)
+    values[rng.uniform(size=values.shape) < 0.3] = np.nan
+    values[20:35, 5:20] = np.nan
+    told = terrain.smooth(values, 1.5)
+    known = np.isfinite(values)
+    total, weight = (
+        ndimage.gaussian_filter(v, 1.5, truncate=2.0, mode="constant")
+        for v in (np.where(known, values, 0.0).astype(float), known.astype(float))
+    )
+    assert np.array_equal(np.isfinite(told), weight > 1e-3)
+    assert np.isnan(told).any()
+    near = weight > 1e-3
+    assert told[near] == pytest.approx((total[near] / weight[near]), abs=2e-5)
+    for rows in (slice(4, 30), slice(3, 41, 5), slice(0, 41, 50)):
+        assert np.array_equal(terrain.smooth(values, 1.5, rows), told[rows], equal_nan=True)
+        for part, whole in zip(
+            terrain.smooth_gradient(values, 2.0, rows=rows), terrain.smooth_gradient(values, 2.0), strict=True
+        ):
+            assert np.array_equal(part, whole[rows], equal_nan=True)
 
 
 def test_ground_is_bilinear_between_centres_and_goes_on_to_the_edge():

@@ -1,0 +1,242 @@
+"""The normal equations of one scan: what its patches, its log and what is known beforehand say of its state.
+
+The unknowns that remain are those by knots, the log's own faults and the change of the moving ground; each
+line's own lean is taken out before and found again after. Source: EQUATIONS 6.3.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import linalg, sparse
+
+from station.quantities import Floats, Shared
+from station.science.leans import KnownLeans, OwnLeans
+from station.science.shared import (
+    GLOBAL,
+    Basis,
+    Sensitivities,
+    condensed,
+    interpolated,
+    leans_between,
+    lines_from_knots,
+    rows_at_knots,
+    rows_at_lines,
+)
+
+
+@dataclass(frozen=True)
+class LineLog:
+    """What the inclination log says of each group of lines, and what it may get wrong."""
+
+    lean_rad: Floats  # (lines,) along the line of sight
+    weight: Floats  # (lines,) 1 / rad², nought where there is none
+    faults: Floats  # (lines, f) effect of one sigma of each of its common errors [rad]
+
+
+@dataclass(frozen=True)
+class Beforehand:
+    """What is known of the scanner's state before a scan is looked at.
+
+    The lean of a line is what is straight between the knots beside it, and its own.
+    """
+
+    of: Basis
+    knots: Floats  # (p, p) covariance of the globals, the lean at knots, the refraction
+    own: OwnLeans
+
+    def against(self, reference: Shared | None) -> Beforehand:
+        """Return the same for the difference to the state of the reference, which is wrong itself."""
+        if reference is None:
+            return self
+        if reference.names != self.of.names:  # the scanner has been moved: it is as unsure as a scan
+            return Beforehand(self.of, 2 * self.knots, self.own.twice())
+        return Beforehand(self.of, self.knots + reference.covariance, self.own)
+
+    def by_line(self) -> Floats:
+        """Covariance (u, u) of globals, leans of lines and refraction knots."""
+        covariance = lines_from_knots(self.of, self.knots)
+        lines = slice(len(GLOBAL), len(GLOBAL) + self.of.line_count)
+        covariance[lines, lines] += self.own.covariance()
+        return covariance
+
+
+@dataclass(frozen=True)
+class Reduced:
+    """Normal equations after the own leans of the lines were taken out of them."""
+
+    normal: Floats  # (m, m)
+    right: Floats  # (m,)
+    own: KnownLeans
+    felt: sparse.csr_array  # (lines, m) how the own leans go with the other unknowns
+    told: Floats  # (lines,) their right side
+
+    def own_rad(self, estimate: Floats) -> Floats:
+        """Own leans (lines,) that go with the other unknowns (m,)."""
+        return self.own.times((self.told - self.felt @ estimate)[:, None])[:, 0]
+
+
+class Normals:
+    """Normal equations of the state by knots, the log's own faults and the change: m unknowns.
+
+    Each line's own lean is an unknown too, which is taken out at once.
+    """
+
+    def __init__(
+        self,
+        felt: Sensitivities,
+        field: sparse.csr_array,
+        wanted_m: Floats,
+        before: Beforehand,
+        log: LineLog | None,
+    ) -> None:
+        of = felt.of
+        seen, state = _design(felt), len(before.knots)
+        self._patches = len(felt)
+        self._lean, self._line, self._wanted = felt.lean, felt.line, wanted_m
+        faults = 0 if log is None else log.faults.shape[1]
+        self.size = state + faults
+        self._design = sparse.hstack([seen, sparse.csr_array((len(felt), faults)), field], format="csr")
+        self._log_weight = np.empty(0)
+        if log is not None:
+            self._add(log, interpolated(of, np.eye(of.lean_count)), of.line_azimuth_rad)
+        self._prior = np.zeros((self._design.shape[1],) * 2)
+        self._prior[:state, :state] = Factored(before.knots).inverse()
+        self._prior[range(state, self.size), range(state, self.size)] = 1.0
+        self._own = before.own
+        rows = np.arange(len(self._line))
+        shape = of.line_count, len(rows)
+        self._lines = sparse.csr_array((self._lean, (self._line, rows)), shape=shape)
+        self._across = self._design.T.tocsr()
+
+    def _add(self, log: LineLog, knots: Floats, azimuth_rad: Floats) -> None:
+        """Add what the log says of each line, as further observations."""
+        felt = np.zeros((len(knots), self._design.shape[1]))
+        felt[:, 0], felt[:, 1] = np.cos(azimuth_rad), -np.sin(azimuth_rad)
+        felt[:, len(GLOBAL) : len(GLOBAL) + knots.shape[1]] = knots
+        felt[:, self.size - log.faults.shape[1] : self.size] = log.faults
+        self._design = sparse.vstack([self._design, sparse.csr_array(felt)], format="csr")
+        self._lean = np.concatenate([self._lean, np.ones(len(knots))])
+        self._line = np.concatenate([self._line, np.arange(len(knots))])
+        self._wanted = np.concatenate([self._wanted, log.lean_rad])
+        self._log_weight = log.weight
+
+    def weighted(self, weight: Floats) -> Reduced:
+        """Return the equations for a weight of each patch (n,)."""
+        weight = np.concatenate([weight, self._log_weight])
+        weighted = sparse.diags_array(weight) @ self._design
+        own = self._own.given(np.asarray(self._lines @ (weight * self._lean)))
+        felt: sparse.csr_array = self._lines @ weighted
+        told = np.asarray(self._lines @ (weight * self._wanted))
+        normal = self._prior + (self._across @ weighted).toarray() - own.between(felt)
+        right = self._across @ (weight * self._wanted) - felt.T @ own.times(told[:, None])[:, 0]
+        return Reduced(normal, right, own, felt, told)
+
+    def effect(self, estimate: Floats, own_rad: Floats) -> Floats:
+        """Effect of the unknowns (m,) and the own leans of the lines on the patches (n,) [m]."""
+        effect = self._design @ estimate + self._lean * own_rad[self._line]
+        return np.asarray(effect[: self._patches])
+
+
+def _design(felt: Sensitivities) -> sparse.csr_array:
+    """Matrix J (n, p), by knots."""
+    of, count = felt.of, len(felt)
+    row = np.arange(count)
+    rows, columns, values = (
+        [np.tile(row, len(GLOBAL))],
+        [np.repeat(np.arange(len(GLOBAL)), count)],
+        [felt.globals_.ravel()],
+    )
+    for effect, (before, after, share), first in (
+        (felt.lean, felt.lean_knot(), len(GLOBAL)),
+        (felt.refraction, felt.refraction_knot(), len(GLOBAL) + of.lean_count),
+    ):
+        rows += [row, row]
+        columns += [first + before, first + after]
+        values += [effect * (1 - share), effect * share]
+    placed = np.concatenate(values), (np.concatenate(rows), np.concatenate(columns))
+    return sparse.csr_array(placed, shape=(count, len(of.names)))
+
+
+@dataclass(frozen=True)
+class Unknown:
+    """What an adjustment leaves unknown: own leans of the lines, given the other unknowns, and these."""
+
+    of: Basis
+    own: KnownLeans
+    felt: sparse.csr_array  # (lines, m) how the own leans go with the other unknowns
+    whole: Factored  # (m, m)
+
+    def by_line(self) -> Floats:
+        """Covariance (u, u) of the state."""
+        of = self.of
+        state, lines = len(of.names), slice(len(GLOBAL), len(GLOBAL) + of.line_count)
+        tied = rows_at_lines(of, np.eye(state, self.felt.shape[1]))
+        tied[lines] -= self.own.times(self.felt.toarray())
+        half = self.whole.half(tied.T)
+        covariance = half.T @ half
+        covariance[lines, lines] += self.own.times(np.eye(of.line_count))
+        return np.asarray(covariance)
+
+    def by_knots(self, estimate: Floats) -> Shared:
+        """Return what is known of the state (u,), condensed to knots."""
+        of, own, between = self.of, self.own, leans_between(self.of)
+        lean = slice(len(GLOBAL), len(GLOBAL) + of.lean_count)
+        felt = own.times(self.felt.toarray())
+        narrow = between.fit @ felt
+        tied = np.eye(len(of.names), self.felt.shape[1])
+        tied[lean] -= narrow
+        half = self.whole.half(tied.T)
+        covariance = half.T @ half
+        beside = own.times(between.fit.T)
+        at_knots = between.fit @ beside
+        covariance[lean, lean] += at_knots
+        left_rad2 = own.variance() - np.einsum(
+            "ij,ij->i", between.knots, 2 * beside - interpolated(of, at_knots)
+        )
+        left_rad2 += np.sum(self.whole.half((felt - interpolated(of, narrow)).T) ** 2, axis=0)
+        return condensed(of, rows_at_knots(of, estimate[:, None])[:, 0], covariance, left_rad2)
+
+
+class Factored:
+    """A covariance or normal matrix (n, n), factored; its unknowns may have units of very different size."""
+
+    def __init__(self, matrix: Floats) -> None:
+        self._scale = 1 / np.sqrt(np.diag(matrix))
+        self._root = root_of(matrix * self._scale[:, None] * self._scale)
+
+    def half(self, right: Floats) -> Floats:
+        """Return H (n, k) so that HᵀH is the right side (n, k) both sides of the inverse."""
+        scaled = right * self._scale[:, None]
+        return np.asarray(
+            linalg.solve_triangular(self._root, scaled, lower=True, overwrite_b=True, check_finite=False)
+        )
+
+    def solve(self, right: Floats) -> Floats:
+        """Solution (n,)."""
+        solved = linalg.cho_solve((self._root, True), right * self._scale, check_finite=False)
+        return np.asarray(solved * self._scale)
+
+    def inverse(self) -> Floats:
+        """Inverse (n, n)."""
+        if not len(self._scale):
+            return np.empty((0, 0))
+        half = np.tril(linalg.lapack.dpotri(self._root, lower=True)[0])
+        whole = half + np.tril(half, -1).T
+        return np.asarray(whole * self._scale[:, None] * self._scale)
+
+    def log_determinant(self) -> float:
+        """Logarithm of the determinant."""
+        return log_determinant(self._root) - float(2 * np.log(self._scale).sum())
+
+
+def root_of(matrix: Floats) -> Floats:
+    """Return the lower triangular root of a symmetric matrix (n, n), which it overwrites."""
+    root, _ = linalg.cho_factor(matrix.T, lower=True, overwrite_a=True, check_finite=False)
+    return np.asarray(root)
+
+
+def log_determinant(root: Floats) -> float:
+    """Logarithm of the determinant of the matrix that has a root (n, n)."""
+    return float(2 * np.log(np.diag(root)).sum())
