@@ -90,6 +90,18 @@ class Frame:
                     np.add(axis_m, scratch, out=axis_m)
         return mapped_m[0], mapped_m[1], mapped_m[2]
 
+    @property
+    def to_axes(self) -> Floats:
+        """Rotation (3, 3) from the scanner's frame to axes along easting, northing and up at the scanner.
+
+        True north lies 1.3° beside grid north at Hintereisferner: the head passes that in eight seconds.
+        """
+        turn = self.to_local[:3, :3]
+        if len(self.powers) == 0:
+            return turn
+        east_m, north_m, _ = self.coefficients[np.all(self.powers == (0, 1, 0), axis=1)][0]
+        return np.asarray(rotation_z(-math.atan2(east_m, north_m)) @ turn)
+
 
 def _monomials(x: Floats, y: Floats, z: Floats, powers: Ints) -> dict[tuple[int, int, int], Floats]:
     """Every wanted monomial, each by one product of two smaller ones."""
