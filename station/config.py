@@ -81,6 +81,11 @@ class ScannerSection(Section):
     inclination_sigma_deg: Annotated[float, Field(gt=0, le=1)]
     inclination_range_deg: Annotated[float, Field(gt=0, le=90)]
     range_max_m: Positive
+    beam_origin_m: Annotated[list[Annotated[float, Field(ge=-2, le=2)]], Field(min_length=3, max_length=3)] = [
+        0.0,
+        0.0,
+        0.0,
+    ]
 
     @model_validator(mode="before")
     @classmethod
@@ -108,6 +113,7 @@ class ScannerSection(Section):
             inclination_sigma_rad=math.radians(self.inclination_sigma_deg),
             inclination_range_rad=math.radians(self.inclination_range_deg),
             range_max_m=self.range_max_m,
+            beam_origin_m=(self.beam_origin_m[0], self.beam_origin_m[1], self.beam_origin_m[2]),
         )
 
 
@@ -399,7 +405,7 @@ class Site(SiteFile):
             mode="json",
             include={
                 "scans": {"frame", "point_time"},
-                "scanner": True,
+                "scanner": set(ScannerSection.model_fields) - {"beam_origin_m"},  # of single points only
                 "map": {"crs", "origin", "vertical_datum"},
                 "grid": True,
                 "inclination": {"filter", "cutoff_hz", "mode"},

@@ -45,7 +45,7 @@ def lean(xyz_m: tuple[Floats, Floats, Floats], time_s: Floats, tilt: Tilt) -> tu
     """Coordinates (n,) of shots in the upright scanner frame [m], each turned by the tilt of its moment.
 
     R_D = Ry(pitch) Rx(roll), in the scanner's frame, before the SOP.
-    Source: Hartzell et al. (2015), Eq. 5.
+    Source: Hartzell et al. (2015), Eq. 5, which adds it to the chain of Eq. 4.
     """
     x_m, y_m, z_m = xyz_m
     roll_rad = np.interp(time_s, tilt.time_s, tilt.roll_rad)

@@ -77,6 +77,10 @@ def describe(told: Told) -> str:
                 )
             )
         lines.append(f"  farthest apart by {max(worst):.1f} sampling errors")
+        lines += [
+            f"  by interaction of {', '.join(one['inputs'])}: {100 * one['share']:.1f} ± {100 * one['error']:.1f}"
+            for one in area["interactions"]
+        ]
     if told["maps"]:
         lines += ["", told["maps"]]
     return "\n".join(lines)
