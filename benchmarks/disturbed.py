@@ -56,7 +56,7 @@ def disturbed(folder: Path, seed: int, case: str) -> dict[str, object]:
 
 def _without_numbers(reason: str) -> str:
     """Return a reason that scans may share."""
-    return re.sub(r"[0-9.]+ (s|degree)\b", r"… \1", reason.split(" of 2")[0])
+    return re.sub(r"[0-9.]+ (s|degree)\b", r"… \1", reason.split(" of 2", maxsplit=1)[0])
 
 
 def _results(_folder: str, names: list[str]) -> set[str]:

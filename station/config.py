@@ -81,7 +81,9 @@ class ScannerSection(Section):
     inclination_sigma_deg: Annotated[float, Field(gt=0, le=1)]
     inclination_range_deg: Annotated[float, Field(gt=0, le=90)]
     range_max_m: Positive
-    beam_origin_m: Annotated[list[Annotated[float, Field(ge=-2, le=2)]], Field(min_length=3, max_length=3)] = [
+    beam_origin_m: Annotated[
+        list[Annotated[float, Field(ge=-2, le=2)]], Field(min_length=3, max_length=3)
+    ] = [
         0.0,
         0.0,
         0.0,

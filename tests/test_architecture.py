@@ -63,7 +63,7 @@ def test_each_equation_has_one_home():
 
 
 def test_every_equation_of_the_papers_has_a_home():
-    """But two that say nothing of their own: Ozendi's covariance before it is turned, Leslar's count of terms."""
+    """But two of which the sheet of equations that all was built from has nothing."""
     found = set()
     for path in SCIENCE:
         for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):

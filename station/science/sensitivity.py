@@ -173,7 +173,7 @@ def sobol(model: Model, draw: Draw, groups: list[Bools], draws: int = 256, seed:
 def interactions(
     model: Model, draw: Draw, groups: list[Bools], draws: int = 256, seed: int = 1
 ) -> dict[tuple[int, ...], tuple[float, float]]:
-    """Index of every combination of groups by simulation, from one group to all, each with its standard error.
+    """Index of every combination of groups by simulation, of one group to all, with its standard error.
 
     What a combination explains together, less what any part of it does: for three, the three pairs' as well
     as the three groups' own. `draws` as of `sobol`; `groups` are few: n make 2ⁿ combinations.
@@ -190,9 +190,7 @@ def interactions(
     return {of: (float(mean), float(error)) for of, (mean, error) in told.items()}
 
 
-def _repeated(
-    model: Model, draw: Draw, groups: list[Bools], draws: int, seed: int
-) -> tuple[Floats, Floats]:
+def _repeated(model: Model, draw: Draw, groups: list[Bools], draws: int, seed: int) -> tuple[Floats, Floats]:
     """First and total indices (repetitions, groups)."""
     random = np.random.default_rng(seed)
     found = []

@@ -42,8 +42,8 @@ class Lateness:
         """Say it where it is clear."""
         if self.odds < LATE_ODDS or abs(self.late_s) < LATE_LEAST_S or self.sigma_s > LATE_SIGMA_S:
             return []
-        word = "late" if self.late_s > 0 else "early"
-        return [f"inclination log {abs(self.late_s):.1f} s {word} (± {self.sigma_s:.1f} s), by how the ground sways"]
+        late = f"{abs(self.late_s):.1f} s {'late' if self.late_s > 0 else 'early'}"
+        return [f"inclination log {late} (± {self.sigma_s:.1f} s), by how the ground sways"]
 
 
 @dataclass(frozen=True)
@@ -163,7 +163,5 @@ def _sway(of: Expected, habits: Habits) -> Floats:
     """What the ground expects a sensor to feel (lines,) [rad]: without what lines have of their own."""
     whole = motion(habits, of.lines)
     mean_rad = of.ground_rad.mean()
-    alone_rad = habits.line_motion_rad**2 * linalg.solve(
-        whole, of.ground_rad - mean_rad, assume_a="pos"
-    )
+    alone_rad = habits.line_motion_rad**2 * linalg.solve(whole, of.ground_rad - mean_rad, assume_a="pos")
     return np.asarray(of.ground_rad - alone_rad)

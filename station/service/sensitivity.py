@@ -78,12 +78,16 @@ def describe(told: Told) -> str:
             )
         lines.append(f"  farthest apart by {max(worst):.1f} sampling errors")
         lines += [
-            f"  by interaction of {', '.join(one['inputs'])}: {100 * one['share']:.1f} ± {100 * one['error']:.1f}"
+            f"  by interaction of {' and '.join(one['inputs'])}: {_percent(one['share'], one['error'])}"
             for one in area["interactions"]
         ]
     if told["maps"]:
         lines += ["", told["maps"]]
     return "\n".join(lines)
+
+
+def _percent(share: float, error: float) -> str:
+    return f"{100 * share:.1f} ± {100 * error:.1f}"
 
 
 def _line(

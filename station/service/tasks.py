@@ -262,11 +262,10 @@ def levelled_to(
 def _log_against_ground(
     levelled: tuple[Told, Adjustment, Bools] | None, reference: Reference | None
 ) -> tuple[list[str], dict[str, float]]:
-    """Say what the ground has against a scan's inclination log, and how late that is as the store keeps it."""
+    """Say what the ground has against a scan's log, and how late that is as the store keeps it."""
     if levelled is None or reference is None or levelled[0].log is None:
         return [], {}
-    told, found, _ = levelled
-    expected = sensor.expected(told.lines, told.log, found)
+    expected = sensor.expected(levelled[0].lines, levelled[0].log, levelled[1])
     doubts, late = sensor.off_habit(expected), sensor.lateness(expected, reference.habits)
     if late is None:
         return doubts, {}

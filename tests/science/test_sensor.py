@@ -25,7 +25,8 @@ FELT[:, 0], FELT[:, 1] = np.cos(OF.line_azimuth_rad), -np.sin(OF.line_azimuth_ra
 FELT[:, STATE] = np.eye(OF.line_count)
 FAULTS = np.concatenate(
     [
-        np.stack([np.cos(OF.line_azimuth_rad), -np.sin(OF.line_azimuth_rad)], axis=-1) * prior.SENSOR_BIAS_RAD,
+        np.stack([np.cos(OF.line_azimuth_rad), -np.sin(OF.line_azimuth_rad)], axis=-1)
+        * prior.SENSOR_BIAS_RAD,
         prior.cycle_changes(LINES, ZERO),
     ],
     axis=1,
@@ -92,7 +93,9 @@ def test_lines_without_a_log_do_not_count():
     alone = scan.adjusted()
     gain = alone.covariance @ FELT[kept].T
     spread = noise + FELT[kept] @ gain
-    estimate = alone.estimate + gain @ np.linalg.solve(spread, log.lean_rad[kept] - FELT[kept] @ alone.estimate)
+    estimate = alone.estimate + gain @ np.linalg.solve(
+        spread, log.lean_rad[kept] - FELT[kept] @ alone.estimate
+    )
     covariance = alone.covariance - gain @ np.linalg.solve(spread, gain.T)
     told = sensor.expected(LINES, with_gap, Adjustment(OF, estimate, covariance, 0.001, np.ones(9)))
     assert told.ground_rad[::-1] == pytest.approx((FELT @ alone.estimate)[kept], abs=1e-9)

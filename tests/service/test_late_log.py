@@ -24,7 +24,9 @@ def told(tmp_path, monkeypatch):
         with netCDF4.Dataset(series.path, "w") as file:
             file.createDimension("time", len(late_s))
             for name, values in zip(names, (late_s, sigma_s), strict=True):
-                file.createVariable(name, "f8", ("time",), fill_value=9.96921e36)[:] = np.ma.masked_invalid(values)
+                file.createVariable(name, "f8", ("time",), fill_value=9.96921e36)[:] = np.ma.masked_invalid(
+                    values
+                )
         return late_log.late_log(SimpleNamespace())
 
     return told
