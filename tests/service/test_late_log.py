@@ -9,7 +9,8 @@ import pytest
 from station.archive.layout import Series
 from station.errors import StoreError
 from station.quantities import Grid
-from station.service import late_log
+from station.service import health, late_log
+from station.service.journal import Journal
 
 NAMES = ("log_lateness", "log_lateness_uncertainty")
 
@@ -63,6 +64,24 @@ def test_scans_that_say_nothing_do_not_count(told):
 
 def test_a_series_of_an_older_version_says_nothing(told):
     assert told(*drawn(1, 6.0), names=("a", "b")) == ""
+
+
+def test_status_says_it(told, tmp_path, monkeypatch):
+    """Beside a journal, as a person asks for it."""
+    monkeypatch.setattr("station.service.moved.moved", lambda _: "")
+    monkeypatch.setattr("station.service.stale.count_by_settings", lambda _: 0)
+    told(*drawn(1, 6.0))
+    with Journal(tmp_path / "journal.sqlite"):
+        pass
+    site = SimpleNamespace(
+        station=SimpleNamespace(id="hef", name="Hef", data=tmp_path),
+        scans=SimpleNamespace(inbox=tmp_path, expected_every_s=3600.0),
+        grid=SimpleNamespace(shape=(2, 3)),
+        adjusts=True,
+    )
+    assert any("clock of the logger" in fault for fault in health.status(site)["faults"])
+    site.adjusts = False
+    assert not any("clock of the logger" in fault for fault in health.status(site)["faults"])
 
 
 def test_a_damaged_series_is_an_error(told, tmp_path):
