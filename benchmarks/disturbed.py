@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import shutil
 from collections import Counter
 from dataclasses import replace
@@ -11,7 +12,8 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.measures import Calibration, Result, box_figures, twenty_boxes
-from benchmarks.stations import METHODS, processed, scenario_of, simulated
+from benchmarks.stations import METHODS, processed, scenario_of, simulated, site_of
+from station.service.late_log import late_log
 
 CASES = (
     "as it was",
@@ -37,7 +39,9 @@ def disturbed(folder: Path, seed: int, case: str) -> dict[str, object]:
     _spoil(home, case, scenario.reference_scans)
     outcomes = processed(home, METHODS["joint_good"])
     result = Result(home, METHODS["joint_good"])
-    reasons = Counter(str(one["reason"]).split(" of 2")[0] for one in outcomes if one["reason"])
+    reasons = Counter(_without_numbers(str(one["reason"])) for one in outcomes if one["reason"])
+    if series := late_log(site_of(home, METHODS["joint_good"])):
+        reasons[f"of the series: {series}"] = 1
     known = Calibration(result)
     targets = known.targets("100 m")
     z = np.array([known.z(targets, epoch)[0] for epoch in range(len(result.error_m))])
@@ -48,6 +52,11 @@ def disturbed(folder: Path, seed: int, case: str) -> dict[str, object]:
         "z_std_100_m": float(np.nanstd(z)),
         **box_figures(result, twenty_boxes(result)),
     }
+
+
+def _without_numbers(reason: str) -> str:
+    """Return a reason that scans may share."""
+    return re.sub(r"[0-9.]+ (s|degree)\b", r"… \1", reason.split(" of 2", maxsplit=1)[0])
 
 
 def _results(_folder: str, names: list[str]) -> set[str]:

@@ -50,6 +50,7 @@ class Scanner:
     inclination_sigma_rad: float  # of one sample of the inclination log
     inclination_range_rad: float  # farthest lean its sensor tells, either way
     range_max_m: float
+    beam_origin_m: tuple[float, float, float] = (0.0, 0.0, 0.0)  # forward, left, up from the frame's origin
 
 
 @dataclass(frozen=True)

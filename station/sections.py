@@ -18,6 +18,7 @@ from station.scanners import SCANNERS
 
 Positive = Annotated[float, Field(gt=0)]
 NotNegative = Annotated[float, Field(ge=0)]
+Arm = Annotated[float, Field(ge=-2, le=2)]
 
 
 def _in_utc(moment: datetime) -> datetime:
@@ -67,6 +68,7 @@ class ScannerSection(Section):
     inclination_sigma_deg: Annotated[float, Field(gt=0, le=1)]
     inclination_range_deg: Annotated[float, Field(gt=0, le=90)]
     range_max_m: Positive
+    beam_origin_m: tuple[Arm, Arm, Arm] = (0.0, 0.0, 0.0)
 
     @model_validator(mode="before")
     @classmethod
@@ -94,6 +96,7 @@ class ScannerSection(Section):
             inclination_sigma_rad=math.radians(self.inclination_sigma_deg),
             inclination_range_rad=math.radians(self.inclination_range_deg),
             range_max_m=self.range_max_m,
+            beam_origin_m=self.beam_origin_m,
         )
 
 

@@ -7,6 +7,7 @@ import math
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from station.quantities import Air
 from station.science import air, beam, uncertainty
@@ -95,6 +96,40 @@ def test_jacobian_against_finite_differences():
             moved[column] = moved[column] + sign * step
             ends.append(beam.cartesian(*moved)[0])
         assert told[:, column] == pytest.approx((ends[0] - ends[1]) / (2 * step), rel=1e-6, abs=1e-5)
+
+
+ORIGIN_M = (0.03, -0.05, 0.22)  # of the beam: forward, left, up
+
+
+def shots(count=40, seed=4):
+    rng = np.random.default_rng(seed)
+    return rng.uniform(1, 60, count), rng.uniform(-1.2, 1.2, count), rng.uniform(-3.1, 3.1, count)
+
+
+def test_a_beam_that_begins_beside_the_centre():
+    """V-4 against a head that is turned as a body: origin and direction in its frame, then both turned."""
+    range_m, elevation, azimuth = shots()
+    in_head = np.stack([np.cos(elevation), 0 * elevation, np.sin(elevation)], axis=-1)
+    wanted = Rotation.from_rotvec(np.outer(azimuth, [0, 0, 1])).apply(ORIGIN_M + range_m[:, None] * in_head)
+    told = beam.cartesian(range_m, elevation, azimuth, ORIGIN_M)
+    assert told == pytest.approx(wanted, abs=1e-9)
+    assert beam.vertex(array(1, 2, 3), array(2.0), array(0, 0, 1.0)[None])[0] == pytest.approx([1, 2, 5])
+    for back, given in zip(beam.polar(told, ORIGIN_M), (range_m, elevation, azimuth), strict=True):
+        assert back == pytest.approx(given, abs=1e-9)
+    without = beam.polar(told)  # what dropping it makes of a near point
+    assert np.abs(without[1] - elevation).max() > 0.01
+
+
+def test_jacobian_of_a_beam_that_begins_beside_the_centre():
+    at = [one[:1] for one in shots(1)]
+    told = beam.polar_jacobian(*at, ORIGIN_M)[0]
+    for column, step in enumerate((1e-2, 1e-6, 1e-6)):
+        ends = []
+        for sign in (1, -1):
+            moved = list(at)
+            moved[column] = moved[column] + sign * step
+            ends.append(beam.cartesian(*moved, ORIGIN_M)[0])
+        assert told[:, column] == pytest.approx((ends[0] - ends[1]) / (2 * step), rel=1e-6, abs=1e-7)
 
 
 def test_beam_of_a_vz4000():

@@ -12,6 +12,8 @@ from station.config import read_site
 from station.quantities import Quality
 from station.service import references, tasks, upkeep
 from station.service.inbox import Arrival
+from station.service.late_log import late_log
+from station.simulation.motion import sensor_faults
 from station.simulation.scenario import named
 from station.simulation.station import simulate
 
@@ -246,12 +248,25 @@ def test_scenarios_a_station_must_stand(tmp_path, name):
         assert not any("see" in outcome.reason for outcome in measured.outcomes)
 
 
+def clocks(scenario):
+    """How late the log of each scan was written."""
+    return np.array([sensor_faults(scenario, scan).clock_s for scan in range(scenario.hours)])
+
+
+def test_how_late_a_log_is_stands_in_the_store(calm):
+    late = calm.series.log_lateness + calm.series.log_offset - clocks(CALM)[REFERENCE:]
+    assert np.all(np.abs(late) < 4 * calm.series.log_lateness_uncertainty)
+    assert np.all(calm.series.log_lateness_uncertainty < 6.0)
+    assert late_log(calm.site) == ""
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("method", ["joint", "none"])
-def test_a_log_five_seconds_late_is_held_by_sigma(tmp_path, method):
-    """Too little to be told from a wave of 0.035°, and too little to matter."""
+def test_a_log_five_seconds_late_is_held_by_sigma_and_told(tmp_path, method):
+    """Too little to be told from a wave of 0.035°, and too little to matter; but the ground sways too."""
     folder = tmp_path / "station"
-    simulate(folder, CALM)
+    scenario = replace(CALM, hours=REFERENCE + 8)
+    simulate(folder, scenario)
     for path in sorted((folder / "inbox").glob("*-incl.txt"))[REFERENCE:]:
         head, *rows = path.read_text().splitlines()
         late = (f"{float(row.split(',')[0]) + 5:.4f},{row.split(',', 1)[1]}" for row in rows)
@@ -259,7 +274,22 @@ def test_a_log_five_seconds_late_is_held_by_sigma(tmp_path, method):
     measured = Measured(folder, *([FILTERED] if method == "none" else []))
     error, sigma, _ = measured.boxes()
     assert np.sqrt(np.mean((error / sigma) ** 2)) < 1.3
-    assert {outcome.verdict for outcome in measured.outcomes} == {"good"}
+    if method == "none":
+        assert {outcome.verdict for outcome in measured.outcomes} == {"good"}
+        return
+    late = measured.series.log_lateness + measured.series.log_offset - 5 - clocks(scenario)[REFERENCE:]
+    assert np.sqrt(np.mean((late / measured.series.log_lateness_uncertainty) ** 2)) < 1.5
+    assert "s late (±" in late_log(measured.site)
+
+
+@pytest.mark.slow
+def test_a_wave_that_has_changed_is_told(tmp_path):
+    folder = tmp_path / "station"
+    simulate(folder, replace(CALM, log_cyclic_change=0.6))
+    measured = Measured(folder)
+    error, sigma, _ = measured.boxes()
+    assert np.sqrt(np.mean((error / sigma) ** 2)) < 1.3
+    assert any("wave over a turn" in outcome.reason for outcome in measured.outcomes)
 
 
 def cut_short(folder):

@@ -19,12 +19,13 @@ from station.quantities import Bools, Floats, Ints, Reference, Shared
 from station.science import terrain
 from station.science.calibration import range_bands
 from station.science.moved import Moved
-from station.science.sensitivity import INPUTS, apart, cell_shares, sobol, some, sum_shares
+from station.science.sensitivity import INPUTS, apart, cell_shares, interactions, sobol, some, sum_shares
 from station.science.shared import Sensitivities, against
 
 LOOKED_AT = 100_000  # cells at once
 SIMULATED_CELLS = 100  # of an area: its shares do not depend on every one
 SIMULATED_DRAWS = 64  # of each repetition
+INTERACTING = 3  # largest inputs, whose interactions are looked at
 
 ROWS = tuple(
     Variable(
@@ -101,12 +102,22 @@ class Attribution:
         weights = np.full(len(chosen), 1 / len(chosen))
         points = grid.x_m[column], grid.y_m[row], height_m
         moved = Moved(ground, self.position_m, points, weights, felt, self.unknown, random_m2)
-        found = sobol(moved, moved.draw, moved.groups(), SIMULATED_DRAWS)
+        groups = moved.groups()
+        found = sobol(moved, moved.draw, groups, SIMULATED_DRAWS)
+        largest = np.argsort(-found.total)[:INTERACTING].tolist()
+        joint = interactions(moved, moved.draw, [groups[one] for one in largest], SIMULATED_DRAWS)
         _, linear = sum_shares(weights, random_m2, felt, apart(self.unknown))
         told = {
             name: dict(zip(INPUTS, values.tolist(), strict=True)) for name, values in asdict(found).items()
         }
-        return {"simulated": told | {"linear": {name: share.part for name, share in linear.items()}}}
+        return {
+            "simulated": told | {"linear": {name: share.part for name, share in linear.items()}},
+            "interactions": [
+                {"inputs": [INPUTS[largest[one]] for one in of], "share": share, "error": error}
+                for of, (share, error) in joint.items()
+                if len(of) > 1
+            ],
+        }
 
     def write(self, path: Path) -> None:
         """Write the shares as maps to a NetCDF file; raise StoreError where it cannot."""

@@ -21,6 +21,7 @@ from station.quantities import Grid
 CHUNK = 128  # rows and columns stored together
 TIMES_TOGETHER = 512  # of a variable that is small per scan, in a file of as many
 CONVENTIONS = "CF-1.11"
+ENCODING = "utf-8"  # of texts; files of old that say ascii are the same
 
 
 @dataclass(frozen=True)
@@ -195,7 +196,7 @@ def _parameters(file: netCDF4.Dataset, names: tuple[str, ...], units: tuple[str,
         ("parameter_unit", units, "unit of the shared parameter"),
     ):
         variable = file.createVariable(name, "S1", ("parameter", "text"))
-        variable.setncatts({"long_name": long_name, "_Encoding": "ascii"})
+        variable.setncatts({"long_name": long_name, "_Encoding": ENCODING})
         variable[:] = text(values, "text")
 
 
@@ -242,7 +243,7 @@ def attributes(row: Variable, *, mapped: bool) -> dict[str, Any]:
     if row.standard_name == "air_temperature":
         told["units_metadata"] = "temperature: on_scale"
     if row.dtype == "S1":
-        told["_Encoding"] = "ascii"
+        told["_Encoding"] = ENCODING
     return told
 
 
@@ -265,18 +266,24 @@ def put_raster(variable: netCDF4.Variable[Any], at: int | None, values: np.ndarr
 
 
 def text(values: Sequence[str], dim: str) -> np.ndarray[Any, Any]:
-    """Return strings as characters (n, length), cut and filled with NUL; only ASCII survives."""
+    """Return strings as characters (n, length), cut and filled with NUL."""
     length = TEXT_LENGTH[dim]
-    told = np.array([value.encode("ascii", "replace")[:length] for value in values], dtype=f"S{length}")
-    return netCDF4.stringtochar(told)
+    told = np.array([_cut(value, dim) for value in values], dtype=f"S{length}")
+    return told.view("S1").reshape(-1, length)
 
 
 def kept_of(value: str, dim: str) -> str:
     """Return a string as it is read again: what `text` keeps of it."""
-    return value.encode("ascii", "replace")[: TEXT_LENGTH[dim]].decode()
+    return _cut(value, dim).decode(ENCODING)
+
+
+def _cut(value: str, dim: str) -> bytes:
+    """Encode as many whole characters as there is room for; what no encoding has becomes a question mark."""
+    room = value.encode(ENCODING, "replace")[: TEXT_LENGTH[dim]]
+    return room.decode(ENCODING, "ignore").encode(ENCODING)
 
 
 def strings(characters: np.ndarray[Any, Any]) -> list[str]:
     """Return characters (n, length) as strings: what `text` was given."""
     rows = np.ascontiguousarray(characters).view(f"S{characters.shape[-1]}")
-    return [value.decode("ascii") for value in rows[:, 0].tolist()]
+    return [value.decode(ENCODING, "replace") for value in rows[:, 0].tolist()]

@@ -11,7 +11,7 @@ from typing import Any
 import netCDF4
 import numpy as np
 
-from station.archive.layout import Series, attributes, lay_out, put_raster, written_whole
+from station.archive.layout import Series, attributes, lay_out, put_raster, strings, written_whole
 from station.archive.variables import FILL, Variable
 from station.errors import StoreError
 from station.quantities import Floats32, Habits, Reference, Shared
@@ -216,8 +216,7 @@ def _read(file: netCDF4.Dataset, series: Series) -> Reference:
     shared = None
     if "parameter_name" in file.variables:
         names, units = (
-            tuple(netCDF4.chartostring(file[name][:], encoding="ascii").tolist())
-            for name in ("parameter_name", "parameter_unit")
+            tuple(strings(np.ma.getdata(file[name][:]))) for name in ("parameter_name", "parameter_unit")
         )
         covariance = np.asarray(file["shared_parameter_covariance"][:], dtype=np.float64)
         noise = np.asarray(file["shared_parameter_noise_variance"][:], dtype=np.float64)

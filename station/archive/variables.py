@@ -178,6 +178,8 @@ VARIABLES: tuple[Variable, ...] = (
     Variable("platform_pitch", ("time",), "f8", "mean pitch of the scanner by its sensor", "degree"),
     Variable("tilt_residual", ("time",), "f8", "noise of the filtered inclination log", "degree"),
     Variable("log_offset", ("time",), "f8", "how late the clock of the inclination log was", "s"),
+    Variable("log_lateness", ("time",), "f8", "how late it still was, by how the ground swayed", "s"),
+    Variable("log_lateness_uncertainty", ("time",), "f8", "one standard deviation of log_lateness", "s"),
     Variable("air_temperature", ("time",), "f8", "air temperature at the scanner", "degC", "air_temperature"),
     Variable("air_pressure", ("time",), "f8", "air pressure at the scanner", "hPa", "air_pressure"),
     Variable(

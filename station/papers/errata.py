@@ -53,6 +53,8 @@ PAPERS = (
 )  # fmt: skip
 
 ERRATA = (
+    Erratum(HARTZELL, "Eq. 1", "a beam that begins in the centre of the scanner's frame; it begins beside it",
+            "vertex = origin + range times direction (Voordendag et al., Eq. 4): `beam.vertex`, `beam.cartesian`"),
     Erratum(HARTZELL, "Eq. 3", "the order of the three rotations is not unambiguous in print",
             "Rz(κ) Ry(φ) Rx(ω), as in the author's code: `pose.rotation`"),
     Erratum(HARTZELL, "Eq. 5", "the SOP already holds the lean of its own scan: absolute roll and pitch apply it twice",
@@ -96,7 +98,7 @@ ERRATA = (
             "sampling and precision apart: `precision.angle_precision`"),
     Erratum(LESLAR, "Eq. 7", "U Q⁻¹ Uᵀ has the unit 1/m²", "U Q Uᵀ: `sensitivity.propagated`"),
     Erratum(LESLAR, "Eq. 11", "only first-order terms are taken off an index of third or higher order",
-            "first and total indices, which need none: `sensitivity.sobol`"),
+            "all lower terms taken off: `sensitivity.interactions`; first and total indices need none: `sensitivity.sobol`"),
     Erratum(LESLAR, "section 5", "propagation and Sobol indices are said to name different inputs; with the same inputs"
             " of an almost linear model they cannot", "both are computed and compared: `station sensitivity`"),
     Erratum(LESLAR, "Table 1", "the inertial system's sigmas are not given; both analyses imply different ones",

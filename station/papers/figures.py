@@ -108,6 +108,13 @@ def _below(rise_m: float) -> float:
     return 1e6 * float(scale[0] - scale[1])
 
 
+def _off_by_origin(range_m: float, up_m: float) -> float:
+    """By what a level shot from above the centre of the frame seems raised if that is dropped [0.001°]."""
+    level = np.array([0.0])
+    point_m = beam.cartesian(np.array([range_m]), level, level, (0.0, 0.0, up_m))
+    return 1e3 * math.degrees(_one(beam.polar(point_m)[1]))
+
+
 def _geometry(range_m: float, incidence_deg: float, slope_deg: float) -> float:
     seen = _seen(range_m, incidence_deg, slope_deg)
     return _one(uncertainty.sigma_geometry(*seen, np.array([0.0]), _DIVERGENCE))
@@ -150,6 +157,10 @@ _AXIS = "the column 'footprint area (m²)' is the major axis in m"
 _LES = "with temperatures of the LES along the path, which are not published"
 
 VOORDENDAG_FIGURES = (
+    Figure(VOORDENDAG, "Eq. 4", "elevation of a shot from 0.1 m over the frame's centre, 100 m", "0.001°", None,
+           57.30, 0.01, lambda: _off_by_origin(100, 0.1)),
+    Figure(VOORDENDAG, "Eq. 4", "elevation of a shot from 0.1 m over the frame's centre, 3421 m", "0.001°", None,
+           1.675, 1e-3, lambda: _off_by_origin(3421, 0.1)),
     Figure(VOORDENDAG, "Eq. 5", "σ of the instrument at 650 m", "m", 0.09, 0.0908, 1e-4, lambda: _tilt(650)),
     Figure(VOORDENDAG, "Eq. 5", "σ of the instrument at 800 m", "m", 0.09, 0.1117, 1e-4, lambda: _tilt(800),
            _FORGOTTEN),
@@ -332,6 +343,25 @@ def _sobol(variable: str, range_m: float, *, total: bool) -> float:
     return 100 * float((found.total if total else found.first)[0])
 
 
+def _third_order(*, printed: bool) -> float:
+    """Index of third order of x y z, each as unsure as large, by simulation [%]."""
+    ones = np.ones(3)
+    each = [np.arange(3) == one for one in range(3)]
+    found = sensitivity.interactions(
+        lambda x: np.prod(x, axis=0), sensitivity.independent(ones, ones), each, 32_768
+    )
+    return 100 * sum(share for of, (share, _) in found.items() if len(of) > (1 if printed else 2))
+
+
+def _of_three(order: int) -> float:
+    """Index of the mobile lidar's height by interaction of so many of its largest inputs, 100 m away [%]."""
+    at, sigma = mobile.abeam(100.0), mobile.sigmas(mobile.EXPECTED)
+    largest = ("boresight_x", "lever_z", "vertical_angle")[:order]
+    groups = [np.array([name == one for name in mobile.VARIABLES]) for one in largest]
+    found = sensitivity.interactions(mobile.height, sensitivity.independent(sigma, at), groups)
+    return 100 * found[tuple(range(order))][0]
+
+
 LESLAR_FIGURES = (
     Figure(LESLAR, "Eq. 6-7", "share of the lever arm's Z in the height, 2 m away", "%", 90.0, 89.0, 1.0,
            lambda: _share("lever_z", 2.0)),
@@ -343,6 +373,12 @@ LESLAR_FIGURES = (
            lambda: _sobol("boresight_x", 100.0, total=False)),
     Figure(LESLAR, "Eq. 12", "total Sobol index of the boresight roll, 100 m away", "%", 70.0, 69.2, 5.0,
            lambda: _sobol("boresight_x", 100.0, total=True)),
+    Figure(LESLAR, "Eq. 11", "index of third order of x y z, each as unsure as large", "%", None, 14.3, 2.0,
+           lambda: _third_order(printed=False)),
+    Figure(LESLAR, "Eq. 11", "the same with first-order terms alone taken off, as printed", "%", None, 57.1, 4.0,
+           lambda: _third_order(printed=True), "the pairs are left in: the indices add up to more than all"),
+    Figure(LESLAR, "Eq. 11", "index of boresight roll, lever Z and vertical angle, 100 m away", "%", None, 0.0, 3.0,
+           lambda: _of_three(3)),
     Figure(LESLAR, "Eq. 11", "subsets of 9 of the 18 variables", "1", 48620, 48620, 0.0,
            lambda: float(math.comb(len(mobile.VARIABLES), 9))),
 )  # fmt: skip

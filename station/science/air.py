@@ -137,6 +137,7 @@ def refraction_coefficient(temperature_c: float, pressure_hpa: float, gradient_k
 def refraction_rise(horizontal_m: Floats, coefficient: float) -> Floats:
     """How much too high a target appears because the beam bends down to it [m].
 
-    Source: EQUATIONS 5.10, k R² / 2 R_E. Voordendag et al. neglect it: 0.12 m at 3421 m for k = 0.13.
+    The angle of Voordendag et al. (2023), Eq. 11, times the range, for a gradient that is the same all along;
+    they neglect it: 0.12 m at 3421 m for k = 0.13. Source: EQUATIONS 5.10, k R² / 2 R_E.
     """
     return coefficient / (2 * EARTH_RADIUS_M) * horizontal_m**2

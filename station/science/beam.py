@@ -8,47 +8,82 @@ import numpy as np
 
 from station.quantities import Floats
 
+Place = tuple[float, float, float]
+CENTRE: Place = (0.0, 0.0, 0.0)
 ELLIPSE = -2 * math.log(1 - 0.683)  # 2.2977, the χ² of two dimensions within which 68.3 % lie
 
 
-def cartesian(range_m: Floats, elevation_rad: Floats, azimuth_rad: Floats) -> Floats:
+def vertex(origin_m: Floats, range_m: Floats, direction: Floats) -> Floats:
+    """Where echoes came from (n, 3) [m]: beams of some origin and direction (n, 3), followed to their range.
+
+    Source: Voordendag et al. (2023), Eq. 4, as the maker's library has it.
+    """
+    return np.asarray(origin_m + np.asarray(range_m)[..., None] * direction)
+
+
+def cartesian(
+    range_m: Floats, elevation_rad: Floats, azimuth_rad: Floats, origin_m: Place = CENTRE
+) -> Floats:
     """Coordinates (n, 3) in the scanner's frame [m]; elevation counts from the horizontal plane.
 
-    Source: Hartzell et al. (2015), Eq. 1.
+    `origin_m` is where the beam leaves the head: forward, to the left, up. It turns with the head.
+    Source: Hartzell et al. (2015), Eq. 1; Ozendi et al. (2016), Eq. 1; neither has an origin of the beam.
     """
-    horizontal_m = range_m * np.cos(elevation_rad)
+    cos_e = np.cos(elevation_rad)
+    direction = np.stack(
+        [cos_e * np.cos(azimuth_rad), cos_e * np.sin(azimuth_rad), np.sin(elevation_rad)], axis=-1
+    )
+    return vertex(_turned_with_head(origin_m, azimuth_rad), range_m, direction)
+
+
+def _turned_with_head(origin_m: Place, azimuth_rad: Floats) -> Floats:
+    forward_m, left_m, up_m = origin_m
+    sin_a, cos_a = np.sin(azimuth_rad), np.cos(azimuth_rad)
     return np.stack(
-        [
-            horizontal_m * np.cos(azimuth_rad),
-            horizontal_m * np.sin(azimuth_rad),
-            range_m * np.sin(elevation_rad),
-        ],
-        axis=-1,
+        [forward_m * cos_a - left_m * sin_a, forward_m * sin_a + left_m * cos_a, up_m + 0.0 * sin_a], axis=-1
     )
 
 
-def polar(xyz_m: Floats) -> tuple[Floats, Floats, Floats]:
-    """Range [m], elevation [rad] and azimuth [rad] of points (n, 3).
+def polar(xyz_m: Floats, origin_m: Place = CENTRE) -> tuple[Floats, Floats, Floats]:
+    """Range [m], elevation [rad] and azimuth [rad] of the beams that meet points (n, 3).
 
+    `origin_m` as in `cartesian`; no beam meets a point nearer to the axis than it passes beside that.
     Source: Ozendi et al. (2016), Eq. 2-4, with atan2 where the paper's arctangent loses the quadrant.
     """
+    forward_m, left_m, up_m = origin_m
     x_m, y_m, z_m = np.moveaxis(xyz_m, -1, 0)
-    horizontal_m = np.hypot(x_m, y_m)
-    return np.hypot(horizontal_m, z_m), np.arctan2(z_m, horizontal_m), np.arctan2(y_m, x_m)
+    away_m = np.hypot(x_m, y_m)
+    ahead_m = np.sqrt(np.maximum(away_m**2 - left_m**2, 0.0))
+    azimuth_rad = np.arctan2(y_m, x_m) - np.arctan2(left_m, ahead_m)
+    horizontal_m, rise_m = ahead_m - forward_m, z_m - up_m
+    return (
+        np.hypot(horizontal_m, rise_m),
+        np.arctan2(rise_m, horizontal_m),
+        (azimuth_rad + math.pi) % (2 * math.pi) - math.pi if left_m else azimuth_rad,
+    )
 
 
-def polar_jacobian(range_m: Floats, elevation_rad: Floats, azimuth_rad: Floats) -> Floats:
+def polar_jacobian(
+    range_m: Floats, elevation_rad: Floats, azimuth_rad: Floats, origin_m: Place = CENTRE
+) -> Floats:
     """Derivative (n, 3, 3) of (x, y, z) by (range, elevation, azimuth) [1, m/rad, m/rad].
 
-    Source: Hartzell et al. (2015), Eq. 10; the order of columns is range, vertical, horizontal.
+    `origin_m` as in `cartesian`: the whole point turns with the head.
+    Source: Hartzell et al. (2015), Eq. 10; Ozendi et al. (2016), Eq. 7; columns are range, vertical,
+    horizontal.
     """
     sin_e, cos_e = np.sin(elevation_rad), np.cos(elevation_rad)
     sin_a, cos_a = np.sin(azimuth_rad), np.cos(azimuth_rad)
     zero = 0.0 * sin_e
+    beside = _turned_with_head(origin_m, azimuth_rad)
     return np.stack(
         [
-            np.stack([cos_e * cos_a, -range_m * sin_e * cos_a, -range_m * cos_e * sin_a], axis=-1),
-            np.stack([cos_e * sin_a, -range_m * sin_e * sin_a, range_m * cos_e * cos_a], axis=-1),
+            np.stack(
+                [cos_e * cos_a, -range_m * sin_e * cos_a, -range_m * cos_e * sin_a - beside[..., 1]], axis=-1
+            ),
+            np.stack(
+                [cos_e * sin_a, -range_m * sin_e * sin_a, range_m * cos_e * cos_a + beside[..., 0]], axis=-1
+            ),
             np.stack([sin_e, range_m * cos_e, zero], axis=-1),
         ],
         axis=-2,
@@ -58,7 +93,8 @@ def polar_jacobian(range_m: Floats, elevation_rad: Floats, azimuth_rad: Floats) 
 def point_covariance(jacobian: Floats, sigma_m_rad_rad: Floats) -> Floats:
     """Covariance (n, 3, 3) of points from independent range, elevation and azimuth errors [m²].
 
-    Source: Hartzell et al. (2015), Eq. 9; Leslar et al. (2014), Eq. 7 as printed inverts the inner matrix.
+    Source: Hartzell et al. (2015), Eq. 9; Ozendi et al. (2016), Eq. 6; Leslar et al. (2014), Eq. 7 as printed
+    inverts the inner matrix.
     """
     scaled = jacobian * np.asarray(sigma_m_rad_rad)[..., None, :]
     return np.asarray(scaled @ np.swapaxes(scaled, -1, -2))

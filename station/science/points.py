@@ -18,11 +18,12 @@ def shot_covariance(offset_m: Floats, axis: Floats, scanner: Scanner) -> Floats:
     """Covariance (n, 3, 3) of points from what each shot has for itself [m²]: range, beam, encoder, jitter.
 
     `offset_m` (n, 3) is from the scanner, `axis` (3,) what its head turns about, both on the map. The beam's
-    width counts once, as an angle (EQUATIONS 3.4).
+    width counts once, as an angle (EQUATIONS 3.4); beams begin where the scanner has it.
     Source: EQUATIONS 3.1 and 3.3, about the head's axis.
     """
     upright = _about(axis)
-    jacobian = upright @ polar_jacobian(*polar(offset_m @ upright))
+    begin_m = scanner.beam_origin_m
+    jacobian = upright @ polar_jacobian(*polar(offset_m @ upright, begin_m), begin_m)
     angle_rad = sigma_angle(scanner)
     return point_covariance(jacobian, np.array([scanner.range_sigma_m, angle_rad, angle_rad]))
 

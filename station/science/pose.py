@@ -45,7 +45,7 @@ def lean(xyz_m: tuple[Floats, Floats, Floats], time_s: Floats, tilt: Tilt) -> tu
     """Coordinates (n,) of shots in the upright scanner frame [m], each turned by the tilt of its moment.
 
     R_D = Ry(pitch) Rx(roll), in the scanner's frame, before the SOP.
-    Source: Hartzell et al. (2015), Eq. 5.
+    Source: Hartzell et al. (2015), Eq. 5, which adds it to the chain of Eq. 4.
     """
     x_m, y_m, z_m = xyz_m
     roll_rad = np.interp(time_s, tilt.time_s, tilt.roll_rad)
@@ -89,6 +89,18 @@ class Frame:
                     np.multiply(monomials[tuple(power)], coefficient_m, out=scratch)
                     np.add(axis_m, scratch, out=axis_m)
         return mapped_m[0], mapped_m[1], mapped_m[2]
+
+    @property
+    def to_axes(self) -> Floats:
+        """Rotation (3, 3) from the scanner's frame to axes along easting, northing and up at the scanner.
+
+        True north lies 1.3° beside grid north at Hintereisferner: the head passes that in eight seconds.
+        """
+        turn = self.to_local[:3, :3]
+        if len(self.powers) == 0:
+            return turn
+        east_m, north_m, _ = self.coefficients[np.all(self.powers == (0, 1, 0), axis=1)][0]
+        return np.asarray(rotation_z(-math.atan2(east_m, north_m)) @ turn)
 
 
 def _monomials(x: Floats, y: Floats, z: Floats, powers: Ints) -> dict[tuple[int, int, int], Floats]:

@@ -22,6 +22,7 @@ CYCLE_LARGEST_RAD = math.radians(0.05)  # a larger wave is the mount's lean, whi
 SLOW_MOTION_S = 300.0
 FAST_MOTION_S = 3.0
 SENSOR_BIAS_RAD = math.radians(0.0015)
+BIASES = 2  # of the faults of a `LineLog`, which come first: in roll and pitch
 SCANS_WORTH = 8  # what start values weigh against scans
 MOTION_STEPS = 10
 MOTIONS = ("slow_motion_rad", "fast_motion_rad", "line_motion_rad")

@@ -168,7 +168,9 @@ def status(site: Site) -> Status:
         "series": str(data / "series.nc") if (data / "series.nc").exists() else None,
         "disk_free_gb": round(shutil.disk_usage(data).free / 1e9, 2) if data.is_dir() else None,
         "faults": [
-            fault for fault in (inbox_fault, _room_fault(site), clock_fault(data, time.time())) if fault
+            fault
+            for fault in (inbox_fault, _room_fault(site), clock_fault(data, time.time()), _late_log(site))
+            if fault
         ],
     }
 
@@ -233,6 +235,15 @@ def _moved(site: Site) -> str:
 
     try:
         return moved(site) if (site.station.data / "series.nc").is_file() else ""
+    except StoreError as error:
+        return str(error)
+
+
+def _late_log(site: Site) -> str:
+    from station.service.late_log import late_log  # noqa: PLC0415 - as above
+
+    try:
+        return late_log(site) if site.adjusts and (site.station.data / "series.nc").is_file() else ""
     except StoreError as error:
         return str(error)
 

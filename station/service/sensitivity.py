@@ -77,9 +77,19 @@ def describe(told: Told) -> str:
                 )
             )
         lines.append(f"  farthest apart by {max(worst):.1f} sampling errors")
+        *pairs, three = area["interactions"]
+        largest = max(pairs, key=lambda one: abs(one["share"]))
+        lines.append(
+            f"  by interaction: most {_percent(largest)} of {' and '.join(largest['inputs'])};"
+            f" of {', '.join(three['inputs'])} together {_percent(three)}"
+        )
     if told["maps"]:
         lines += ["", told["maps"]]
     return "\n".join(lines)
+
+
+def _percent(index: Told) -> str:
+    return f"{round(100 * index['share'], 2) + 0.0:.2f} ± {100 * index['error']:.2f}"
 
 
 def _line(

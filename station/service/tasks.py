@@ -34,7 +34,7 @@ from station.readers.flags import flag_on, read_flags
 from station.readers.polygons import mask, read_polygons
 from station.readers.raster import read_geotiff
 from station.readers.scan import ScanReader, open_scan, require_begun, utc_interval
-from station.science import ground, verdict
+from station.science import ground, sensor, verdict
 from station.science.adjustment import Adjustment
 from station.science.grid import Gridder
 from station.science.terrain import nodes_for
@@ -214,9 +214,10 @@ def _measure(
     measured = measure(gridder, gathered.setup, unknown, reference, levelled)
     progress()
     numbers = _numbers(measured, gathered, reader.header.point_count, levelled)
+    doubts, late = _log_against_ground(levelled, reference)
     word, reason = verdict.judge(
         flag,
-        gathered.lacking,
+        [*gathered.lacking, *doubts],
         measured,
         reference,
         (gathered.setup.position_m, gathered.setup.axis) if gathered.setup.position_m else None,
@@ -232,7 +233,7 @@ def _measure(
         shared=unknown,
         verdict=word,
         verdict_reason=reason,
-        numbers=numbers,
+        numbers=numbers | late,
         provenance={
             "scan_sha256": scan_sha256,
             "log_sha256": sha256_of_log(arrival),
@@ -254,6 +255,19 @@ def levelled_to(
         return None
     stable = stable_ground(site, reference)
     return gathered.told, level(gridder, gathered.setup, gathered.told, reference, stable), stable
+
+
+def _log_against_ground(
+    levelled: tuple[Told, Adjustment, Bools] | None, reference: Reference | None
+) -> tuple[list[str], dict[str, float]]:
+    """Say what the ground has against a scan's log, and how late that is as the store keeps it."""
+    if levelled is None or reference is None or levelled[0].log is None:
+        return [], {}
+    expected = sensor.expected(levelled[0].lines, levelled[0].log, levelled[1])
+    doubts, late = sensor.off_habit(expected), sensor.lateness(expected, reference.habits)
+    if late is None:
+        return doubts, {}
+    return doubts + late.words(), {"log_lateness": late.late_s, "log_lateness_uncertainty": late.sigma_s}
 
 
 def stable_ground(site: Site, reference: Reference) -> Bools:

@@ -1,6 +1,7 @@
 """The covariance of single points against simulated errors."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -40,6 +41,26 @@ def test_a_shot_about_a_leaning_axis():
     )
     drawn = to_head.inv().apply(moved.reshape(-1, 3)).reshape(moved.shape)
     close(points.shot_covariance(OFFSET_M, AXIS, SCANNER), scatter(drawn))
+
+
+def test_a_near_shot_whose_beam_begins_beside_the_centre():
+    """Turned by its angles about the head's axis, a point beside the beam's origin scatters otherwise."""
+    scanner = replace(SCANNER, beam_origin_m=(0.1, 0.3, 0.2), range_sigma_m=1e-3, angle_resolution_rad=0.02)
+    near_m = OFFSET_M / 500
+    rng = np.random.default_rng(7)
+    to_head = Rotation.align_vectors([[0, 0, 1.0]], [AXIS])[0]
+    range_m, elevation, azimuth = beam.polar(to_head.apply(near_m), scanner.beam_origin_m)
+    draws = rng.standard_normal((3, DRAWS, 2))
+    moved = beam.cartesian(
+        range_m + 1e-3 * draws[0],
+        elevation + sigma_angle(scanner) * draws[1],
+        azimuth + sigma_angle(scanner) * draws[2],
+        scanner.beam_origin_m,
+    )
+    drawn = scatter(to_head.inv().apply(moved.reshape(-1, 3)).reshape(moved.shape))
+    close(points.shot_covariance(near_m, AXIS, scanner), drawn)
+    plain = points.shot_covariance(near_m, AXIS, replace(scanner, beam_origin_m=beam.CENTRE))
+    assert np.abs(plain / drawn - 1).max() > 0.1
 
 
 def test_a_registered_point():

@@ -109,3 +109,19 @@ def test_real_mammoth_matrices(shared_data, season):
     assert np.abs(told_m - by_pyproj(pop @ sop, scanner_m, "EPSG:26911")).max() < 1e-3
     lean_deg = math.degrees(math.acos(frame.to_local[2, 2]))
     assert 29.0 < lean_deg < 35.0
+
+
+@pytest.mark.parametrize("crs", ["EPSG:32632", "EPSG:31254"])
+def test_axes_are_those_of_the_map(crs):
+    """Where a beam points on the map; true north is 1.3° from grid north in UTM 32, nought in none."""
+    sop = np.eye(4)
+    sop[:3, :3] = pose.rotation(0.03, -0.02, 1.0)
+    frame = pose.frame_by_origin(sop, HEF, crs, REACH_M)
+    beams = np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [-0.6, 0.8, 0.0]]).T
+    local_m = 500.0 * frame.to_local[:3, :3] @ beams
+    east_m, north_m, _ = (a - b for a, b in zip(frame.to_map(tuple(local_m)), frame.position_m, strict=True))
+    axes = frame.to_axes @ beams
+    assert np.arctan2(axes[0], axes[1]) == pytest.approx(np.arctan2(east_m, north_m), abs=2e-5)
+    assert frame.to_axes[2] == pytest.approx(frame.to_local[2, :3])
+    local = pose.frame_in_local_map(sop)
+    assert local.to_axes == pytest.approx(sop[:3, :3])

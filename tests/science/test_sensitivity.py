@@ -17,6 +17,7 @@ from station.science.sensitivity import (
     cell_shares,
     derivatives,
     independent,
+    interactions,
     members,
     propagated,
     sobol,
@@ -59,6 +60,52 @@ def test_indices_of_the_ishigami_function():
     assert found.first == pytest.approx([0.3139, 0.4424, 0.0], abs=0.04)
     assert found.total == pytest.approx([0.5576, 0.4424, 0.2437], abs=0.04)
     assert (np.abs(found.first - [0.3139, 0.4424, 0.0]) < 4.5 * found.first_error).all()
+
+
+def test_interactions_of_the_g_function():
+    """Sobol (1993), all a nought: of each combination of n variables a share of 3⁻ⁿ over (4/3)³ - 1."""
+
+    def model(x):
+        return np.prod(np.abs(4 * x - 2), axis=0)
+
+    found = interactions(model, lambda n, random: random.uniform(0, 1, (3, n)), each(3), 4096)
+    assert sorted(map(len, found)) == [1, 1, 1, 2, 2, 2, 3]
+    for of, (told, error) in found.items():
+        assert abs(told - 27 / 3 ** len(of) / 37) < 4.5 * error
+        assert error < 0.02
+    total = sobol(model, lambda n, random: random.uniform(0, 1, (3, n)), each(3), 4096).total
+    assert sum(told for of, (told, _) in found.items() if 0 in of) == pytest.approx(total[0], abs=0.05)
+
+
+def test_an_index_of_third_order_lacks_all_lower_ones():
+    """x y z, each as unsure as large: a seventh each; the printed formula leaves the pairs in, four sevenths.
+
+    And by brute force: the variance of means over one group's draws while the others stay.
+    """
+
+    def model(x):
+        return np.prod(x, axis=0)
+
+    draw = independent(np.ones(3), np.ones(3))
+    found = interactions(model, draw, each(3), 4096)
+    for told, error in found.values():
+        assert abs(told - 1 / 7) < 4.5 * error
+    triple, error = found[0, 1, 2]
+    assert error < 0.06
+    assert abs(triple - 4 / 7) > 5 * error
+    rng = np.random.default_rng(3)
+    pair, other = draw(2000, rng)[:2, :, None], draw(2000, rng)[2]
+    means = (pair[0] * pair[1] * other).mean(axis=1)
+    closed = means.var() / 7  # of x and y together: three sevenths
+    assert found[0,][0] + found[1,][0] + found[0, 1][0] == pytest.approx(closed, abs=0.12)
+
+
+def test_groups_of_an_additive_model_do_not_interact():
+    draw = independent(np.array([1.0, 2.0, 0.5]), np.zeros(3))
+    found = interactions(lambda x: np.array([3.0, 4.0, 12.0]) @ x, draw, each(3), 512)
+    for of, (told, error) in found.items():
+        if len(of) > 1:
+            assert abs(told) < 4.5 * error + 1e-12
 
 
 def test_mobile_lidar_against_independent_rotations():

@@ -91,6 +91,7 @@ def test_sensitivity_tells_shares_and_maps_them(lived, tmp_path):
     assert done.exit_code == 0, done.output
     assert "mean of glacier" in done.output
     assert "sampling errors" in done.output
+    assert "together" in next(line for line in done.output.splitlines() if "by interaction" in line)
     with xr.open_dataset(tmp_path / "maps.nc") as maps:
         total = sum(maps[name] for name in maps if name.startswith("share_")).values
     assert total[np.isfinite(total)] == pytest.approx(1.0, abs=5e-3)
@@ -102,6 +103,10 @@ def test_sensitivity_of_another_epoch_as_json(lived):
     assert [area["area"] for area in told["areas"]][:2] == ["everything", "glacier"]
     for area in told["areas"]:
         assert sum(area["part"].values()) == pytest.approx(1.0)
+        assert [len(one["inputs"]) for one in area["interactions"]] == [2, 2, 2, 3]
+        assert all(
+            abs(one["share"]) < 4 * one["error"] + 0.01 for one in area["interactions"]
+        )  # as good as linear
     beyond = run("sensitivity", lived, "--epoch", 99)
     assert beyond.exit_code == 2
     assert "no epoch at place 99" in beyond.output

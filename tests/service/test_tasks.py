@@ -12,7 +12,11 @@ import pytest
 
 from station.config import read_site
 from station.errors import ConfigError, NotReadyError, ScanError
+from station.pipeline import to_map
+from station.readers.scan import utc_interval
+from station.science.shared import LINES_A_KNOT
 from station.service import references, tasks
+from station.service.gather import gather
 from station.service.places import arrival_of
 from station.simulation.motion import sensor_faults
 from station.simulation.station import simulate, tiny
@@ -59,6 +63,23 @@ def log_of(folder, scan=1):
 def test_all_there_is_good(folder):
     outcome, _ = processed(folder)
     assert (outcome.verdict, outcome.reason) == ("good", "")
+
+
+def test_lines_are_passed_when_their_shots_were_taken(folder):
+    """Though true north lies 1.3° beside grid north, which the head passes in 2.6 s here."""
+    site = site_of(folder)
+    scan = arrival_of(site, min(site.scans.inbox.glob("*.laz")))
+    with tasks.opened(site, scan.path) as reader:
+        start, end, _ = utc_interval(reader, site.scans.name)
+        found = gather(site, reader, scan.log, start, end)
+        shots = next(iter(reader.blocks()))
+    points = to_map(shots, found.pose)
+    offset_m = tuple(axis - at for axis, at in zip(points, found.setup.position_m, strict=True))
+    far = np.hypot(*offset_m[:2]) > 200
+    line = (found.told.of.knots_before(offset_m)[far] * LINES_A_KNOT).astype(int)
+    late_s = found.told.lines.time_s[line] - shots.time_s[far]
+    assert abs(np.median(late_s)) < 0.3
+    assert np.quantile(np.abs(late_s), 0.95) < 1.0
 
 
 def test_no_log(folder):
