@@ -138,8 +138,9 @@ def level(gridder: Gridder, setup: Setup, told: Told, reference: Reference, stab
     """Estimate the state of the scanner from a scan on its grid; `stable` (ny, nx) is ground known for it."""
     habits = reference.habits
     sigma = prior.globals_sigma(habits, weather_known=told.weather_known)
-    motion, bend = prior.motion(habits, told.lines), prior.bending(habits, told.of)
-    state = prior_of_difference(told.of, prior.by_line(told.of, sigma, motion, bend), reference.shared)
+    of, lines = told.of, told.lines
+    leans = prior.motion(habits, lines), prior.bending(habits, of), prior.across(habits, of, lines)
+    state = prior_of_difference(of, prior.by_line(of, sigma, *leans), reference.shared)
     bands = _cells(gridder, setup, told.of, reference, stable)
     patches = collect(told.of, bands, setup.scanner.range_max_m)
     return adjust(patches, told.assumed_rad, state, told.log)

@@ -1,9 +1,9 @@
 """What all points of a scan have in common: parameters, their effect on heights, their covariance.
 
-Nine global parameters, and by azimuth the lean along the line of sight (knots every 1°) and the refraction
-(every 5°) that they do not hold. The effect of each on a height is analytic in the place of the cell and the
-gradient of the terrain, so that it is never stored: with these functions and the covariance in an epoch
-anyone gets the uncertainty of a cell, a box, a volume, a difference.
+Nine global parameters, and by azimuth the lean along the line of sight (knots every 1°), the refraction and
+the lean across the line of sight (every 5°) that they do not hold. The effect of each on a height is analytic
+in the place of the cell and the gradient of the terrain, so that it is never stored: with these functions and
+the covariance in an epoch anyone gets the uncertainty of a cell, a box, a volume, a difference.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ MOST_LEANING_COS = math.cos(math.radians(10.0))  # beyond, a sector on the map s
 
 @dataclass(frozen=True)
 class Basis:
-    """The parameters of a station: nine, then lean and refraction at knots from azimuth `start_rad` on.
+    """The parameters of a station: nine, then lean, refraction, lean across, at knots from `start_rad` on.
 
     Azimuths are those of the scanner's head: about its axis of rotation (east, north, up), clockwise from
     grid north, so that a scan line has one, however the mount leans. `closed`: the knots go all the way
@@ -56,7 +56,7 @@ class Basis:
 
     @property
     def refraction_count(self) -> int:
-        """How many knots the refraction has."""
+        """How many knots the refraction has, and as many the lean across the line of sight."""
         return self.intervals // LEAN_PER_REFRACTION + (not self.closed)
 
     @property
@@ -91,13 +91,15 @@ class Basis:
             *(name for name, _ in GLOBAL),
             *(f"lean_{_degrees(a)}" for a in lean_rad),
             *(f"refraction_{_degrees(a)}" for a in self.refraction_azimuth_rad),
+            *(f"lean_across_{_degrees(a)}" for a in self.refraction_azimuth_rad),
         )
 
     @property
     def units(self) -> tuple[str, ...]:
         """Unit of each parameter."""
         return (
-            *(unit for _, unit in GLOBAL), *["rad"] * self.lean_count, *["1"] * self.refraction_count
+            *(unit for _, unit in GLOBAL), *["rad"] * self.lean_count, *["1"] * self.refraction_count,
+            *["rad"] * self.refraction_count,
         )  # fmt: skip
 
     def knots_before(self, offset_m: tuple[Floats, Floats, Floats]) -> Floats:
@@ -149,7 +151,8 @@ def basis(
 class Sensitivities:
     """Effect of a unit of each parameter on the heights of cells: the matrix J, without its zeros.
 
-    A cell feels the nine globals, the lean of its line and the two knots of the refraction beside it.
+    A cell feels the nine globals, the lean of its line and the two knots beside it of the refraction and of
+    the lean across the line of sight.
     """
 
     of: Basis
@@ -167,13 +170,30 @@ class Sensitivities:
         """Group of scan lines (n,) that each cell lies in."""
         return (self.passed * LINES_A_KNOT).astype(np.int64)
 
+    @property
+    def across(self) -> Floats:
+        """Effect of a turn about the direction in which the head looks (n,), per rad.
+
+        It shifts points sideways by their height under the scanner: steep ground close by shows it.
+        """
+        east, north = _clockwise(self.of.axis)
+        azimuth_rad = self.of.start_rad + LEAN_KNOT_RAD * self.passed
+        sine, cosine = np.sin(azimuth_rad), np.cos(azimuth_rad)
+        turn = [sine * e + cosine * n for e, n in zip(east, north, strict=True)]
+        return np.asarray(
+            self.globals_[0] * turn[0] + self.globals_[1] * turn[1] - self.globals_[2] * turn[2]
+        )
+
     def lean_knot(self) -> tuple[Ints, Ints, Floats]:
         """Knots of the lean before and after each cell (n,), and the share of the one after."""
         before = self.passed.astype(np.int64)
         return before, (before + 1) % self.of.lean_count, self.passed - before
 
     def refraction_knot(self) -> tuple[Ints, Ints, Floats]:
-        """Knots of the refraction before and after each cell (n,), and the share of the one after."""
+        """Knots of the refraction before and after each cell (n,), and the share of the one after.
+
+        The lean across the line of sight has the same.
+        """
         before = self.passed.astype(np.int64) // LEAN_PER_REFRACTION
         return before, (before + 1) % self.of.refraction_count, self.passed / LEAN_PER_REFRACTION - before
 
@@ -186,6 +206,7 @@ class Sensitivities:
         for effect, (before, after, share), count in (
             (self.lean * weights, self.lean_knot(), self.of.lean_count),
             (self.refraction * weights, self.refraction_knot(), self.of.refraction_count),
+            (self.across * weights, self.refraction_knot(), self.of.refraction_count),
         ):
             knots: Floats = np.zeros(count)
             np.add.at(knots, before, effect * (1 - share))
@@ -202,7 +223,7 @@ class Sensitivities:
     def variance(self, unknown: Shared) -> Floats:
         """Variance of each cell's height (n,) [m²]: the diagonal of J C Jᵀ, and what its line adds."""
         variance_m2 = np.empty(len(self))
-        of = self.of
+        of, across = self.of, self.across
         before, _, share = self.lean_knot()
         _, _, bend_share = self.refraction_knot()
         order = np.argsort(before.astype(np.int16), kind="stable")
@@ -210,12 +231,15 @@ class Sensitivities:
         own = leans_between(of).left ** 2 @ line_variances(of, unknown)
         for knot in np.flatnonzero(np.diff(bounds)):
             cells = order[bounds[knot] : bounds[knot + 1]]
-            bend = knot // LEAN_PER_REFRACTION
+            bend, first = knot // LEAN_PER_REFRACTION, len(GLOBAL) + of.lean_count
+            bend_after = (bend + 1) % of.refraction_count
             knots = (
                 len(GLOBAL) + knot,
                 len(GLOBAL) + (knot + 1) % of.lean_count,
-                len(GLOBAL) + of.lean_count + bend,
-                len(GLOBAL) + of.lean_count + (bend + 1) % of.refraction_count,
+                first + bend,
+                first + bend_after,
+                first + of.refraction_count + bend,
+                first + of.refraction_count + bend_after,
             )
             felt = [*range(len(GLOBAL)), *knots]
             along, bent = self.lean[cells], self.refraction[cells]
@@ -226,6 +250,8 @@ class Sensitivities:
                     along * share[cells],
                     bent * (1 - bend_share[cells]),
                     bent * bend_share[cells],
+                    across[cells] * (1 - bend_share[cells]),
+                    across[cells] * bend_share[cells],
                 ]
             )
             root = _root(unknown.covariance[np.ix_(felt, felt)])
@@ -343,19 +369,19 @@ def against(unknown: Shared, common: Shared | None) -> Shared:
 
 
 def lines_from_knots(of: Basis, unknown: Floats) -> Floats:
-    """Covariance by line (9 + lines + refraction knots) of one by knot (p, p)."""
-    wide = _beside(leans_between(of).knots, len(GLOBAL), of.refraction_count)
+    """Covariance by line (9 + lines + knots of refraction and lean across) of one by knot (p, p)."""
+    wide = _beside(leans_between(of).knots, len(GLOBAL), 2 * of.refraction_count)
     return np.asarray(wide @ unknown @ wide.T)
 
 
 def by_knots(of: Basis, estimate: Floats, covariance: Floats) -> Shared:
-    """Return what is known by line (9 + lines + refraction knots), condensed to knots.
+    """Return what is known by line (9 + lines + knots of refraction and lean across), condensed to knots.
 
     What the knots cannot hold of a line's lean is kept as the variance of independent leans from which the
     knots have taken their part; that loses less than 5 % of the sigma of boxes and areas.
     """
     between = leans_between(of)
-    narrow = _beside(between.fit, len(GLOBAL), of.refraction_count)
+    narrow = _beside(between.fit, len(GLOBAL), 2 * of.refraction_count)
     lines = slice(len(GLOBAL), len(GLOBAL) + of.line_count)
     left = between.left
     own = np.maximum(np.einsum("ij,ij->i", left @ covariance[lines, lines], left), 0.0)

@@ -29,7 +29,9 @@ def prior_of(of, **habits):
     lines = prior.lines_of(of, np.eye(3), None)
     station = replace(HABITS, **habits)
     sigma = prior.globals_sigma(station, weather_known=True)
-    covariance = prior.by_line(of, sigma, prior.motion(station, lines), prior.bending(station, of))
+    covariance = prior.by_line(
+        of, sigma, prior.motion(station, lines), prior.bending(station, of), prior.across(station, of, lines)
+    )
     return covariance, np.linalg.cholesky(covariance)
 
 
@@ -58,7 +60,9 @@ class Ground:
         if of.closed:
             knot[:, 0] += knot[:, -1]
             knot = knot[:, :-1]
-        return np.hstack([np.stack(globals_, axis=-1), -rise[:, None] * line, bend[:, None] * knot])
+        sideways = z * (east * y - north * x) / away  # of a turn about the line to the place below or above
+        effects = [-rise[:, None] * line, bend[:, None] * knot, sideways[:, None] * knot]
+        return np.hstack([np.stack(globals_, axis=-1), *effects])
 
     def felt(self, of=OF):
         return shared.sensitivities(of, self.offset_m, self.east, self.north)

@@ -193,7 +193,9 @@ def scans_of(habits, count, seed=0):
     rng = np.random.default_rng(seed)
     lines = prior.lines_of(OF, np.eye(3), None)
     sigma = prior.globals_sigma(habits, weather_known=True)
-    covariance = prior.by_line(OF, sigma, prior.motion(habits, lines), prior.bending(habits, OF))
+    covariance = prior.by_line(
+        OF, sigma, prior.motion(habits, lines), prior.bending(habits, OF), prior.across(habits, OF, lines)
+    )
     root = np.linalg.cholesky(covariance)
     return [(lines, root @ rng.normal(size=len(root)), 1e-6 * covariance) for _ in range(count)]
 
@@ -223,7 +225,9 @@ def test_what_a_scan_leaves_unknown_counts_as_shown():
     """Scans without any observation have estimates of nought and all of the prior as covariance."""
     lines = prior.lines_of(OF, np.eye(3), None)
     sigma = prior.globals_sigma(HABITS, weather_known=True)
-    covariance = prior.by_line(OF, sigma, prior.motion(HABITS, lines), prior.bending(HABITS, OF))
+    covariance = prior.by_line(
+        OF, sigma, prior.motion(HABITS, lines), prior.bending(HABITS, OF), prior.across(HABITS, OF, lines)
+    )
     blind = [(lines, np.zeros(len(covariance)), covariance)] * 80
     for name, value in vars(prior.learned(HABITS, OF, blind)).items():
         assert value == pytest.approx(getattr(HABITS, name), rel=0.01)
