@@ -368,6 +368,20 @@ def against(unknown: Shared, common: Shared | None) -> Shared:
     return unknown + (common if common.names == unknown.names else unknown)
 
 
+def by_names(of: Basis, unknown: Shared) -> Shared:
+    """Return what is unknown by the parameters of a basis; what an older epoch lacks counts as known."""
+    if unknown.names == of.names:
+        return unknown
+    place = {name: at for at, name in enumerate(unknown.names)}
+    here = [at for at, name in enumerate(of.names) if name in place]
+    there = [place[of.names[at]] for at in here]
+    estimate, noise = np.zeros(len(of.names)), np.zeros(len(of.names))
+    covariance = np.zeros((len(of.names),) * 2)
+    estimate[here], noise[here] = unknown.estimate[there], unknown.noise_variance[there]
+    covariance[np.ix_(here, here)] = unknown.covariance[np.ix_(there, there)]
+    return Shared(of.names, of.units, estimate, covariance, noise)
+
+
 def lines_from_knots(of: Basis, unknown: Floats) -> Floats:
     """Covariance by line (9 + lines + knots of refraction and lean across) of one by knot (p, p)."""
     wide = _beside(leans_between(of).knots, len(GLOBAL), 2 * of.refraction_count)

@@ -202,6 +202,26 @@ def test_an_epoch_of_the_log_alone_has_its_own_covariance_and_the_references(fil
             assert station.variance(filled.folder, weights, NONE) == told
 
 
+def test_an_epoch_of_before_the_lean_across_is_read_as_if_there_were_none(filled):
+    whole = drawn(13, 0.3)
+    older = np.array(["across" not in name for name in whole.names])
+    names, units = (tuple(np.array(told)[older]) for told in (whole.names, whole.units))
+    short = Shared(
+        names,
+        units,
+        whole.estimate[older],
+        whole.covariance[np.ix_(older, older)],
+        whole.noise_variance[older],
+    )
+    none = replace(whole, covariance=np.where(np.outer(older, older), whole.covariance, 0.0))
+    for hour, unknown in ((12, short), (13, none)):
+        store.write_epoch(filled, replace(epoch(12, "joint", unknown), start_s=START_S + 3600 * hour))
+    found = Aggregates(filled)
+    weights = np.full(GRID.shape, 1.0)
+    told = found.variance(weights, found.row(-2))
+    assert told == pytest.approx(found.variance(weights, found.row(-1)), rel=1e-6)
+
+
 def test_an_adjusted_epoch_has_that_of_the_reference_in_its_own(filled):
     found = Aggregates(filled)
     with station.open(filled.folder) as ds:
