@@ -149,7 +149,9 @@ def test_changes_of_the_cycle_against_its_wave_made_a_fifth_larger(largest):
     size = math.radians(0.05) / largest
     for wave in (roll, pitch):
         wave[1:] *= size / math.hypot(*wave[1:])
-    told = prior.cycle_changes(lines, Cycle(tuple(roll), tuple(pitch)))
+    told, across = (
+        prior.cycle_changes(lines, Cycle(tuple(roll), tuple(pitch)), beside) for beside in (0.0, math.pi / 2)
+    )
     grown = [np.array([wave[0], *(1 + 0.2 * largest) * wave[1:]]) for wave in (roll, pitch)]
     before = Cycle(tuple(roll), tuple(pitch)).at(lines.azimuth_rad)
     for column, after in enumerate(
@@ -158,6 +160,8 @@ def test_changes_of_the_cycle_against_its_wave_made_a_fifth_larger(largest):
         moved = [a - b for a, b in zip(after.at(lines.azimuth_rad), before, strict=True)]
         wanted = moved[0] * np.sin(lines.azimuth_rad) - moved[1] * np.cos(lines.azimuth_rad)
         assert told[:, column] == pytest.approx(wanted, abs=1e-12)
+        about = moved[0] * np.cos(lines.azimuth_rad) + moved[1] * np.sin(lines.azimuth_rad)
+        assert across[:, column] == pytest.approx(about, abs=1e-12)
 
 
 def test_motion_is_a_covariance_of_three_memories():
@@ -265,3 +269,13 @@ def test_what_stays_unknown_without_adjustment_is_a_covariance_and_a_log_makes_i
         assert len(unknown.names) == len(unknown.estimate) == len(unknown.noise_variance)
     assert (felt.variance(with_log) < felt.variance(without)).all()
     assert felt.variance(with_log).mean() < 0.5 * felt.variance(without).mean()
+
+
+def test_the_lean_across_is_as_slow_as_the_mount():
+    """Between knots 5° apart 5 / 0.13 seconds go by; the slow motion is forgotten over 300 s."""
+    lines = prior.lines_of(OF, np.eye(3), None)
+    told = prior.across(HABITS, OF, lines)
+    assert told.shape == (OF.refraction_count,) * 2
+    assert np.diag(told) == pytest.approx(HABITS.slow_motion_rad**2)
+    within = told[1:-2, 2:-1].diagonal() / HABITS.slow_motion_rad**2
+    assert within == pytest.approx(math.exp(-5 / 0.13 / 300), rel=1e-6)
