@@ -219,7 +219,7 @@ class Aggregates:
             file.set_auto_chartostring(False)
             names, units = (tuple(strings(np.ma.getdata(file[name][:]))) for name in PARAMETER)
             estimate, covariance, noise = (
-                np.asarray(file[name][row.index], dtype=np.float64)
+                np.ma.filled(file[name][row.index].astype(np.float64), 0.0)  # what other epochs alone name
                 for name in (
                     "shared_parameter", "shared_parameter_covariance", "shared_parameter_noise_variance"
                 )
