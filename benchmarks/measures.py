@@ -313,12 +313,13 @@ def _matrices(felt: shared.Sensitivities) -> tuple[sparse.csr_array, sparse.csr_
     for effect, knots, start in (
         (felt.lean, felt.lean_knot(), first),
         (felt.refraction, felt.refraction_knot(), first + of.lean_count),
+        (felt.across, felt.refraction_knot(), first + of.lean_count + of.refraction_count),
     ):
         before, after, share = knots
         rows += [np.arange(count)] * 2
         columns += [start + before, start + after]
         values += [effect * (1 - share), effect * share]
-    total = first + of.lean_count + of.refraction_count
+    total = first + of.lean_count + 2 * of.refraction_count
     design = sparse.csr_array(
         (np.concatenate(values), (np.concatenate(rows), np.concatenate(columns))), shape=(count, total)
     )

@@ -13,7 +13,15 @@ from station.archive.reference import read_reference
 from station.archive.store import Row, rows
 from station.errors import StoreError
 from station.quantities import Bools, Floats, Grid, Reference, Shared
-from station.science.shared import Sensitivities, against, aggregate_variance, basis, cell_sensitivities
+from station.science.shared import (
+    Basis,
+    Sensitivities,
+    against,
+    aggregate_variance,
+    basis,
+    by_names,
+    cell_sensitivities,
+)
 from station.science.terrain import smooth_gradient
 from station.science.voids import area_weights, void_variance
 
@@ -191,10 +199,7 @@ class Aggregates:
     def felt(self, held: Held, cells: Bools) -> Sensitivities:
         """Return what the chosen cells (ny, nx) of an epoch feel of its shared parameters."""
         grid, elevation_m = self._series.grid, held.reference.elevation_m
-        east_m, north_m, height_m, axis_east, axis_north = held.scanner
-        up = float(np.sqrt(max(1 - axis_east**2 - axis_north**2, 0.0)))
-        position_m = east_m, north_m, height_m
-        of = basis(grid, position_m, (axis_east, axis_north, up))
+        of, position_m = self._basis(held.scanner)
         rows, columns = _box(cells, MARGIN_CELLS)
         corner_m = grid.west_m + columns.start * grid.cell_m, grid.north_m - rows.start * grid.cell_m
         around = elevation_m[rows, columns]
@@ -214,13 +219,20 @@ class Aggregates:
             file.set_auto_chartostring(False)
             names, units = (tuple(strings(np.ma.getdata(file[name][:]))) for name in PARAMETER)
             estimate, covariance, noise = (
-                np.asarray(file[name][row.index], dtype=np.float64)
+                np.ma.filled(file[name][row.index].astype(np.float64), 0.0)  # what other epochs alone name
                 for name in (
                     "shared_parameter", "shared_parameter_covariance", "shared_parameter_noise_variance"
                 )
             )  # fmt: skip
-        unknown = Shared(names, units, estimate, covariance, noise)
+        unknown = by_names(self._basis(scanner)[0], Shared(names, units, estimate, covariance, noise))
         return Held(change_m, random_m, unknown, scanner, reference, joint)
+
+    def _basis(self, scanner: tuple[float, ...]) -> tuple[Basis, tuple[float, float, float]]:
+        """Return the parameters of a scanner and where it stood."""
+        east_m, north_m, height_m, axis_east, axis_north = scanner
+        up = float(np.sqrt(max(1 - axis_east**2 - axis_north**2, 0.0)))
+        position_m = east_m, north_m, height_m
+        return basis(self._series.grid, position_m, (axis_east, axis_north, up)), position_m
 
 
 SCANNER = ("scanner_east", "scanner_north", "scanner_height", "scanner_axis_east", "scanner_axis_north")

@@ -38,7 +38,7 @@ SCATTER_MOST_M = 1.0  # the same of moving ones
 TOGETHER_MOST = 40.0  # patches of moving ground that are wrong as one
 CHANGE_AZIMUTH_KNOTS = 4  # knots of the lean, between knots of the change
 CHANGE_STRETCHES = 3  # of range, between knots of the change
-CHANGE_STEPS_M = tuple(float(step) for step in np.geomspace(0.0005, 0.5, 11))
+CHANGE_STEPS_M = tuple(float(step) for step in np.geomspace(0.5 / 2**14, 0.5, 15))
 UNIFORM_CHANGE = 1.0  # one sigma of what all the moving ground changes by, in steps of a knot's
 # The same of what neighbours change by alike, and after how many knots in azimuth and range it no longer is.
 ALIKE_CHANGES = (0.0, 1.0, 3.0, 10.0)
@@ -50,7 +50,7 @@ ALIKE_AZIMUTH_KNOTS, ALIKE_RANGE_KNOTS = 10.0, 6.0
 
 @dataclass(frozen=True)
 class Adjustment:
-    """The scanner's state against the SOP: nine globals, the lean of each group of lines, refraction.
+    """The scanner's state against the SOP: nine globals, the lean of each group of lines, knots of the rest.
 
     `change_step_m` is one sigma of the change between its knots that the moving ground shows;
     `stable_weight` (patches,) how far each stable patch was trusted.
@@ -66,11 +66,12 @@ class Adjustment:
         """Effect of the estimated state on heights (n,) [m], to be taken off."""
         first, last = len(GLOBAL), len(GLOBAL) + self.of.line_count
         before, after, share = felt.refraction_knot()
-        bend = self.estimate[last:]
+        bend, across_rad = np.split(self.estimate[last:], 2)
         return np.asarray(
             self.estimate[:first] @ felt.globals_
             + self.estimate[first:last][felt.line] * felt.lean
             + (bend[before] * (1 - share) + bend[after] * share) * felt.refraction
+            + (across_rad[before] * (1 - share) + across_rad[after] * share) * felt.across
         )
 
     @property

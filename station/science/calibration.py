@@ -180,11 +180,12 @@ def _matrices(felt: Sensitivities) -> tuple[sparse.csr_array, sparse.csr_array]:
     for effect, (before, after, share), start in (
         (felt.lean, felt.lean_knot(), first),
         (felt.refraction, felt.refraction_knot(), first + of.lean_count),
+        (felt.across, felt.refraction_knot(), first + of.lean_count + of.refraction_count),
     ):
         rows += [cells, cells]
         columns += [start + before, start + after]
         values += [effect * (1 - share), effect * share]
-    total = first + of.lean_count + of.refraction_count
+    total = first + of.lean_count + 2 * of.refraction_count
     place = np.concatenate(rows), np.concatenate(columns)
     design = sparse.csr_array((np.concatenate(values), place), shape=(count, total))
     return design, sparse.csr_array((felt.lean, (cells, felt.line)), shape=(count, of.line_count))

@@ -68,10 +68,17 @@ class Moved:
             for axis, at, name in zip(self.points, self.position_m, ("east", "north", "up"), strict=True)
         )
         x_m, y_m = _turned(x_m, y_m, of["heading"])
-        z_m, x_m = _turned(z_m, x_m, -of["tilt_north"])
-        y_m, z_m = _turned(y_m, z_m, -of["tilt_east"])
+        lean_rad, bend, across_rad = self._knots(parameters)
         flat_m = np.hypot(x_m, y_m)
-        farther_m, z_m = _turned(flat_m, z_m, self._upward(parameters, flat_m, of["refraction"]))
+        east_rad, north_rad = (
+            of["tilt_east"] + across_rad * x_m / flat_m,
+            of["tilt_north"] + across_rad * y_m / flat_m,
+        )
+        z_m, x_m = _turned(z_m, x_m, -north_rad)
+        y_m, z_m = _turned(y_m, z_m, -east_rad)
+        flat_m = np.hypot(x_m, y_m)
+        upward_rad = (of["refraction"] + bend) * flat_m / (2 * EARTH_RADIUS_M) - lean_rad
+        farther_m, z_m = _turned(flat_m, z_m, upward_rad)
         x_m, y_m = x_m * farther_m / flat_m, y_m * farther_m / flat_m
         scale = 1 + of["range_bias"] / np.hypot(farther_m, z_m) + 1e-6 * of["range_scale"]
         east_m, north_m, up_m = (
@@ -81,17 +88,18 @@ class Moved:
         column, row = (east_m - grid.west_m) / grid.cell_m, (grid.north_m - north_m) / grid.cell_m
         return np.asarray(up_m - self.ground.under(column, row)[0])
 
-    def _upward(self, parameters: Floats, flat_m: Floats, refraction: Floats) -> Floats:
-        """By how much lines of sight (draws, n) are turned up: the air, less the lean [rad]."""
-        first, count = len(GLOBAL), self.felt.of.lean_count
-        lean_rad, bend = (
+    def _knots(self, parameters: Floats) -> list[Floats]:
+        """Lean, refraction and lean across (draws, n) at each point."""
+        of, refraction = self.felt.of, self.felt.refraction_knot()
+        ends = np.cumsum([len(GLOBAL), of.lean_count, of.refraction_count])
+        return [
             (knots[before] * (1 - share)[:, None] + knots[after] * share[:, None]).T
-            for knots, (before, after, share) in (
-                (parameters[first : first + count], self.felt.lean_knot()),
-                (parameters[first + count :], self.felt.refraction_knot()),
+            for knots, (before, after, share) in zip(
+                np.split(parameters, ends)[1:],
+                (self.felt.lean_knot(), refraction, refraction),
+                strict=True,
             )
-        )
-        return np.asarray((refraction + bend) * flat_m / (2 * EARTH_RADIUS_M) - lean_rad)
+        ]
 
 
 def _turned(first: Floats, second: Floats, angle_rad: Floats) -> tuple[Floats, Floats]:

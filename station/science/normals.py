@@ -43,7 +43,7 @@ class Beforehand:
     """
 
     of: Basis
-    knots: Floats  # (p, p) covariance of the globals, the lean at knots, the refraction
+    knots: Floats  # (p, p) covariance of the globals, the lean at knots, the refraction, the lean across
     own: OwnLeans
 
     def against(self, reference: Shared | None) -> Beforehand:
@@ -55,7 +55,7 @@ class Beforehand:
         return Beforehand(self.of, self.knots + reference.covariance, self.own)
 
     def by_line(self) -> Floats:
-        """Covariance (u, u) of globals, leans of lines and refraction knots."""
+        """Covariance (u, u) of globals, leans of lines, knots of refraction and lean across."""
         covariance = lines_from_knots(self.of, self.knots)
         lines = slice(len(GLOBAL), len(GLOBAL) + self.of.line_count)
         covariance[lines, lines] += self.own.covariance()
@@ -151,6 +151,7 @@ def _design(felt: Sensitivities) -> sparse.csr_array:
     for effect, (before, after, share), first in (
         (felt.lean, felt.lean_knot(), len(GLOBAL)),
         (felt.refraction, felt.refraction_knot(), len(GLOBAL) + of.lean_count),
+        (felt.across, felt.refraction_knot(), len(GLOBAL) + of.lean_count + of.refraction_count),
     ):
         rows += [row, row]
         columns += [first + before, first + after]

@@ -12,7 +12,7 @@ from station.quantities import Floats, Habits, HeadTrack, Shared, Tilt
 from station.science.inclination import SENSOR_STEP_RAD, Cycle, Lean
 from station.science.leans import OwnLeans
 from station.science.normals import Beforehand, LineLog
-from station.science.shared import GLOBAL, LINES_A_KNOT, Basis, by_knots
+from station.science.shared import GLOBAL, LEAN_PER_REFRACTION, LINES_A_KNOT, Basis, by_knots
 
 REFRACTION_MEMORY_RAD = math.radians(15.0)
 RANGE_SCALE_UNKNOWN_PPM = 4.0  # no weather: 5 K and 5 hPa off, 0.737 ppm/K, 0.290 ppm/hPa, EQUATIONS 5.8
@@ -135,13 +135,33 @@ def bending(habits: Habits, of: Basis) -> Floats:
     return np.asarray(habits.refraction_by_azimuth**2 * np.exp(-apart_rad / REFRACTION_MEMORY_RAD))
 
 
-def by_line(of: Basis, globals_sigma: Floats, lean: Floats, bend: Floats) -> Floats:
-    """Covariance of globals, leans of lines and refraction knots, independent of each other."""
+def across(habits: Habits, of: Basis, lines: Lines) -> Floats:
+    """Covariance (knots, knots) of the lean across the line of sight [rad²]: that of the slow motion.
+
+    Of the fast one, knots a half minute apart hold nothing; the jitter of the mirror lifts lines, no more.
+    """
+    slow, _, _ = motions(_knots(of, lines))
+    return np.asarray(habits.slow_motion_rad**2 * slow)
+
+
+def _knots(of: Basis, lines: Lines) -> Lines:
+    """How the head passed the knots of the refraction and of the lean across."""
+    place = LINES_A_KNOT * LEAN_PER_REFRACTION * np.arange(of.refraction_count) - 0.5
+    azimuth_rad, time_s = (
+        np.interp(place, np.arange(of.line_count), values) for values in (lines.azimuth_rad, lines.time_s)
+    )
+    return Lines(azimuth_rad, time_s)
+
+
+def by_line(of: Basis, globals_sigma: Floats, lean: Floats, bend: Floats, across_rad2: Floats) -> Floats:
+    """Covariance of globals, leans of lines, refraction and lean across, independent of each other."""
     first, last = len(GLOBAL), len(GLOBAL) + of.line_count
-    covariance = np.zeros((last + of.refraction_count,) * 2)
+    beyond = last + of.refraction_count
+    covariance = np.zeros((beyond + of.refraction_count,) * 2)
     covariance[:first, :first] = np.diag(np.square(globals_sigma))
     covariance[first:last, first:last] = lean
-    covariance[last:, last:] = bend
+    covariance[last:beyond, last:beyond] = bend
+    covariance[beyond:, beyond:] = across_rad2
     return covariance
 
 
@@ -160,7 +180,9 @@ def beforehand(of: Basis, lines: Lines, habits: Habits, *, weather_known: bool) 
     knots = np.zeros((len(of.names),) * 2)
     knots[:first, :first] = np.diag(np.square(globals_sigma(habits, weather_known=weather_known)))
     knots[first:last, first:last] = habits.slow_motion_rad**2 * slow
-    knots[last:, last:] = bending(habits, of)
+    beyond = last + of.refraction_count
+    knots[last:beyond, last:beyond] = bending(habits, of)
+    knots[beyond:, beyond:] = across(habits, of, lines)
     apart = 1 - slow[np.arange(of.intervals), (np.arange(of.intervals) + 1) % of.lean_count]
     share = (np.arange(LINES_A_KNOT) + 0.5) / LINES_A_KNOT
     bent = 2 * np.outer(apart, share * (1 - share)).ravel()
@@ -186,17 +208,24 @@ def covariance_without_adjustment(
     the motion it takes away; without a log, all motion.
     """
     told = replace(habits, tilt_rad=SENSOR_BIAS_RAD) if lean else habits
+    slow = replace(habits, fast_motion_rad=0.0, line_motion_rad=0.0)
     covariance = by_line(
         of,
         globals_sigma(told, weather_known=weather_known),
         _missed_by_log(lines, lean, zero, habits) if lean else motion(habits, lines),
         bending(habits, of),
+        _missed_by_log(_knots(of, lines), lean, zero, slow, math.pi / 2)
+        if lean
+        else across(habits, of, lines),
     )
     return by_knots(of, np.zeros(len(covariance)), covariance)
 
 
-def _missed_by_log(lines: Lines, lean: Lean, zero: Cycle, habits: Habits) -> Floats:
-    """Covariance (lines, lines) of the lean along the line of sight that the filtered log leaves [rad²]."""
+def _missed_by_log(lines: Lines, lean: Lean, zero: Cycle, habits: Habits, beside_rad: float = 0.0) -> Floats:
+    """Covariance (lines, lines) of the lean that the filtered log leaves [rad²].
+
+    Along the line of sight, or along a direction so far counter-clockwise beside it.
+    """
     _, fast, white = motions(lines)
     apart_s = np.abs(np.subtract.outer(lines.time_s, lines.time_s))
     apart_rad = np.subtract.outer(lines.azimuth_rad, lines.azimuth_rad)
@@ -204,7 +233,7 @@ def _missed_by_log(lines: Lines, lean: Lean, zero: Cycle, habits: Habits) -> Flo
     missed = 1 - 2 / math.pi * math.atan(2 * math.pi * lean.cutoff_hz * SLOW_MOTION_S)
     width_s = lean.memory_s / (2 * math.sqrt(math.pi))  # of the Gaussian window with the same memory
     noise = np.exp(-((apart_s / width_s) ** 2) / 4) * np.cos(apart_rad)
-    changes = cycle_changes(lines, zero)
+    changes = cycle_changes(lines, zero, beside_rad)
     return np.asarray(
         habits.fast_motion_rad**2 * fast
         + habits.line_motion_rad**2 * white
@@ -215,17 +244,18 @@ def _missed_by_log(lines: Lines, lean: Lean, zero: Cycle, habits: Habits) -> Flo
     )
 
 
-def cycle_changes(lines: Lines, zero: Cycle) -> Floats:
+def cycle_changes(lines: Lines, zero: Cycle, beside_rad: float = 0.0) -> Floats:
     """Effect on the line of sight (lines, 2) of one sigma of change in the sensor's waves [rad].
 
-    Source: EQUATIONS 2.7.
+    Or on a direction so far counter-clockwise beside it. Source: EQUATIONS 2.7.
     """
     cos, sin = np.cos(lines.azimuth_rad), np.sin(lines.azimuth_rad)
+    toward_rad = lines.azimuth_rad + beside_rad
     waves = [
         (wave[1] * cos + wave[2] * sin)
         * arm
         * min(1.0, CYCLE_LARGEST_RAD / max(math.hypot(*wave[1:]), 1e-12))
-        for wave, arm in ((zero.roll_rad, sin), (zero.pitch_rad, -cos))
+        for wave, arm in ((zero.roll_rad, np.sin(toward_rad)), (zero.pitch_rad, -np.cos(toward_rad)))
     ]
     return CYCLE_CHANGE_SHARE * np.stack(waves, axis=-1)
 
@@ -239,7 +269,7 @@ def learned(start: Habits, of: Basis, scans: Iterable[tuple[Lines, Floats, Float
     """
     first, last = len(GLOBAL), len(GLOBAL) + of.line_count
     lean = slice(first, last)
-    shown, moved = np.zeros(last + of.refraction_count), np.zeros((of.line_count,) * 2)
+    shown, moved = np.zeros(last + 2 * of.refraction_count), np.zeros((of.line_count,) * 2)
     passed: list[Lines] = []
     for lines, estimate, covariance in scans:  # one after the other: covariances are large
         passed.append(lines)
@@ -255,7 +285,7 @@ def learned(start: Habits, of: Basis, scans: Iterable[tuple[Lines, Floats, Float
         return math.sqrt((variance * count + getattr(start, name) ** 2 * SCANS_WORTH) / mass)
 
     seen = {name: float(shown[place].mean()) for name, place in SHOWN.items()}
-    seen["refraction_by_azimuth"] = float(shown[last:].mean())
+    seen["refraction_by_azimuth"] = float(shown[last : last + of.refraction_count].mean())
     kernels = motions(passed[0])
     now = start
     for _ in range(MOTION_STEPS):

@@ -12,7 +12,8 @@ import numpy as np
 from scipy import linalg, stats
 
 from station.quantities import Bools, Floats, Habits
-from station.science.adjustment import Adjustment, LineLog
+from station.science.adjustment import Adjustment
+from station.science.normals import LineLog
 from station.science.prior import BIASES, Lines, motion
 from station.science.shared import GLOBAL
 
@@ -73,9 +74,9 @@ def expected(lines: Lines, log: LineLog, found: Adjustment) -> Expected:
     state = len(GLOBAL) + order
     azimuth_rad = found.of.line_azimuth_rad[order]
     tilt = np.stack([np.cos(azimuth_rad), -np.sin(azimuth_rad)], axis=-1)
-    across = tilt @ found.covariance[:2, state]
-    known = found.covariance[np.ix_(state, state)] + across + across.T
-    known += tilt @ found.covariance[:2, :2] @ tilt.T
+    covariance = found.covariance
+    across = tilt @ covariance[:2, state]
+    known = covariance[np.ix_(state, state)] + across + across.T + tilt @ covariance[:2, :2] @ tilt.T
     left = log.lean_rad[order] - tilt @ found.estimate[:2] - found.estimate[state]
     weight, faults = log.weight[order], log.faults[order]
     weighted = weight[:, None] * faults

@@ -1,9 +1,9 @@
 """What all points of a scan have in common: parameters, their effect on heights, their covariance.
 
-Nine global parameters, and by azimuth the lean along the line of sight (knots every 1°) and the refraction
-(every 5°) that they do not hold. The effect of each on a height is analytic in the place of the cell and the
-gradient of the terrain, so that it is never stored: with these functions and the covariance in an epoch
-anyone gets the uncertainty of a cell, a box, a volume, a difference.
+Nine global parameters, and by azimuth the lean along the line of sight (knots every 1°), the refraction and
+the lean across the line of sight (every 5°) that they do not hold. The effect of each on a height is analytic
+in the place of the cell and the gradient of the terrain, so that it is never stored: with these functions and
+the covariance in an epoch anyone gets the uncertainty of a cell, a box, a volume, a difference.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ MOST_LEANING_COS = math.cos(math.radians(10.0))  # beyond, a sector on the map s
 
 @dataclass(frozen=True)
 class Basis:
-    """The parameters of a station: nine, then lean and refraction at knots from azimuth `start_rad` on.
+    """The parameters of a station: nine, then lean, refraction, lean across, at knots from `start_rad` on.
 
     Azimuths are those of the scanner's head: about its axis of rotation (east, north, up), clockwise from
     grid north, so that a scan line has one, however the mount leans. `closed`: the knots go all the way
@@ -56,7 +56,7 @@ class Basis:
 
     @property
     def refraction_count(self) -> int:
-        """How many knots the refraction has."""
+        """How many knots the refraction has, and as many the lean across the line of sight."""
         return self.intervals // LEAN_PER_REFRACTION + (not self.closed)
 
     @property
@@ -91,13 +91,15 @@ class Basis:
             *(name for name, _ in GLOBAL),
             *(f"lean_{_degrees(a)}" for a in lean_rad),
             *(f"refraction_{_degrees(a)}" for a in self.refraction_azimuth_rad),
+            *(f"lean_across_{_degrees(a)}" for a in self.refraction_azimuth_rad),
         )
 
     @property
     def units(self) -> tuple[str, ...]:
         """Unit of each parameter."""
         return (
-            *(unit for _, unit in GLOBAL), *["rad"] * self.lean_count, *["1"] * self.refraction_count
+            *(unit for _, unit in GLOBAL), *["rad"] * self.lean_count, *["1"] * self.refraction_count,
+            *["rad"] * self.refraction_count,
         )  # fmt: skip
 
     def knots_before(self, offset_m: tuple[Floats, Floats, Floats]) -> Floats:
@@ -149,7 +151,8 @@ def basis(
 class Sensitivities:
     """Effect of a unit of each parameter on the heights of cells: the matrix J, without its zeros.
 
-    A cell feels the nine globals, the lean of its line and the two knots of the refraction beside it.
+    A cell feels the nine globals, the lean of its line and the two knots beside it of the refraction and of
+    the lean across the line of sight.
     """
 
     of: Basis
@@ -167,13 +170,30 @@ class Sensitivities:
         """Group of scan lines (n,) that each cell lies in."""
         return (self.passed * LINES_A_KNOT).astype(np.int64)
 
+    @property
+    def across(self) -> Floats:
+        """Effect of a turn about the direction in which the head looks (n,), per rad.
+
+        It shifts points sideways by their height under the scanner: steep ground close by shows it.
+        """
+        east, north = _clockwise(self.of.axis)
+        azimuth_rad = self.of.start_rad + LEAN_KNOT_RAD * self.passed
+        sine, cosine = np.sin(azimuth_rad), np.cos(azimuth_rad)
+        turn = [sine * e + cosine * n for e, n in zip(east, north, strict=True)]
+        return np.asarray(
+            self.globals_[0] * turn[0] + self.globals_[1] * turn[1] - self.globals_[2] * turn[2]
+        )
+
     def lean_knot(self) -> tuple[Ints, Ints, Floats]:
         """Knots of the lean before and after each cell (n,), and the share of the one after."""
         before = self.passed.astype(np.int64)
         return before, (before + 1) % self.of.lean_count, self.passed - before
 
     def refraction_knot(self) -> tuple[Ints, Ints, Floats]:
-        """Knots of the refraction before and after each cell (n,), and the share of the one after."""
+        """Knots of the refraction before and after each cell (n,), and the share of the one after.
+
+        The lean across the line of sight has the same.
+        """
         before = self.passed.astype(np.int64) // LEAN_PER_REFRACTION
         return before, (before + 1) % self.of.refraction_count, self.passed / LEAN_PER_REFRACTION - before
 
@@ -186,6 +206,7 @@ class Sensitivities:
         for effect, (before, after, share), count in (
             (self.lean * weights, self.lean_knot(), self.of.lean_count),
             (self.refraction * weights, self.refraction_knot(), self.of.refraction_count),
+            (self.across * weights, self.refraction_knot(), self.of.refraction_count),
         ):
             knots: Floats = np.zeros(count)
             np.add.at(knots, before, effect * (1 - share))
@@ -201,26 +222,26 @@ class Sensitivities:
 
     def variance(self, unknown: Shared) -> Floats:
         """Variance of each cell's height (n,) [m²]: the diagonal of J C Jᵀ, and what its line adds."""
-        of, first = self.of, len(GLOBAL)
+        of, first, across = self.of, len(GLOBAL), self.across
         before = self.passed.astype(np.int16)
         order = np.argsort(before, kind="stable")
         bounds = np.searchsorted(before[order], np.arange(of.intervals + 1))
         own = leans_between(of).left ** 2 @ line_variances(of, unknown)
         variance_m2 = self.lean**2 * own[self.line]
+        last, beyond = first + of.lean_count, first + of.lean_count + of.refraction_count
         for knot in np.flatnonzero(np.diff(bounds)):
             cells = order[bounds[knot] : bounds[knot + 1]]
             bend = knot // LEAN_PER_REFRACTION
-            knots = (
-                first + knot,
-                first + (knot + 1) % of.lean_count,
-                first + of.lean_count + bend,
-                first + of.lean_count + (bend + 1) % of.refraction_count,
+            bend_after = (bend + 1) % of.refraction_count
+            leans = first + knot, first + (knot + 1) % of.lean_count
+            felt = [*range(first), *leans, last + bend, last + bend_after, beyond + bend, beyond + bend_after]
+            passed, along, bent, aside = (
+                values[cells] for values in (self.passed, self.lean, self.refraction, across)
             )
-            felt = [*range(first), *knots]
-            passed, along, bent = self.passed[cells], self.lean[cells], self.refraction[cells]
-            after, bent_after = along * (passed - knot), bent * (passed / LEAN_PER_REFRACTION - bend)
-            beside = np.stack([along - after, after, bent - bent_after, bent_after])
-            columns = np.concatenate([self.globals_[:, cells], beside])
+            share, bent_share = passed - knot, passed / LEAN_PER_REFRACTION - bend
+            after, bent_after, aside_after = along * share, bent * bent_share, aside * bent_share
+            beside = [along - after, after, bent - bent_after, bent_after, aside - aside_after, aside_after]
+            columns = np.concatenate([self.globals_[:, cells], np.stack(beside)])
             told_m2 = np.einsum("ij,ij->j", columns, unknown.covariance[np.ix_(felt, felt)] @ columns)
             variance_m2[cells] += np.maximum(told_m2, 0.0)  # rounding, where the covariance is singular
         return variance_m2
@@ -332,8 +353,22 @@ def against(unknown: Shared, common: Shared | None) -> Shared:
     return unknown + (common if common.names == unknown.names else unknown)
 
 
+def by_names(of: Basis, unknown: Shared) -> Shared:
+    """Return what is unknown by the parameters of a basis; what an older epoch lacks counts as known."""
+    if unknown.names == of.names:
+        return unknown
+    place = {name: at for at, name in enumerate(unknown.names)}
+    here = [at for at, name in enumerate(of.names) if name in place]
+    there = [place[of.names[at]] for at in here]
+    estimate, noise = np.zeros(len(of.names)), np.zeros(len(of.names))
+    covariance = np.zeros((len(of.names),) * 2)
+    estimate[here], noise[here] = unknown.estimate[there], unknown.noise_variance[there]
+    covariance[np.ix_(here, here)] = unknown.covariance[np.ix_(there, there)]
+    return Shared(of.names, of.units, estimate, covariance, noise)
+
+
 def lines_from_knots(of: Basis, unknown: Floats) -> Floats:
-    """Covariance by line (9 + lines + refraction knots) of one by knot (p, p)."""
+    """Covariance by line (9 + lines + knots of refraction and lean across) of one by knot (p, p)."""
     wide = rows_at_lines(of, unknown)
     return rows_at_lines(of, wide.T)
 
@@ -345,13 +380,13 @@ def rows_at_lines(of: Basis, rows: Floats) -> Floats:
 
 
 def rows_at_knots(of: Basis, rows: Floats) -> Floats:
-    """Rows by knot of rows by line (9 + lines + refraction knots, k)."""
+    """Rows by knot of rows by line (9 + lines + knots of refraction and lean across, k)."""
     first, last = len(GLOBAL), len(GLOBAL) + of.line_count
     return np.concatenate([rows[:first], leans_between(of).fit @ rows[first:last], rows[last:]])
 
 
 def by_knots(of: Basis, estimate: Floats, covariance: Floats) -> Shared:
-    """Return what is known by line (9 + lines + refraction knots), condensed to knots."""
+    """Return what is known by line (9 + lines + knots of refraction and lean across), condensed to knots."""
     lines = slice(len(GLOBAL), len(GLOBAL) + of.line_count)
     narrow = rows_at_knots(of, covariance)
     left = covariance[lines, lines] - interpolated(

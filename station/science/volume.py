@@ -229,7 +229,7 @@ def shared_contributions(weights: Floats, felt: Sensitivities, unknown: Shared) 
     """
     of = felt.of
     back = unknown.covariance @ felt.total(weights)
-    lean, bend = np.split(back[len(GLOBAL) :], [of.lean_count])
+    lean, bend, aside = np.split(back[len(GLOBAL) :], [of.lean_count, of.lean_count + of.refraction_count])
     lean_before, lean_after, lean_share = felt.lean_knot()
     bend_before, bend_after, bend_share = felt.refraction_knot()
     left = leans_between(of).left
@@ -238,6 +238,7 @@ def shared_contributions(weights: Floats, felt: Sensitivities, unknown: Shared) 
         back[: len(GLOBAL)] @ felt.globals_
         + felt.lean * (lean[lean_before] * (1 - lean_share) + lean[lean_after] * lean_share + own[felt.line])
         + felt.refraction * (bend[bend_before] * (1 - bend_share) + bend[bend_after] * bend_share)
+        + felt.across * (aside[bend_before] * (1 - bend_share) + aside[bend_after] * bend_share)
     )
     return np.asarray(weights * height_m2)
 

@@ -41,7 +41,8 @@ def drawn(seed, size):
     """Shared parameters with a full covariance of lifelike size."""
     rng = np.random.default_rng(seed)
     scale = np.array([1e-4, 1e-4, 3e-5, 3e-3, 3e-3, 3e-3, 4e-3, 0.8, 0.05])
-    sigma = np.concatenate([scale, np.full(BESIDE.lean_count, 3e-5), np.full(BESIDE.refraction_count, 0.02)])
+    counts = BESIDE.lean_count, BESIDE.refraction_count, BESIDE.refraction_count
+    sigma = np.concatenate([scale, np.repeat([3e-5, 0.02, 3e-5], counts)])
     root = sigma[:, None] * rng.normal(size=(len(sigma), 3 * len(sigma))) / np.sqrt(3 * len(sigma))
     noise = np.zeros(len(sigma))
     noise[9 : 9 + BESIDE.intervals] = rng.uniform(1e-10, 1e-9, BESIDE.intervals)
@@ -117,7 +118,9 @@ def azimuth_deg(ds, index):
     north /= np.linalg.norm(north)
     east = np.cross(north, up)
     along = [d[0] * x + d[1] * y + d[2] * z for d in (east, north)]
-    return np.degrees(np.arctan2(*along)), (x, y, z)
+    azimuth = np.arctan2(*along)
+    outward = [np.sin(azimuth) * e + np.cos(azimuth) * n for e, n in zip(east, north, strict=True)]
+    return np.degrees(azimuth), (x, y, z), outward
 
 
 def matrix(ds, index):
@@ -125,7 +128,7 @@ def matrix(ds, index):
 
     And the lean's effect with the group of lines (cells, groups), for what each has of its own.
     """
-    azimuth, (x, y, z) = azimuth_deg(ds, index)
+    azimuth, (x, y, z), outward = azimuth_deg(ds, index)
     away = np.hypot(x, y)
     rise = away + z * (EAST * x + NORTH * y) / away
     along = z - EAST * x - NORTH * y
@@ -142,13 +145,17 @@ def matrix(ds, index):
         "refraction": bend,
     }
     names = [str(name) for name in ds.parameter_name.values]
-    first = min(float(name[5:]) for name in names if name.startswith("lean_"))
+    turns = effects["tilt_east"], effects["tilt_north"], -effects["heading"]
+    across = sum(turn * part for turn, part in zip(turns, outward, strict=True))
+    leans = [name for name in names if name.startswith("lean_") and "across" not in name]
+    first = min(float(name[5:]) for name in leans)
     for name in names[len(effects) :]:
         kind, at = name.rsplit("_", 1)
-        wide, effect = {"lean": (1.0, -rise), "refraction": (5.0, bend)}[kind]
+        kinds = {"lean": (1.0, -rise), "refraction": (5.0, bend), "lean_across": (5.0, across)}
+        wide, effect = kinds[kind]
         effects[name] = effect * np.maximum(1 - np.abs(azimuth - float(at)) / wide, 0)
     group = np.floor((azimuth - first) / 0.2).astype(int).ravel()
-    lines = np.arange(5 * (sum(name.startswith("lean_") for name in names) - 1))
+    lines = np.arange(5 * (len(leans) - 1))
     own = np.where(group[:, None] == lines, -rise.ravel()[:, None], 0.0)
     knots = np.maximum(1 - np.abs((lines[:, None] + 0.5) / 5 - np.arange(len(lines) // 5 + 1)), 0)
     own -= (
@@ -193,6 +200,26 @@ def test_an_epoch_of_the_log_alone_has_its_own_covariance_and_the_references(fil
             assert told == pytest.approx(wanted(ds, counted, NONE, common=drawn(7, 0.5)), rel=1e-4)
             assert told > 1.01 * wanted(ds, counted, NONE)
             assert station.variance(filled.folder, weights, NONE) == told
+
+
+def test_an_epoch_of_before_the_lean_across_is_read_as_if_there_were_none(filled):
+    whole = drawn(13, 0.3)
+    older = np.array(["across" not in name for name in whole.names])
+    names, units = (tuple(np.array(told)[older]) for told in (whole.names, whole.units))
+    short = Shared(
+        names,
+        units,
+        whole.estimate[older],
+        whole.covariance[np.ix_(older, older)],
+        whole.noise_variance[older],
+    )
+    none = replace(whole, covariance=np.where(np.outer(older, older), whole.covariance, 0.0))
+    for hour, unknown in ((12, short), (13, none)):
+        store.write_epoch(filled, replace(epoch(12, "joint", unknown), start_s=START_S + 3600 * hour))
+    found = Aggregates(filled)
+    weights = np.full(GRID.shape, 1.0)
+    told = found.variance(weights, found.row(-2))
+    assert told == pytest.approx(found.variance(weights, found.row(-1)), rel=1e-6)
 
 
 def test_an_adjusted_epoch_has_that_of_the_reference_in_its_own(filled):

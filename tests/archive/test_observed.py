@@ -33,7 +33,8 @@ SIGMA_M = 0.03  # of each cell
 def unknown():
     """What scans share, of lifelike size: as large in a mean as what a cell has of its own."""
     scale = np.array([2e-5, 2e-5, 1e-5, 3e-3, 3e-3, 3e-3, 4e-3, 0.8, 0.02])
-    sigma = np.concatenate([scale, np.full(OF.lean_count, 2e-5), np.full(OF.refraction_count, 0.01)])
+    counts = OF.lean_count, OF.refraction_count, OF.refraction_count
+    sigma = np.concatenate([scale, np.repeat([2e-5, 0.01, 2e-5], counts)])
     near = np.eye(len(sigma))
     near[0, 1] = near[1, 0] = 0.5
     noise = np.zeros(len(sigma))
@@ -62,7 +63,8 @@ def drawn():
         common = draw[:9] @ felt.globals_
         for effect, (before, after, share), knots in (
             (felt.lean, lean, draw[9 : 9 + OF.lean_count]),
-            (felt.refraction, refraction, draw[9 + OF.lean_count :]),
+            (felt.refraction, refraction, draw[9 + OF.lean_count : -OF.refraction_count]),
+            (felt.across, refraction, draw[-OF.refraction_count :]),
         ):
             common = common + effect * (knots[before] * (1 - share) + knots[after] * share)
         error_m.append(common + SIGMA_M * rng.normal(size=len(felt)))

@@ -149,7 +149,9 @@ def test_changes_of_the_cycle_against_its_wave_made_a_fifth_larger(largest):
     size = math.radians(0.05) / largest
     for wave in (roll, pitch):
         wave[1:] *= size / math.hypot(*wave[1:])
-    told = prior.cycle_changes(lines, Cycle(tuple(roll), tuple(pitch)))
+    told, across = (
+        prior.cycle_changes(lines, Cycle(tuple(roll), tuple(pitch)), beside) for beside in (0.0, math.pi / 2)
+    )
     grown = [np.array([wave[0], *(1 + 0.2 * largest) * wave[1:]]) for wave in (roll, pitch)]
     before = Cycle(tuple(roll), tuple(pitch)).at(lines.azimuth_rad)
     for column, after in enumerate(
@@ -158,6 +160,8 @@ def test_changes_of_the_cycle_against_its_wave_made_a_fifth_larger(largest):
         moved = [a - b for a, b in zip(after.at(lines.azimuth_rad), before, strict=True)]
         wanted = moved[0] * np.sin(lines.azimuth_rad) - moved[1] * np.cos(lines.azimuth_rad)
         assert told[:, column] == pytest.approx(wanted, abs=1e-12)
+        about = moved[0] * np.cos(lines.azimuth_rad) + moved[1] * np.sin(lines.azimuth_rad)
+        assert across[:, column] == pytest.approx(about, abs=1e-12)
 
 
 def test_motion_is_a_covariance_of_three_memories():
@@ -193,7 +197,9 @@ def scans_of(habits, count, seed=0):
     rng = np.random.default_rng(seed)
     lines = prior.lines_of(OF, np.eye(3), None)
     sigma = prior.globals_sigma(habits, weather_known=True)
-    covariance = prior.by_line(OF, sigma, prior.motion(habits, lines), prior.bending(habits, OF))
+    covariance = prior.by_line(
+        OF, sigma, prior.motion(habits, lines), prior.bending(habits, OF), prior.across(habits, OF, lines)
+    )
     root = np.linalg.cholesky(covariance)
     return [(lines, root @ rng.normal(size=len(root)), 1e-6 * covariance) for _ in range(count)]
 
@@ -223,7 +229,9 @@ def test_what_a_scan_leaves_unknown_counts_as_shown():
     """Scans without any observation have estimates of nought and all of the prior as covariance."""
     lines = prior.lines_of(OF, np.eye(3), None)
     sigma = prior.globals_sigma(HABITS, weather_known=True)
-    covariance = prior.by_line(OF, sigma, prior.motion(HABITS, lines), prior.bending(HABITS, OF))
+    covariance = prior.by_line(
+        OF, sigma, prior.motion(HABITS, lines), prior.bending(HABITS, OF), prior.across(HABITS, OF, lines)
+    )
     blind = [(lines, np.zeros(len(covariance)), covariance)] * 80
     for name, value in vars(prior.learned(HABITS, OF, blind)).items():
         assert value == pytest.approx(getattr(HABITS, name), rel=0.01)
@@ -261,3 +269,13 @@ def test_what_stays_unknown_without_adjustment_is_a_covariance_and_a_log_makes_i
         assert len(unknown.names) == len(unknown.estimate) == len(unknown.noise_variance)
     assert (felt.variance(with_log) < felt.variance(without)).all()
     assert felt.variance(with_log).mean() < 0.5 * felt.variance(without).mean()
+
+
+def test_the_lean_across_is_as_slow_as_the_mount():
+    """Between knots 5° apart 5 / 0.13 seconds go by; the slow motion is forgotten over 300 s."""
+    lines = prior.lines_of(OF, np.eye(3), None)
+    told = prior.across(HABITS, OF, lines)
+    assert told.shape == (OF.refraction_count,) * 2
+    assert np.diag(told) == pytest.approx(HABITS.slow_motion_rad**2)
+    within = told[1:-2, 2:-1].diagonal() / HABITS.slow_motion_rad**2
+    assert within == pytest.approx(math.exp(-5 / 0.13 / 300), rel=1e-6)

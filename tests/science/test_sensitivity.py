@@ -145,7 +145,8 @@ def drawn(seed, *, tied):
     """Shared parameters; `tied` across groups as an adjustment ties them."""
     rng = np.random.default_rng(seed)
     scale = np.array([1e-4, 1e-4, 3e-4, 3e-2, 3e-2, 3e-2, 4e-2, 8.0, 0.5])
-    sigma = np.concatenate([scale, np.full(OF.lean_count, 5e-5), np.full(OF.refraction_count, 0.2)])
+    counts = OF.lean_count, OF.refraction_count, OF.refraction_count
+    sigma = np.concatenate([scale, np.repeat([5e-5, 0.2, 5e-5], counts)])
     root = sigma[:, None] * rng.normal(size=(len(sigma), 2 * len(sigma))) / np.sqrt(2 * len(sigma))
     noise = np.zeros(len(sigma))
     noise[9 : 9 + OF.intervals] = 1e-9
@@ -235,7 +236,7 @@ def moved():
 def test_a_small_move_is_what_the_sensitivities_say(moved):
     """Inward from a cell's centre the ground's slope is another on either side; their mean is that of J."""
     count = len(OF.names)
-    for at in (0, 1, 2, 5, 6, 7, 8, 9 + 3, count - 2):
+    for at in (0, 1, 2, 5, 6, 7, 8, 9 + 3, 9 + OF.lean_count + 1, count - 2):
         step = 1e-3 * math.sqrt(moved.unknown.covariance[at, at])
         inputs = np.zeros((count + 2, 2))
         inputs[at] = step, -step

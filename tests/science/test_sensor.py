@@ -2,14 +2,16 @@
 
 import math
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from station.quantities import Habits
 from station.science import prior, sensor
-from station.science.adjustment import Adjustment, LineLog
+from station.science.adjustment import Adjustment
 from station.science.inclination import Cycle
+from station.science.normals import LineLog
 from station.science.shared import GLOBAL, Basis
 
 OF = Basis(math.radians(60.0), 120, closed=False)  # 600 groups of lines
@@ -20,7 +22,7 @@ WAVE_RAD = math.radians(0.035)
 ZERO = Cycle((0.0, WAVE_RAD, 0.0), (0.0, WAVE_RAD, 0.0))
 GROUND_RAD, NOISE_RAD = math.radians(0.0006), math.radians(0.007)
 STATE = slice(len(GLOBAL), len(GLOBAL) + OF.line_count)
-FELT = np.zeros((OF.line_count, len(GLOBAL) + OF.line_count + OF.refraction_count))
+FELT = np.zeros((OF.line_count, len(GLOBAL) + OF.line_count + 2 * OF.refraction_count))
 FELT[:, 0], FELT[:, 1] = np.cos(OF.line_azimuth_rad), -np.sin(OF.line_azimuth_rad)
 FELT[:, STATE] = np.eye(OF.line_count)
 FAULTS = np.concatenate(
@@ -40,7 +42,8 @@ class Scan:
         self.random, self.habits = np.random.default_rng(seed), habits
         motion = prior.motion(habits, LINES)
         sigma = prior.globals_sigma(habits, weather_known=True)
-        self.prior = prior.by_line(OF, sigma, motion, prior.bending(habits, OF))
+        leans = motion, prior.bending(habits, OF), prior.across(habits, OF, LINES)
+        self.prior = prior.by_line(OF, sigma, *leans)
         seen = motion - habits.line_motion_rad**2 * np.eye(OF.line_count)
         self.lean_rad = np.linalg.cholesky(seen + 1e-18 * np.eye(len(seen))) @ self.normal()
         self.lean_rad += FELT[:, :2] @ (habits.tilt_rad * self.random.standard_normal(2))
@@ -66,7 +69,8 @@ class Scan:
             normal += FELT.T @ np.linalg.solve(noise, FELT)
             right += FELT.T @ np.linalg.solve(noise, log.lean_rad)
         covariance = np.linalg.inv(normal)
-        return Adjustment(OF, covariance @ right, covariance, 0.001, np.ones(9))
+        unknown = SimpleNamespace(by_line=lambda: covariance)
+        return Adjustment(OF, covariance @ right, unknown, 0.001, np.ones(9))
 
     def told(self, log):
         return sensor.expected(LINES, log, self.adjusted(log))
@@ -97,7 +101,8 @@ def test_lines_without_a_log_do_not_count():
         spread, log.lean_rad[kept] - FELT[kept] @ alone.estimate
     )
     covariance = alone.covariance - gain @ np.linalg.solve(spread, gain.T)
-    told = sensor.expected(LINES, with_gap, Adjustment(OF, estimate, covariance, 0.001, np.ones(9)))
+    unknown = SimpleNamespace(by_line=lambda: covariance)
+    told = sensor.expected(LINES, with_gap, Adjustment(OF, estimate, unknown, 0.001, np.ones(9)))
     assert told.ground_rad[::-1] == pytest.approx((FELT @ alone.estimate)[kept], abs=1e-9)
 
 

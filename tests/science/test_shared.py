@@ -40,6 +40,9 @@ def moved(parameter, unit, place_m):
         return place_m * (1 + unit / range_m)
     if parameter == "range_scale":
         return place_m * (1 + unit * 1e-6)
+    if parameter == "across":
+        sight = place_m / horizontal_m * np.array([[1.0], [1.0], [0.0]])
+        return Rotation.from_rotvec(-unit * sight.T).apply(place_m.T).T
     elevation = np.arctan2(place_m[2], horizontal_m)
     turn = unit * horizontal_m / (2 * EARTH_RADIUS_M) if parameter == "refraction" else -unit
     outward = place_m[:2] / horizontal_m * (range_m * np.cos(elevation + turn))
@@ -48,15 +51,19 @@ def moved(parameter, unit, place_m):
 
 @pytest.mark.parametrize(
     ("parameter", "unit"),
-    [*((name, 1e-6 if kind == "rad" else 1e-3) for name, kind in shared.GLOBAL), ("lean", 1e-6)],
+    [
+        *((name, 1e-6 if kind == "rad" else 1e-3) for name, kind in shared.GLOBAL),
+        ("lean", 1e-6),
+        ("across", 1e-6),
+    ],
 )
 def test_sensitivities_against_moved_points(parameter, unit):
     place_m = cells()
     of = shared.basis(GRID, (0.0, 0.0, 0.0))
     felt = shared.sensitivities(of, place_m, np.full(200, EAST), np.full(200, NORTH))
     wanted = height_error(moved(parameter, unit, place_m), place_m) / unit
-    row = [name for name, _ in shared.GLOBAL].index(parameter) if parameter != "lean" else None
-    told = felt.lean if row is None else felt.globals_[row]
+    told = dict(zip((name for name, _ in shared.GLOBAL), felt.globals_, strict=True))
+    told = (told | {"lean": felt.lean, "across": felt.across})[parameter]
     assert told == pytest.approx(
         wanted, rel=2e-3, abs=1e-6 * abs(wanted).max() + 1e-3 * (parameter == "range_scale")
     )
@@ -112,7 +119,7 @@ def test_knots_cover_the_sector():
     assert of.refraction_azimuth_rad[0] <= min(corners)
     assert of.refraction_azimuth_rad[-1] >= max(corners)
     assert of.line_azimuth_rad[0] < of.refraction_azimuth_rad[1]
-    assert len(of.names) == len(of.units) == 9 + of.lean_count + of.refraction_count
+    assert len(of.names) == len(of.units) == 9 + of.lean_count + 2 * of.refraction_count
 
 
 def test_a_line_of_a_leaning_head_has_one_azimuth():
