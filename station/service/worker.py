@@ -213,7 +213,7 @@ class Worker:
 
     def _adopt(self) -> None:
         """Make rows for epochs that the journal does not know: it was lost, or older than the store."""
-        found = self.run(unknown, self._journal.rows())
+        found = self._mending(unknown, self._journal.rows())
         if found:
             log.warning("%s", logfmt(journal="made anew", epochs=len(found), reason="it knew not of them"))
         self._journal.adopt(found)
