@@ -173,16 +173,14 @@ class Surface:
     """One scan on the grid.
 
     `change_m` is the mean residual to the reference, NaN where there is none; everything is NaN (or zero
-    points) where the scan saw nothing. `random_variance_m2` is of the cell's mean and averages out over
-    cells; what does not average out is in `shared`, through the sensitivities of EQUATIONS 6.1.
+    points) where the scan saw nothing.
     """
 
     grid: Grid
-    elevation_m: Floats  # (ny, nx)
+    elevation_m: Floats32  # (ny, nx)
     change_m: Floats32  # (ny, nx)
     count: NDArray[np.int32]  # (ny, nx)
     spread_m: Floats32  # (ny, nx) standard deviation of the points in the cell
-    random_variance_m2: Floats32  # (ny, nx)
 
 
 class Quality(IntFlag):

@@ -13,9 +13,11 @@ from station.science.terrain import Ground, ground
 if TYPE_CHECKING:
     from station.quantities import Bools, Floats, Floats32, Grid, Ints, Reference
 
-# Sums are of multiples of 2^-20 m (and m²), so that adding float64 is exact up to 2^33 and the order in
-# which points come cannot matter.
+# Sums are whole numbers, of 2^-20 m (and m²), so that the order in which points come cannot matter.
 QUANTUM = 2.0**20
+BRIGHTEST = 65535.0  # intensity is of 16 bits
+BITS = 40  # of a number, in which brightness is summed up; the others count
+ONE = 1 << BITS
 STEP_MOST = 6.0  # sigmas: beyond, something happened
 CLASS_STEPS = 10.0  # what the class of a cell weighs against the steps from scan to scan of its own
 ALL = slice(None)
@@ -35,82 +37,87 @@ class Gridder:
         self.grid = grid
         self.ground: Ground | None = ground(reference) if reference else None
         self.datum_m = float(np.round(datum_m))
-        cells = grid.nx * grid.ny
-        self.count = np.zeros(cells, np.int32)
-        self._residual = np.zeros(cells)
-        self._square = np.zeros(cells)
-        self._variance = np.zeros(cells)
-        self._brightness = np.zeros(cells)
+        # Of a cell side by side, for it is they that a shot has to wait for: number of points and brightness
+        # in one, heights, and their squares.
+        self._sums = np.zeros((*grid.shape, 3), np.int64)
 
-    def cells(self, x_m: Floats, y_m: Floats) -> tuple[Bools, Floats, Floats]:
-        """Tell which points (n,) lie on the grid, and the column and row of those, in fractions of cells.
+    def cells(self, x_m: Floats, y_m: Floats) -> tuple[Ints, Floats, Floats]:
+        """Number of each point (n,) that lies on the grid, and its column and row, in fractions of cells.
 
         A point on an edge belongs to the cell east or south of it.
         """
         column = (x_m - self.grid.west_m) / self.grid.cell_m
         row = (self.grid.north_m - y_m) / self.grid.cell_m
-        inside = (column >= 0) & (column < self.grid.nx) & (row >= 0) & (row < self.grid.ny)
+        inside = np.flatnonzero(
+            (column >= 0) & (column < self.grid.nx) & (row >= 0) & (row < self.grid.ny)
+        )
         return inside, column[inside], row[inside]
 
     def flat(self, column: Floats, row: Floats) -> Ints:
         """Index (n,) of each point's cell in the flattened grid."""
         return row.astype(np.int64) * self.grid.nx + column.astype(np.int64)
 
-    def known(self, cell: Ints) -> Bools:
-        """Tell for each point (n,) whether the reference is known in its cell."""
+    def below(self, cell: Ints, column: Floats, row: Floats) -> Floats:
+        """Height (n,) that the residual of each point is taken from [m]: of the reference, or the datum."""
         if self.ground is None:
-            return np.zeros(len(cell), bool)
-        return np.asarray(self.ground.known.ravel()[cell])
+            return np.full(len(cell), self.datum_m)
+        known = self.ground.known.ravel()[cell]
+        return np.where(known, self.ground.height(column, row), self.datum_m)
 
-    def add(self, cell: Ints, residual_m: Floats, variance_m2: Floats, intensity: Floats | None) -> None:
-        """Add points (n,): their cell, height above reference or datum, random variance and brightness."""
-        residual_m = np.rint(residual_m * QUANTUM) / QUANTUM
-        np.add.at(self.count, cell, 1)
-        np.add.at(self._residual, cell, residual_m)
-        np.add.at(self._square, cell, np.rint(residual_m**2 * QUANTUM) / QUANTUM)
-        np.add.at(self._variance, cell, np.rint(variance_m2 * QUANTUM) / QUANTUM)
-        if intensity is not None:
-            np.add.at(self._brightness, cell, np.rint(intensity * QUANTUM) / QUANTUM)
+    def below_cells(self, rows: slice) -> tuple[Bools, Floats]:
+        """Whether the reference is known (r, nx) in some rows, and the mean height [m] residuals are from."""
+        if self.ground is None:
+            shape = self.count(rows).shape
+            return np.zeros(shape, bool), np.full(shape, self.datum_m)
+        known = self.ground.known[rows]
+        return known, np.where(known, self.ground.cell_means(rows), self.datum_m)
+
+    def add(self, cell: Ints, residual_m: Floats, intensity: Floats | None) -> None:
+        """Add points (n,): their cell, height above reference or datum, and brightness, 0-1."""
+        sums = self._sums.reshape(-1)
+        steps = np.rint(residual_m * QUANTUM)
+        at = cell * 3
+        tally = ONE if intensity is None else ONE + np.rint(intensity * BRIGHTEST).astype(np.int64)
+        np.add.at(sums, at, tally)
+        np.add.at(sums, at + 1, steps.astype(np.int64))
+        np.add.at(sums, at + 2, np.rint(steps * steps / QUANTUM).astype(np.int64))
+
+    def count(self, rows: slice = ALL) -> NDArray[np.int32]:
+        """Points in each cell (ny, nx); of some rows or all."""
+        return (self._sums[rows, :, 0] >> BITS).astype(np.int32)
 
     def mean_residual(self, rows: slice = ALL) -> Floats:
         """Mean height above reference or datum (ny, nx) [m], NaN in empty cells; of some rows or all.
 
         Source: Hartzell et al. (2015), Eq. 11, of residuals (EQUATIONS 6.5).
         """
-        count, residual = self._rows(self.count, rows), self._rows(self._residual, rows)
+        count = self.count(rows)
         mean_m = np.full(count.shape, np.nan)
-        np.divide(residual, count, out=mean_m, where=count > 0)
+        np.divide(self._sums[rows, :, 1], count * QUANTUM, out=mean_m, where=count > 0)
         return mean_m
 
     def intensity(self, rows: slice = ALL) -> Floats32:
         """Mean brightness of each cell (ny, nx), 0-1, NaN in empty cells and in scans that do not tell."""
-        count, brightness = self._rows(self.count, rows), self._rows(self._brightness, rows)
-        bright = np.full(count.shape, np.nan, np.float32)
-        np.divide(brightness, count, out=bright, where=brightness > 0)
+        tally = self._sums[rows, :, 0]
+        brightness = tally & (ONE - 1)
+        bright = np.full(tally.shape, np.nan, np.float32)
+        np.divide(brightness, (tally >> BITS) * BRIGHTEST, out=bright, where=brightness > 0, casting="same_kind")
         return bright
 
-    def spread(self) -> Floats32:
+    def spread(self, rows: slice = ALL) -> Floats32:
         """Standard deviation of the points in each cell (ny, nx) [m], NaN for fewer than two."""
-        spread_m = np.full(len(self.count), np.nan, np.float32)
-        several = np.flatnonzero(self.count > 1)
-        count = self.count[several].astype(np.float64)
-        centred = self._square[several] - self._residual[several] ** 2 / count
+        sums = self._sums[rows]
+        spread_m = np.full(sums.shape[:2], np.nan, np.float32)
+        several = sums[..., 0] >= 2 * ONE
+        tally, residual, square = sums[several].T
+        count = (tally >> BITS).astype(np.float64)
+        centred = square / QUANTUM - (residual / QUANTUM) ** 2 / count
         spread_m[several] = np.sqrt(np.maximum(centred, 0.0) / (count - 1))
-        return spread_m.reshape(self.grid.shape)
+        return spread_m
 
-    def random_variance(self, rows: slice = ALL) -> Floats32:
-        """Random variance of each cell's mean (ny, nx) [m²], NaN in empty cells; of some rows or all.
-
-        Source: Hartzell et al. (2015), Eq. 12.
-        """
-        count, variance = self._rows(self.count, rows), self._rows(self._variance, rows)
-        variance_m2 = np.full(count.shape, np.nan, np.float32)
-        seen = count > 0
-        variance_m2[seen] = variance[seen] / count[seen].astype(np.float64) ** 2
-        return variance_m2
-
-    def _rows(self, values: NDArray[T], rows: slice) -> NDArray[T]:
-        return values.reshape(self.grid.shape)[rows]
+    def memory(self) -> NDArray[np.float32]:
+        """Give the sums away: (ny, nx, 6), to be overwritten row by row once read."""
+        return self._sums.view(np.float32)
 
 
 class Stack:
@@ -127,19 +134,25 @@ class Stack:
         self._last: tuple[Floats32, Floats32] | None = None
 
     def add(
-        self, gridder: Gridder, correction_m: Floats32 | None = None, roughness_m2: Floats32 | None = None
+        self,
+        gridder: Gridder,
+        known: tuple[Floats32, Floats32] | None = None,
+        roughness_m2: Floats32 | None = None,
     ) -> None:
-        """Add a scan, its heights lowered by the correction (ny, nx).
+        """Add a scan.
 
-        `roughness_m2` of the reference it lies on, if any: then scans are also compared with each other.
+        `known`, on a reference: random variance of a shot and what to lower heights by, and the
+        `roughness_m2` of that reference, (ny, nx) each. Then scans are also compared with each other.
         """
-        count = gridder.count.reshape(self.grid.shape).astype(np.float64)
+        count = gridder.count().astype(np.float64)
         seen = count > 0
         self._seen += seen
         self._scans += 1
         self.count += count
         mean_m = gridder.mean_residual()
-        if correction_m is not None:
+        shot_m2 = np.zeros(self.grid.shape, np.float32)
+        if known is not None:
+            shot_m2, correction_m = known
             mean_m -= correction_m
         self._residual[seen] += mean_m[seen] * count[seen]
         bright = gridder.intensity()
@@ -147,10 +160,9 @@ class Stack:
         self._bright += np.nan_to_num(bright) * lit
         self._lit += lit
         if roughness_m2 is not None:
-            variance_m2 = gridder.random_variance()
-            variance_m2 += (roughness_m2 / np.maximum(count, 1)).astype(np.float32)
-            self._compare(mean_m.astype(np.float32), variance_m2)
-        self._variance[seen] += gridder.random_variance()[seen] * count[seen] ** 2
+            variance_m2 = (shot_m2 + roughness_m2) / np.maximum(count, 1)
+            self._compare(mean_m.astype(np.float32), variance_m2.astype(np.float32))
+        self._variance[seen] += shot_m2[seen] * count[seen]
         self._within += np.nan_to_num(gridder.spread()).astype(np.float64) ** 2 * np.maximum(count - 1, 0)
         self._freedom += np.maximum(count - 1, 0)
 

@@ -56,27 +56,43 @@ class Ground:
     rise_m: Floats32
     known: Bools
 
+    def height(self, column: Floats, row: Floats) -> Floats:
+        """Height of the surface below points (n,) [m], as `under`."""
+        nw, ne, sw, se, u, v = self._corners(column, row)
+        return self._height(nw + (ne - nw) * u, sw + (se - sw) * u, v)
+
     def under(self, column: Floats, row: Floats) -> tuple[Floats, Floats, Floats]:
         """Height [m] and rise per metre eastward and northward below points (n,).
 
         Points are in cells from the north-west corner of the grid; the answer means something where the
         point's own cell is known.
         """
-        nx, ny = self.grid.nx, self.grid.ny
-        # Half a cell within the border of the grid the last slope goes on.
-        left = np.clip((column - 0.5).astype(np.intp), 0, max(nx - 2, 0))
-        top = np.clip((row - 0.5).astype(np.intp), 0, max(ny - 2, 0))
-        u, v = column - 0.5 - left, row - 0.5 - top
-        flat = self.rise_m.ravel()
-        first = top * nx + left
-        right, below = min(nx - 1, 1), min(ny - 1, 1) * nx
-        nw, ne = flat[first].astype(np.float64), flat[first + right].astype(np.float64)
-        sw, se = flat[first + below].astype(np.float64), flat[first + below + right].astype(np.float64)
+        nw, ne, sw, se, u, v = self._corners(column, row)
         north_side, south_side = nw + (ne - nw) * u, sw + (se - sw) * u
-        height_m = self.datum_m + north_side + (south_side - north_side) * v
         east = ((ne - nw) * (1 - v) + (se - sw) * v) / self.grid.cell_m
         north = (north_side - south_side) / self.grid.cell_m
-        return height_m, east, north
+        return self._height(north_side, south_side, v), east, north
+
+    def cell_means(self, rows: slice) -> Floats:
+        """Mean height over each cell (r, nx) of some rows [m]."""
+        first = max(rows.start - 1, 0)
+        means = cell_means(self.rise_m[first : rows.stop + 1])
+        return self.datum_m + means[rows.start - first :][: rows.stop - rows.start]
+
+    def _height(self, north_side: Floats, south_side: Floats, v: Floats) -> Floats:
+        return self.datum_m + north_side + (south_side - north_side) * v
+
+    def _corners(self, column: Floats, row: Floats) -> tuple[Floats, ...]:
+        """Rise of the nodes around points (n,): nw, ne, sw, se, and how far east and south of nw, in cells."""
+        nx, ny = self.grid.nx, self.grid.ny
+        # Half a cell within the border of the grid the last slope goes on; -0.5 counts as nought.
+        left = np.minimum((column - 0.5).astype(np.intp), max(nx - 2, 0))
+        top = np.minimum((row - 0.5).astype(np.intp), max(ny - 2, 0))
+        first = top * nx + left
+        right, below = min(nx - 1, 1), min(ny - 1, 1) * nx
+        rises = [self.rise_m.ravel().take(first + there) for there in (0, right, below, below + right)]
+        nw, ne, sw, se = (rise.astype(np.float64) for rise in rises)
+        return nw, ne, sw, se, column - 0.5 - left, row - 0.5 - top
 
 
 def cell_means(nodes: Floats | Floats32) -> Floats:

@@ -201,8 +201,8 @@ def _measure(
             wait_for_weather=wait_for_weather,
         )
         gridder = gridder_for(gathered.setup, reference)
-        survey(gridder, reader.blocks(), gathered.setup, gathered.pose, progress)
-    if not gridder.count.any():
+        survey(gridder, reader.blocks(), gathered.pose, progress)
+    if not gridder.count().any():
         raise ScanError("no point falls on the grid: wrong scans.frame, SOP, CRS or units?")
     progress()
     levelled = levelled_to(site, gridder, gathered, reference)
