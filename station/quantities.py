@@ -227,6 +227,7 @@ class Reference:
     stable: Bools  # (ny, nx) found steep and without change
     habits: Habits  # of the station, as its scans show them
     seen: Floats32  # (ny, nx) share of its scans that saw the cell; NaN where unknown
+    nodes_m: Floats | None = None  # (ny, nx) elevation with the ring around it that `terrain.extend` adds
 
     @classmethod
     def given(cls, grid: Grid, version: str, elevation_m: Floats, stable: Bools | None = None) -> Reference:

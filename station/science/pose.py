@@ -121,20 +121,14 @@ class Frame:
 
 def _monomials(x: Axis, y: Axis, z: Axis, powers: Ints) -> Monomials[Axis]:
     """Every wanted monomial, each by one product of two smaller ones."""
-    made: Monomials[Axis] = {}
-
-    def make(i: int, j: int, k: int) -> Axis:
-        if (i, j, k) not in made:
-            if i:
-                made[i, j, k] = x if (i, j, k) == (1, 0, 0) else make(i - 1, j, k) * x
-            elif j:
-                made[i, j, k] = y if (j, k) == (1, 0) else make(i, j - 1, k) * y
-            else:
-                made[i, j, k] = z if k == 1 else make(i, j, k - 1) * z
-        return made[i, j, k]
-
+    made: Monomials[Axis] = {(1, 0, 0): x, (0, 1, 0): y, (0, 0, 1): z}
     for i, j, k in powers.tolist():
-        make(i, j, k)
+        path = [(i, j, k)]
+        while path[-1] not in made:  # down along x, then y, then z
+            i, j, k = path[-1]  # noqa: PLW2901 - the way down
+            path.append((i - 1, j, k) if i else (i, j - 1, k) if j else (i, j, k - 1))
+        for wanted, smaller in zip(path[-2::-1], path[:0:-1], strict=True):
+            made[wanted] = made[smaller] * (x if wanted[0] else y if wanted[1] else z)
     return made
 
 

@@ -9,6 +9,8 @@ from scipy import ndimage
 
 from station.quantities import Bools, Floats, Floats32, Grid, Reference
 
+BAND_ROWS = 128  # looked at together: what a store chunk is high
+
 
 def normal(slope_rad: Floats, aspect_rad: Floats) -> Floats:
     """Unit normal (n, 3) (east, north, up); aspect is the downslope direction, clockwise from north.
@@ -114,10 +116,21 @@ def nodes_for(means: Floats) -> Floats:
 
 def ground(reference: Reference) -> Ground:
     """Prepare a master surface for looking up."""
-    known = np.isfinite(reference.elevation_m)
-    datum_m = float(np.round(np.mean(reference.elevation_m, where=known))) if known.any() else 0.0
-    rise_m = extend((reference.elevation_m - datum_m).astype(np.float32))
-    return Ground(reference.grid, datum_m, np.nan_to_num(rise_m, copy=False), known)
+    known = np.zeros(reference.grid.shape, bool)
+    total_m = 0.0
+    bands = [slice(top, top + BAND_ROWS) for top in range(0, reference.grid.ny, BAND_ROWS)]
+    for rows in bands:
+        elevation_m = reference.elevation_m[rows]
+        known[rows] = np.isfinite(elevation_m)
+        total_m += float(np.sum(elevation_m, where=known[rows]))
+    datum_m = float(np.round(total_m / max(np.count_nonzero(known), 1)))
+    if reference.nodes_m is None:
+        rise_m = extend((reference.elevation_m[:] - datum_m).astype(np.float32))
+        return Ground(reference.grid, datum_m, np.nan_to_num(rise_m, copy=False), known)
+    rise_m = np.zeros(reference.grid.shape, np.float32)
+    for rows in bands:
+        rise_m[rows] = np.nan_to_num(reference.nodes_m[rows] - datum_m)
+    return Ground(reference.grid, datum_m, rise_m, known)
 
 
 def extend(values: Floats32) -> Floats32:

@@ -18,7 +18,7 @@ import numpy as np
 from station import __version__
 from station.archive import store
 from station.archive.layout import Series, kept_of
-from station.archive.reference import current, read_reference, write_reference
+from station.archive.reference import current, open_reference, write_reference
 from station.config import Site
 from station.errors import ScanError
 from station.pipeline import (
@@ -313,14 +313,14 @@ def reference_of(site: Site, version: str | None = None) -> Reference | None:
     if not isinstance(given, Path):
         made = current(series)
         newest = list(made)[-1] if made else None
-        return read_reference(series, version if version in made else newest)
-    held = read_reference(series)
+        return open_reference(series, version if version in made else newest)
+    held = open_reference(series)
     version = version_of_given(given)
     if held is None or held.version != version:
         elevation_m = nodes_for(read_geotiff(given, series.grid, series.crs))
         steep = ground.steep(elevation_m, series.grid.cell_m)
         write_reference(series, Reference.given(series.grid, version, elevation_m, steep))
-        held = read_reference(series)
+        held = open_reference(series)
     return held
 
 
