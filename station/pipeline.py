@@ -34,7 +34,7 @@ from station.science.terrain import smooth_gradient
 from station.science.view import Points, View
 
 NORMAL_MAD = 0.6744897501960817  # of a normal distribution with a standard deviation of one
-BAND_ROWS = 128  # the cells that are looked at together: what a store chunk is high
+BAND_ROWS = 64  # the cells that are looked at together: half of what a store chunk is high
 MARGIN_ROWS = 4  # rows beyond a band that its smoothed gradient looks at
 FEW_POINTS = 3
 MOVING_MOST = 400_000  # cells of moving ground that an adjustment looks at
@@ -75,9 +75,7 @@ def gridder_for(setup: Setup, reference: Reference | None) -> Gridder:
     return Gridder(setup.grid, reference, setup.position_m[2] if setup.position_m else 0.0)
 
 
-def survey(
-    gridder: Gridder, blocks: Iterable[Shots], pose: Pose, progress: Callable[[], None]
-) -> None:
+def survey(gridder: Gridder, blocks: Iterable[Shots], pose: Pose, progress: Callable[[], None]) -> None:
     """Lay every shot of a scan on the grid."""
     for shots in blocks:
         lay(gridder, to_map(shots, pose), shots.intensity)
@@ -138,9 +136,10 @@ def level(gridder: Gridder, setup: Setup, told: Told, reference: Reference, stab
 def _cells(gridder: Gridder, setup: Setup, of: Basis, reference: Reference, stable: Bools) -> Iterator[Cells]:
     """Give the cells of a scan that the reference knows, band by band; of too many moving ones a part."""
     grid = setup.grid
-    every = 1 + sum(np.count_nonzero(gridder.count(band)) for band in _bands(grid)) // MOVING_MOST
+    every = 1 + gridder.seen_cells() // MOVING_MOST
     for band in _bands(grid):
-        count = gridder.count(band)
+        sums = gridder.sums(band)
+        count = sums.count
         seen = (count > 0) & np.isfinite(reference.elevation_m[band])
         seen &= stable[band] | (
             np.add.outer(np.arange(*band.indices(grid.ny)), np.arange(grid.nx)) % every == 0
@@ -148,14 +147,14 @@ def _cells(gridder: Gridder, setup: Setup, of: Basis, reference: Reference, stab
         if not seen.any():
             continue
         view = _view(setup, band, seen, *_around(reference.elevation_m, band))
-        unlike = ground.looks_unlike(gridder.intensity(band)[seen], reference.intensity[band][seen])
+        unlike = ground.looks_unlike(sums.intensity()[seen], reference.intensity[band][seen])
         row, column = np.nonzero(seen)
         kept_out = ground.withheld(grid.x_m[column], grid.y_m[band][row])
         yield Cells(
             _felt(view, of),
             np.hypot(view.offset_m[0], view.offset_m[1]),
             ground.kinds(stable[band][seen], kept_out, view.tan_slope, unlike),
-            gridder.mean_residual(band)[seen],
+            sums.mean_residual()[seen],
             _random(view.shot_variance(setup.scanner, published=False), count[seen], reference, band, seen)
             + reference.random_variance_m2[band][seen],
         )
@@ -170,7 +169,7 @@ def on_reference(
     """
     variance_m2, correction_m = (np.zeros(setup.grid.shape, np.float32) for _ in range(2))
     for band in _bands(setup.grid):
-        seen = (gridder.count(band) > 0) & np.isfinite(reference.elevation_m[band])
+        seen = (gridder.sums(band).count > 0) & np.isfinite(reference.elevation_m[band])
         if not seen.any():
             continue
         if setup.position_m is None:
@@ -212,18 +211,24 @@ def measure(
         band = _Band.of(gridder, rows, above_m, setup.min_points)
         above_m = band.above_next_m
         told = judge.judge(band)
-        count[rows], spread_m[rows] = band.count, band.spread_m
+        whole = np.full((*band.seen.shape, 6), np.nan, np.float32)
+        whole[band.seen] = np.stack(
+            [
+                np.rint(told.elevation_m / KEPT_M) * KEPT_M,
+                told.change_m,
+                np.zeros_like(told.change_m),
+                told.sigma_m,
+                told.random_m,
+                np.zeros_like(told.change_m),
+            ],
+            axis=-1,
+        )
+        whole[..., 2] = band.spread_m
+        whole.view(np.int32)[..., 5] = band.count
+        memory[rows] = whole
         quality[rows][band.seen] = told.flags
-        for raster, values in (
-            (elevation_m, np.rint(told.elevation_m / KEPT_M) * KEPT_M),
-            (change_m, told.change_m),
-            (uncertainty_m, told.sigma_m),
-            (random_m, told.random_m),
-            *((terms[name], values) for name, values in told.terms.items()),
-        ):
-            whole = np.full(band.seen.shape, np.nan, np.float32)
-            whole[band.seen] = values
-            raster[rows] = whole
+        for name, values in told.terms.items():
+            terms[name][rows][band.seen] = values
     surface = Surface(grid, elevation_m, change_m, count, spread_m)
     return Measurement(surface, uncertainty_m, random_m, quality, terms)
 
@@ -233,8 +238,9 @@ def stable_figures(measured: Measurement) -> dict[str, float]:
     surface = measured.surface
     chosen = (measured.quality & Quality.STABLE_GROUND) > 0
     row, column = np.nonzero(chosen)
-    chosen[row, column] = ground.withheld(surface.grid.x_m[column], surface.grid.y_m[row])
-    change_m, sigma_m = surface.change_m[chosen], measured.uncertainty_m[chosen]
+    unused = ground.withheld(surface.grid.x_m[column], surface.grid.y_m[row])
+    row, column = row[unused], column[unused]
+    change_m, sigma_m = surface.change_m[row, column], measured.uncertainty_m[row, column]
     figures = {"stable_count": float(len(change_m))}
     if len(change_m) >= FEW_STABLE:
         figures["stable_median"] = float(np.median(change_m))
@@ -285,15 +291,15 @@ class _Band:
     def of(cls, gridder: Gridder, rows: slice, above_m: Floats, min_points: int) -> _Band:
         """Take rows off the sums; those above, whose sums have given way, are told."""
         ahead = slice(rows.start, min(rows.stop + MARGIN_ROWS, gridder.grid.ny))
-        residual_m = gridder.mean_residual(ahead)
-        residual_m[gridder.count(ahead) < min_points] = np.nan
+        sums, height = gridder.sums(ahead), rows.stop - rows.start
+        residual_m = sums.mean_residual()
+        residual_m[sums.count < min_points] = np.nan
         known, below_m = gridder.below_cells(ahead)
-        height = rows.stop - rows.start
         return cls(
             rows,
-            gridder.count(rows),
-            gridder.spread(rows),
-            gridder.intensity(rows),
+            sums.count[:height],
+            sums.spread()[:height],
+            sums.intensity()[:height],
             known[:height],
             residual_m[:height],
             np.concatenate([above_m, residual_m + below_m]),
@@ -347,7 +353,9 @@ class _Judge:
         shared_m2, correction_m, terms = np.zeros_like(count), np.zeros_like(count), dict[str, Floats]()
         if setup.position_m is None:
             shot_m2 = np.full(len(count), setup.scanner.range_sigma_m**2)
-            random_m2 = np.maximum(np.nan_to_num(band.spread_m[seen].astype(np.float64)) ** 2, shot_m2) / count
+            random_m2 = (
+                np.maximum(np.nan_to_num(band.spread_m[seen].astype(np.float64)) ** 2, shot_m2) / count
+            )
         else:
             view = self._view(band)
             flags |= np.where(view.cos_incidence < HIGH_INCIDENCE_COS, Quality.HIGH_INCIDENCE, 0)
@@ -381,7 +389,7 @@ class _Judge:
     def _shared(
         self, view: View, count: Floats, sampling_m2: Floats
     ) -> tuple[Floats, Floats, dict[str, Floats]]:
-        """Return what cells share with others [m²], what the adjustment takes off [m], and terms asked for [m]."""
+        """Return what cells share with others [m²], what the adjustment takes off [m], and terms [m]."""
         setup, unknown = self.setup, self.unknown
         shared_m2, correction_m, terms = np.zeros_like(count), np.zeros_like(count), dict[str, Floats]()
         if setup.store_terms and setup.published_budget:
@@ -411,7 +419,7 @@ class _Judge:
 
 
 def _around(elevation_m: Floats, rows: slice) -> tuple[Floats, int]:
-    """Return some rows of a surface (ny, nx) with those beyond that smoothing looks at; which is the first."""
+    """Return some rows of a surface (ny, nx) with those that smoothing looks at, and which is the first."""
     first = max(rows.start - MARGIN_ROWS, 0)
     return elevation_m[first : rows.stop + MARGIN_ROWS], rows.start - first
 

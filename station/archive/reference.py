@@ -27,7 +27,7 @@ _ROWS = (
     ),
     Variable(
         "reference_node", ("y", "x"), "f4", "elevation of the reference surface and of a ring around it", "m",
-        None, 3, None, "what lies beyond the known cells goes on as these do: to look up heights at their rim",
+        None, 3, None, "beyond the known cells it goes on as they do: for heights at their rim",
     ),
     Variable(
         "reference_random_uncertainty", ("y", "x"), "f4", "random uncertainty of the reference surface", "m",

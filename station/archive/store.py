@@ -267,7 +267,7 @@ def _write(file: netCDF4.Dataset, series: Series, epoch: Epoch, name: str) -> No
 
 def _rasters(measured: Measurement) -> list[tuple[Variable, np.ndarray[Any, Any]]]:
     """Return what lies on the grid, by variable."""
-    rasters = {
+    rasters: dict[str, np.ndarray[Any, Any]] = {
         "elevation": measured.surface.elevation_m,
         "elevation_change": measured.surface.change_m,
         "elevation_change_uncertainty": measured.uncertainty_m,

@@ -91,7 +91,9 @@ class LasScan:
         check = _Check(self._layout, self._range_max_m)
         together = BLOCKS_AT_ONCE * size
         stretches = range(0, self._layout.count, together)
-        rooms = np.empty((2, together * self._layout.record_bytes), np.uint8)  # one is filled, one is looked at
+        rooms = np.empty(
+            (2, together * self._layout.record_bytes), np.uint8
+        )  # one is filled, one is looked at
         with self._points(all_cores=True) as points, ThreadPoolExecutor(1) as ahead:
             coming = ahead.submit(points.read, min(together, self._layout.count), rooms[0])
             for number, first in enumerate(stretches, start=1):
@@ -197,7 +199,7 @@ class _Points:
         with foreign_code(f"corrupt after point {self.at:,}"):
             if self._decompressor is not None:
                 self._decompressor.decompress_many(raw)
-            elif self._file.readinto(raw) != length:
+            elif self._file.readinto(raw.data) != length:
                 raise ScanError(f"cut off: ends before point {self.at + count:,} of {self._layout.count:,}")
         self.at += count
         return np.frombuffer(raw, dtype=self._layout.record)

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, TypeVar
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,8 +22,48 @@ ONE = 1 << BITS
 STEP_MOST = 6.0  # sigmas: beyond, something happened
 CLASS_STEPS = 10.0  # what the class of a cell weighs against the steps from scan to scan of its own
 ALL = slice(None)
-T = TypeVar("T", bound=np.generic)
 ROUGHNESS_CELLS = 1.0  # one sigma of the neighbourhood that tells how rough a cell is
+
+
+@dataclass(frozen=True)
+class Sums:
+    """What the points of cells amount to, (ny, nx) each."""
+
+    tally: Ints  # number of points, and below `BITS` their brightness
+    residual: Ints
+    square: Ints
+
+    @property
+    def count(self) -> NDArray[np.int32]:
+        """Points in each cell (ny, nx)."""
+        return (self.tally >> BITS).astype(np.int32)
+
+    def mean_residual(self) -> Floats:
+        """Mean height above reference or datum (ny, nx) [m], NaN in empty cells.
+
+        Source: Hartzell et al. (2015), Eq. 11, of residuals (EQUATIONS 6.5).
+        """
+        count = self.count
+        mean_m = np.full(count.shape, np.nan)
+        np.divide(self.residual, count * QUANTUM, out=mean_m, where=count > 0)
+        return mean_m
+
+    def intensity(self) -> Floats32:
+        """Mean brightness of each cell (ny, nx), 0-1, NaN in empty cells and in scans that do not tell."""
+        brightness = self.tally & (ONE - 1)
+        bright = np.full(brightness.shape, np.nan, np.float32)
+        whole = self.count * BRIGHTEST
+        np.divide(brightness, whole, out=bright, where=brightness > 0, casting="same_kind")
+        return bright
+
+    def spread(self) -> Floats32:
+        """Standard deviation of the points in each cell (ny, nx) [m], NaN for fewer than two."""
+        spread_m = np.full(self.tally.shape, np.nan, np.float32)
+        several = self.tally >= 2 * ONE
+        count = (self.tally[several] >> BITS).astype(np.float64)
+        centred = self.square[several] / QUANTUM - (self.residual[several] / QUANTUM) ** 2 / count
+        spread_m[several] = np.sqrt(np.maximum(centred, 0.0) / (count - 1))
+        return spread_m
 
 
 class Gridder:
@@ -48,9 +89,7 @@ class Gridder:
         """
         column = (x_m - self.grid.west_m) / self.grid.cell_m
         row = (self.grid.north_m - y_m) / self.grid.cell_m
-        inside = np.flatnonzero(
-            (column >= 0) & (column < self.grid.nx) & (row >= 0) & (row < self.grid.ny)
-        )
+        inside = np.flatnonzero((column >= 0) & (column < self.grid.nx) & (row >= 0) & (row < self.grid.ny))
         return inside, column[inside], row[inside]
 
     def flat(self, column: Floats, row: Floats) -> Ints:
@@ -67,7 +106,7 @@ class Gridder:
     def below_cells(self, rows: slice) -> tuple[Bools, Floats]:
         """Whether the reference is known (r, nx) in some rows, and the mean height [m] residuals are from."""
         if self.ground is None:
-            shape = self.count(rows).shape
+            shape = self._sums[rows].shape[:2]
             return np.zeros(shape, bool), np.full(shape, self.datum_m)
         known = self.ground.known[rows]
         return known, np.where(known, self.ground.cell_means(rows), self.datum_m)
@@ -82,38 +121,13 @@ class Gridder:
         np.add.at(sums, at + 1, steps.astype(np.int64))
         np.add.at(sums, at + 2, np.rint(steps * steps / QUANTUM).astype(np.int64))
 
-    def count(self, rows: slice = ALL) -> NDArray[np.int32]:
-        """Points in each cell (ny, nx); of some rows or all."""
-        return (self._sums[rows, :, 0] >> BITS).astype(np.int32)
+    def sums(self, rows: slice = ALL) -> Sums:
+        """Take a copy of some rows, or all."""
+        return Sums(*np.ascontiguousarray(np.moveaxis(self._sums[rows], -1, 0)))
 
-    def mean_residual(self, rows: slice = ALL) -> Floats:
-        """Mean height above reference or datum (ny, nx) [m], NaN in empty cells; of some rows or all.
-
-        Source: Hartzell et al. (2015), Eq. 11, of residuals (EQUATIONS 6.5).
-        """
-        count = self.count(rows)
-        mean_m = np.full(count.shape, np.nan)
-        np.divide(self._sums[rows, :, 1], count * QUANTUM, out=mean_m, where=count > 0)
-        return mean_m
-
-    def intensity(self, rows: slice = ALL) -> Floats32:
-        """Mean brightness of each cell (ny, nx), 0-1, NaN in empty cells and in scans that do not tell."""
-        tally = self._sums[rows, :, 0]
-        brightness = tally & (ONE - 1)
-        bright = np.full(tally.shape, np.nan, np.float32)
-        np.divide(brightness, (tally >> BITS) * BRIGHTEST, out=bright, where=brightness > 0, casting="same_kind")
-        return bright
-
-    def spread(self, rows: slice = ALL) -> Floats32:
-        """Standard deviation of the points in each cell (ny, nx) [m], NaN for fewer than two."""
-        sums = self._sums[rows]
-        spread_m = np.full(sums.shape[:2], np.nan, np.float32)
-        several = sums[..., 0] >= 2 * ONE
-        tally, residual, square = sums[several].T
-        count = (tally >> BITS).astype(np.float64)
-        centred = square / QUANTUM - (residual / QUANTUM) ** 2 / count
-        spread_m[several] = np.sqrt(np.maximum(centred, 0.0) / (count - 1))
-        return spread_m
+    def seen_cells(self) -> int:
+        """Return how many cells have points."""
+        return int(np.count_nonzero(self._sums[..., 0]))
 
     def memory(self) -> NDArray[np.float32]:
         """Give the sums away: (ny, nx, 6), to be overwritten row by row once read."""
@@ -144,18 +158,19 @@ class Stack:
         `known`, on a reference: random variance of a shot and what to lower heights by, and the
         `roughness_m2` of that reference, (ny, nx) each. Then scans are also compared with each other.
         """
-        count = gridder.count().astype(np.float64)
+        sums = gridder.sums()
+        count = sums.count.astype(np.float64)
         seen = count > 0
         self._seen += seen
         self._scans += 1
         self.count += count
-        mean_m = gridder.mean_residual()
+        mean_m = sums.mean_residual()
         shot_m2 = np.zeros(self.grid.shape, np.float32)
         if known is not None:
             shot_m2, correction_m = known
             mean_m -= correction_m
         self._residual[seen] += mean_m[seen] * count[seen]
-        bright = gridder.intensity()
+        bright = sums.intensity()
         lit = np.where(np.isfinite(bright), count, 0).astype(np.float32)
         self._bright += np.nan_to_num(bright) * lit
         self._lit += lit
@@ -163,7 +178,7 @@ class Stack:
             variance_m2 = (shot_m2 + roughness_m2) / np.maximum(count, 1)
             self._compare(mean_m.astype(np.float32), variance_m2.astype(np.float32))
         self._variance[seen] += shot_m2[seen] * count[seen]
-        self._within += np.nan_to_num(gridder.spread()).astype(np.float64) ** 2 * np.maximum(count - 1, 0)
+        self._within += np.nan_to_num(sums.spread()).astype(np.float64) ** 2 * np.maximum(count - 1, 0)
         self._freedom += np.maximum(count - 1, 0)
 
     def _compare(self, mean_m: Floats32, variance_m2: Floats32) -> None:

@@ -103,7 +103,8 @@ class Frame:
         whole = _monomials(x, y, z, self.powers[linear])
         mapped_m = self._sum(whole, linear, [np.full_like(x, origin) for origin in self.position_m])
         # What bends is metres: 24 bits hold it to a micrometre, at half the cost.
-        single = _monomials(*(axis.astype(np.float32) for axis in (x, y, z)), self.powers[~linear])
+        singles = x.astype(np.float32), y.astype(np.float32), z.astype(np.float32)
+        single = _monomials(*singles, self.powers[~linear])
         bent_m = self._sum(single, ~linear, [np.zeros(len(x), np.float32) for _ in range(3)])
         return mapped_m[0] + bent_m[0], mapped_m[1] + bent_m[1], mapped_m[2] + bent_m[2]
 

@@ -85,7 +85,7 @@ class Ground:
         return self.datum_m + north_side + (south_side - north_side) * v
 
     def _corners(self, column: Floats, row: Floats) -> tuple[Floats, ...]:
-        """Rise of the nodes around points (n,): nw, ne, sw, se, and how far east and south of nw, in cells."""
+        """Rise of the nodes nw, ne, sw, se of points (n,); how far east and south of nw they are, in cells."""
         nx, ny = self.grid.nx, self.grid.ny
         # Half a cell within the border of the grid the last slope goes on; -0.5 counts as nought.
         left = np.minimum((column - 0.5).astype(np.intp), max(nx - 2, 0))
@@ -123,7 +123,7 @@ def ground(reference: Reference) -> Ground:
         elevation_m = reference.elevation_m[rows]
         known[rows] = np.isfinite(elevation_m)
         total_m += float(np.sum(elevation_m, where=known[rows]))
-    datum_m = float(np.round(total_m / max(np.count_nonzero(known), 1)))
+    datum_m = float(np.round(total_m / max(int(np.count_nonzero(known)), 1)))
     if reference.nodes_m is None:
         rise_m = extend((reference.elevation_m[:] - datum_m).astype(np.float32))
         return Ground(reference.grid, datum_m, np.nan_to_num(rise_m, copy=False), known)

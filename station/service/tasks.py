@@ -202,7 +202,7 @@ def _measure(
         )
         gridder = gridder_for(gathered.setup, reference)
         survey(gridder, reader.blocks(), gathered.pose, progress)
-    if not gridder.count().any():
+    if not gridder.seen_cells():
         raise ScanError("no point falls on the grid: wrong scans.frame, SOP, CRS or units?")
     progress()
     levelled = levelled_to(site, gridder, gathered, reference)
