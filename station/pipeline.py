@@ -80,6 +80,7 @@ def survey(gridder: Gridder, blocks: Iterable[Shots], pose: Pose, progress: Call
     for shots in blocks:
         lay(gridder, to_map(shots, pose), shots.intensity)
         progress()
+    gridder.complete()
 
 
 def to_map(shots: Shots, pose: Pose) -> Points:
@@ -236,8 +237,7 @@ def measure(
 def stable_figures(measured: Measurement) -> dict[str, float]:
     """Return how a scan does on stable ground it was not fitted to: number of cells, median, spread, z."""
     surface = measured.surface
-    chosen = (measured.quality & Quality.STABLE_GROUND) > 0
-    row, column = np.nonzero(chosen)
+    row, column = np.nonzero(measured.flagged(Quality.STABLE_GROUND))
     unused = ground.withheld(surface.grid.x_m[column], surface.grid.y_m[row])
     row, column = row[unused], column[unused]
     change_m, sigma_m = surface.change_m[row, column], measured.uncertainty_m[row, column]

@@ -207,6 +207,10 @@ class Measurement:
     quality: NDArray[np.uint8]  # bits of Quality
     terms: dict[str, Floats32]
 
+    def flagged(self, flag: Quality) -> Bools:
+        """Tell which cells (ny, nx) have a bit set."""
+        return np.asarray((self.quality & np.uint8(flag)) > 0)
+
 
 @dataclass(frozen=True)
 class Reference:
@@ -227,7 +231,7 @@ class Reference:
     stable: Bools  # (ny, nx) found steep and without change
     habits: Habits  # of the station, as its scans show them
     seen: Floats32  # (ny, nx) share of its scans that saw the cell; NaN where unknown
-    nodes_m: Floats | None = None  # (ny, nx) elevation with the ring around it that `terrain.extend` adds
+    nodes_m: Floats32 | None = None  # (ny, nx) elevation with the ring around it that `terrain.extend` adds
 
     @classmethod
     def given(cls, grid: Grid, version: str, elevation_m: Floats, stable: Bools | None = None) -> Reference:

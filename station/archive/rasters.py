@@ -155,6 +155,6 @@ class Raster:
                         raw = isal_zlib.decompress(os.pread(file.fileno(), size, at))
                         tile = _unshuffled(raw, self._stored).reshape(height, width)
                         rows[:, left : left + width] = tile[: len(rows), : nx - left]
-        except (OSError, ValueError, IsalError) as error:
+        except (OSError, ValueError, IsalError) as error:  # type: ignore[misc] # the stub has no class
             raise StoreError(f"{self._path}: damaged, cannot be read: {error}") from error
         return self._made(rows)

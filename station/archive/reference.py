@@ -278,7 +278,7 @@ def _filled(values: np.ndarray[Any, Any], fill: float = np.nan) -> Floats32:
 
 _HELD: tuple[tuple[str, str, Callable[[np.ndarray[Any, Any]], np.ndarray[Any, Any]]], ...] = (
     ("elevation_m", "reference_elevation", lambda values: _filled(values).astype(np.float64)),
-    ("nodes_m", "reference_node", lambda values: _filled(values).astype(np.float64)),
+    ("nodes_m", "reference_node", _filled),
     ("random_variance_m2", "reference_random_uncertainty", lambda values: _filled(values) ** 2),
     ("roughness_m2", "reference_roughness", lambda values: _filled(values) ** 2),
     ("variance_factor", "reference_variance_factor", lambda values: _filled(values, 1.0)),

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from station.science.terrain import Ground, ground
+from station.science.terrain import Ground, ground, means_below
 
 if TYPE_CHECKING:
     from station.quantities import Bools, Floats, Floats32, Grid, Ints, Reference
@@ -76,7 +76,9 @@ class Gridder:
     def __init__(self, grid: Grid, reference: Reference | None, datum_m: float) -> None:
         """Heights in cells without reference are taken from `datum_m`, to keep their sums small."""
         self.grid = grid
+        self._reference = reference
         self.ground: Ground | None = ground(reference) if reference else None
+        self._ground_datum_m = 0.0
         self.datum_m = float(np.round(datum_m))
         # Of a cell side by side, for it is they that a shot has to wait for: number of points and brightness
         # in one, heights, and their squares.
@@ -105,11 +107,19 @@ class Gridder:
 
     def below_cells(self, rows: slice) -> tuple[Bools, Floats]:
         """Whether the reference is known (r, nx) in some rows, and the mean height [m] residuals are from."""
-        if self.ground is None:
+        if self._reference is None:
             shape = self._sums[rows].shape[:2]
             return np.zeros(shape, bool), np.full(shape, self.datum_m)
-        known = self.ground.known[rows]
-        return known, np.where(known, self.ground.cell_means(rows), self.datum_m)
+        if self.ground is not None:
+            known, means_m = self.ground.known[rows], self.ground.cell_means(rows)
+        else:
+            known, means_m = means_below(self._reference, self._ground_datum_m, rows)
+        return known, np.where(known, means_m, self.datum_m)
+
+    def complete(self) -> None:
+        """No more points come: let the ground go that only they need, where it can be had by rows."""
+        if self.ground is not None and self._reference is not None and self._reference.nodes_m is not None:
+            self._ground_datum_m, self.ground = self.ground.datum_m, None
 
     def add(self, cell: Ints, residual_m: Floats, intensity: Floats | None) -> None:
         """Add points (n,): their cell, height above reference or datum, and brightness, 0-1."""

@@ -77,15 +77,14 @@ class Ground:
 
     def cell_means(self, rows: slice) -> Floats:
         """Mean height over each cell (r, nx) of some rows [m]."""
-        first = max(rows.start - 1, 0)
-        means = cell_means(self.rise_m[first : rows.stop + 1])
-        return self.datum_m + means[rows.start - first :][: rows.stop - rows.start]
+        around = _around(rows)
+        return self.datum_m + cell_means(self.rise_m[around])[rows.start - around.start :][: _height(rows)]
 
     def _height(self, north_side: Floats, south_side: Floats, v: Floats) -> Floats:
         return self.datum_m + north_side + (south_side - north_side) * v
 
     def _corners(self, column: Floats, row: Floats) -> tuple[Floats, ...]:
-        """Rise of the nodes nw, ne, sw, se of points (n,); how far east and south of nw they are, in cells."""
+        """Rise of the nodes nw, ne, sw, se of points (n,); how far east and south of nw they are [cells]."""
         nx, ny = self.grid.nx, self.grid.ny
         # Half a cell within the border of the grid the last slope goes on; -0.5 counts as nought.
         left = np.minimum((column - 0.5).astype(np.intp), max(nx - 2, 0))
@@ -102,6 +101,26 @@ def cell_means(nodes: Floats | Floats32) -> Floats:
     around = np.pad(np.asarray(nodes, dtype=np.float64), 1, mode="reflect", reflect_type="odd")
     rows = (around[:-2] + 6 * around[1:-1] + around[2:]) / 8
     return np.asarray((rows[:, :-2] + 6 * rows[:, 1:-1] + rows[:, 2:]) / 8)
+
+
+def means_below(reference: Reference, datum_m: float, rows: slice) -> tuple[Bools, Floats]:
+    """Which cells (r, nx) of some rows a master surface knows, and its mean height over each [m].
+
+    As `Ground.cell_means`, of a reference that has its nodes, without the whole of them in memory.
+    """
+    assert reference.nodes_m is not None  # noqa: S101 - the caller's case
+    around = _around(rows)
+    rise_m = np.nan_to_num(reference.nodes_m[around] - datum_m).astype(np.float32)
+    means_m = datum_m + cell_means(rise_m)[rows.start - around.start :][: _height(rows)]
+    return np.isfinite(reference.elevation_m[rows]), means_m
+
+
+def _around(rows: slice) -> slice:
+    return slice(max(rows.start - 1, 0), rows.stop + 1)
+
+
+def _height(rows: slice) -> int:
+    return int(rows.stop - rows.start)
 
 
 def nodes_for(means: Floats) -> Floats:

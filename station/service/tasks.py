@@ -390,7 +390,7 @@ def _figures(epoch: store.Epoch, seconds: float) -> dict[str, float | str]:
     change_m = measured.surface.change_m[np.isfinite(measured.surface.change_m)]
     if len(change_m):
         told["change_median_m"] = round(float(np.median(change_m)), 4)
-        significant = (measured.quality & Quality.CHANGE_SIGNIFICANT) > 0
+        significant = measured.flagged(Quality.CHANGE_SIGNIFICANT)
         told["significant_pct"] = round(100 * float(significant.sum()) / len(change_m), 1)
     for figure in ("stable_nmad", "stable_z_std"):
         if np.isfinite(epoch.numbers.get(figure, np.nan)):
