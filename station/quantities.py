@@ -174,16 +174,14 @@ class Surface:
     """One scan on the grid.
 
     `change_m` is the mean residual to the reference, NaN where there is none; everything is NaN (or zero
-    points) where the scan saw nothing. `random_variance_m2` is of the cell's mean and averages out over
-    cells; what does not average out is in `shared`, through the sensitivities of EQUATIONS 6.1.
+    points) where the scan saw nothing.
     """
 
     grid: Grid
-    elevation_m: Floats  # (ny, nx)
+    elevation_m: Floats32  # (ny, nx)
     change_m: Floats32  # (ny, nx)
     count: NDArray[np.int32]  # (ny, nx)
     spread_m: Floats32  # (ny, nx) standard deviation of the points in the cell
-    random_variance_m2: Floats32  # (ny, nx)
 
 
 class Quality(IntFlag):
@@ -210,6 +208,10 @@ class Measurement:
     quality: NDArray[np.uint8]  # bits of Quality
     terms: dict[str, Floats32]
 
+    def flagged(self, flag: Quality) -> Bools:
+        """Tell which cells (ny, nx) have a bit set."""
+        return np.asarray((self.quality & np.uint8(flag)) > 0)
+
 
 @dataclass(frozen=True)
 class Reference:
@@ -230,6 +232,7 @@ class Reference:
     stable: Bools  # (ny, nx) found steep and without change
     habits: Habits  # of the station, as its scans show them
     seen: Floats32  # (ny, nx) share of its scans that saw the cell; NaN where unknown
+    nodes_m: Floats32 | None = None  # (ny, nx) elevation with the ring around it that `terrain.extend` adds
 
     @classmethod
     def given(cls, grid: Grid, version: str, elevation_m: Floats, stable: Bools | None = None) -> Reference:

@@ -1,13 +1,14 @@
 """One scan from shots to surface, against shots made here from first principles."""
 
 import math
+from copy import deepcopy
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from station import pipeline
-from station.pipeline import Pose, Setup, Told, gridder_for, level, measure, survey
+from station.pipeline import Pose, Setup, Told, gridder_for, level, measure, on_reference, survey
 from station.quantities import Air, Grid, Habits, Quality, Reference, Scanner, Shots, Tilt
 from station.science import budget
 from station.science.air import air_correction
@@ -62,8 +63,8 @@ def scanned(shots, reference, unknown=None, **settings):
     sop[:3, 3] = SCANNER
     setup = Setup(VZ6000, GRID, SCANNER, **settings)
     gridder = gridder_for(setup, reference)
-    survey(gridder, [shots], setup, Pose(frame_in_local_map(sop), None, None), lambda: None)
-    return measure(gridder, setup, unknown, reference), gridder, setup
+    survey(gridder, [shots], Pose(frame_in_local_map(sop), None, None), lambda: None)
+    return measure(deepcopy(gridder), setup, unknown, reference), gridder, setup
 
 
 def test_without_errors_the_surface_is_the_truth():
@@ -99,7 +100,7 @@ def test_a_master_from_scans_finds_the_truth_and_its_own_error():
         stack = Stack(GRID)
         for shots in scans:
             _, gridder, setup = scanned(shots, made)
-            stack.add(gridder)
+            stack.add(gridder, made and on_reference(gridder, setup, made, None))
         made = master(stack, made, [None], setup.position_m, "1", ("a",), Habits())
     error = made.elevation_m - height(x_m, y_m)
     assert np.nanmedian(error) == pytest.approx(0.0, abs=1e-3)
@@ -117,7 +118,8 @@ def test_roughness_within_cells_is_found():
     for seed in range(3):
         shots = shots_at(*spots(300_000, seed), seed=seed)
         rough = Shots(shots.x_m, shots.y_m, shots.z_m + rng.normal(0, 0.2, len(shots)), None)
-        stack.add(scanned(rough, made)[1])
+        _, gridder, setup = scanned(rough, made)
+        stack.add(gridder, on_reference(gridder, setup, made, None))
     several = stack.count > 10
     assert np.sqrt(stack.roughness()[several].mean()) == pytest.approx(0.2, rel=0.05)
 
@@ -183,10 +185,10 @@ def test_blocks_and_order_change_nothing():
         gridder = gridder_for(setup, None)
         columns = [np.split(axis[order], splits) for axis in (shots.x_m, shots.y_m, shots.z_m, time_s)]
         blocks = [Shots(*block) for block in zip(*columns, strict=True)]
-        survey(gridder, blocks, setup, Pose(frame, tilt, air), lambda: None)
+        survey(gridder, blocks, Pose(frame, tilt, air), lambda: None)
         made.append(measure(gridder, setup, None, None))
     assert (made[0].surface.count > 0).mean() > 0.3
-    for name in ("elevation_m", "count", "spread_m", "random_variance_m2"):
+    for name in ("elevation_m", "count", "spread_m"):
         one, other = (getattr(measured.surface, name) for measured in made)
         assert np.array_equal(one, other, equal_nan=True), name
     assert np.array_equal(made[0].uncertainty_m, made[1].uncertainty_m, equal_nan=True)

@@ -4,23 +4,30 @@ from __future__ import annotations
 
 import json
 import os
-from dataclasses import asdict, dataclass, fields
+from collections.abc import Callable, Iterator
+from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
 import netCDF4
 import numpy as np
 
-from station.archive.layout import Series, attributes, lay_out, put_raster, strings, written_whole
+from station.archive.layout import Series, define, lay_out, strings, written_whole
+from station.archive.rasters import Raster, write_rasters
 from station.archive.variables import FILL, Variable
 from station.errors import StoreError
-from station.quantities import Floats32, Habits, Reference, Shared
+from station.quantities import Floats, Floats32, Habits, Reference, Shared
+from station.science.terrain import extend
 
 HABIT = "habit_"  # of the station, one sigma each, attributes of the file
 _ROWS = (
     Variable(
         "reference_elevation", ("y", "x"), "f4", "elevation of the reference surface at the cell centre", "m",
         "surface_altitude", 3, None, "bilinear between cell centres",
+    ),
+    Variable(
+        "reference_node", ("y", "x"), "f4", "elevation of the reference surface and of a ring around it", "m",
+        None, 3, None, "beyond the known cells it goes on as they do: for heights at their rim",
     ),
     Variable(
         "reference_random_uncertainty", ("y", "x"), "f4", "random uncertainty of the reference surface", "m",
@@ -63,6 +70,7 @@ _ROWS = (
         comment="units are products of parameter_unit",
     ),
 )  # fmt: skip
+_BY_NAME = {row.name: row for row in _ROWS}
 
 
 @dataclass(frozen=True)
@@ -126,38 +134,51 @@ def write_reference(series: Series, reference: Reference, lineage: Lineage | Non
     """
     lineage = lineage or Lineage(reference.version)
     kept = path_of(series, reference.version)
-    with written_whole(kept) as beside, netCDF4.Dataset(beside, "w", clobber=False) as file:
-        shared = reference.shared
-        parameters = (shared.names, shared.units) if shared is not None else ((), ())
-        lay_out(file, series, f"Reference surface of {series.name or series.station_id}", None, parameters)
-        file.setncatts({"reference_version": reference.version, "scan_ids": " ".join(reference.scan_ids)})
-        file.setncatts({"base": lineage.base, "science_hash": lineage.science_hash})
-        file.setncatts({"replaces": " ".join(lineage.replaces)})
-        file.setncatts({"made_from": json.dumps(lineage.made_from)})
-        file.setncatts({f"{HABIT}{name}": value for name, value in asdict(reference.habits).items()})
-        values = {
-            "reference_elevation": reference.elevation_m,
-            "reference_random_uncertainty": np.sqrt(reference.random_variance_m2),
-            "reference_roughness": np.sqrt(reference.roughness_m2),
-            "reference_variance_factor": reference.variance_factor,
-            "reference_intensity": reference.intensity,
-            "reference_stable": reference.stable.astype(np.int8),
-            "reference_seen": reference.seen,
-        }
-        for row in _ROWS:
-            if any(dim not in file.dimensions for dim in row.dims):
-                continue
-            variable = file.createVariable(
-                row.name, row.dtype, row.dims, compression="zlib", complevel=1, shuffle=True,
-                fill_value=FILL if row.dtype[0] == "f" else None, least_significant_digit=row.digits,
-            )  # fmt: skip
-            variable.setncatts(attributes(row, mapped=series.crs is not None))
-            if row.is_raster:
-                put_raster(variable, None, values[row.name])
-            elif shared is not None:
-                noise = row.name == "shared_parameter_noise_variance"
-                variable[:] = shared.noise_variance if noise else shared.covariance
+    with written_whole(kept) as beside:
+        with netCDF4.Dataset(beside, "w", clobber=False) as file:
+            _write(file, series, reference, lineage)
+        write_rasters(beside, _rasters(reference))
     _name_newest(series, kept)
+
+
+def _write(file: netCDF4.Dataset, series: Series, reference: Reference, lineage: Lineage) -> None:
+    """Write all but the rasters, for which there is room."""
+    shared = reference.shared
+    parameters = (shared.names, shared.units) if shared is not None else ((), ())
+    lay_out(file, series, f"Reference surface of {series.name or series.station_id}", None, parameters)
+    file.setncatts({"reference_version": reference.version, "scan_ids": " ".join(reference.scan_ids)})
+    file.setncatts({"base": lineage.base, "science_hash": lineage.science_hash})
+    file.setncatts({"replaces": " ".join(lineage.replaces)})
+    file.setncatts({"made_from": json.dumps(lineage.made_from)})
+    file.setncatts({f"{HABIT}{name}": value for name, value in asdict(reference.habits).items()})
+    for row in _ROWS:
+        if all(dim in file.dimensions for dim in row.dims):
+            define(file, row, series, 1)
+    if shared is not None:
+        file["shared_parameter_covariance"][:] = shared.covariance
+        file["shared_parameter_noise_variance"][:] = shared.noise_variance
+
+
+def _rasters(reference: Reference) -> Iterator[tuple[Variable, np.ndarray[Any, Any]]]:
+    """Give what lies on the grid, by variable."""
+    for name, values in (
+        ("reference_elevation", reference.elevation_m),
+        ("reference_node", _nodes(reference)),
+        ("reference_random_uncertainty", np.sqrt(reference.random_variance_m2)),
+        ("reference_roughness", np.sqrt(reference.roughness_m2)),
+        ("reference_variance_factor", reference.variance_factor),
+        ("reference_intensity", reference.intensity),
+        ("reference_stable", reference.stable),
+        ("reference_seen", reference.seen),
+    ):
+        yield _BY_NAME[name], values
+
+
+def _nodes(reference: Reference) -> Floats:
+    """Return the elevation with a ring of cells around what is known (ny, nx)."""
+    known = np.isfinite(reference.elevation_m)
+    datum_m = float(np.round(np.mean(reference.elevation_m, where=known))) if known.any() else 0.0
+    return np.asarray(extend((reference.elevation_m - datum_m).astype(np.float32)) + np.float64(datum_m))
 
 
 def settle_reference(series: Series) -> None:
@@ -182,13 +203,25 @@ def _written_ns(path: Path) -> int:
 
 def read_reference(series: Series, version: str | None = None) -> Reference | None:
     """Read the newest reference or a version; None where there is none; StoreError where it fits no grid."""
+    held = open_reference(series, version)
+    if held is None:
+        return None
+    whole: dict[str, Any] = {
+        name: np.asarray(getattr(held, name)) for name, _, _ in _HELD if name != "nodes_m"
+    }
+    return replace(held, **whole, nodes_m=None)
+
+
+def open_reference(series: Series, version: str | None = None) -> Reference | None:
+    """Return as `read_reference` does, but read the rasters only as rows of them are looked at."""
     path = series.folder / "reference.nc" if version is None else path_of(series, version)
     if not path.is_file():
         return None
     try:
         with netCDF4.Dataset(path) as file:
-            return _read(file, series)
-    except (OSError, RuntimeError, KeyError, IndexError) as error:
+            kept = path_of(series, str(file.reference_version))  # its name for good
+            return _opened(file, kept if kept.is_file() else path, series)
+    except (OSError, RuntimeError, KeyError, IndexError, AttributeError) as error:
         raise StoreError(f"{path}: cannot be read: {error}") from error
 
 
@@ -204,7 +237,7 @@ def read_habits(series: Series) -> Habits:
         raise StoreError(f"{path}: cannot be read: {error}") from error
 
 
-def _read(file: netCDF4.Dataset, series: Series) -> Reference:
+def _opened(file: netCDF4.Dataset, path: Path, series: Series) -> Reference:
     grid = series.grid
     if (
         file["x"].shape != (grid.nx,)
@@ -221,19 +254,16 @@ def _read(file: netCDF4.Dataset, series: Series) -> Reference:
         covariance = np.asarray(file["shared_parameter_covariance"][:], dtype=np.float64)
         noise = np.asarray(file["shared_parameter_noise_variance"][:], dtype=np.float64)
         shared = Shared(names, units, np.zeros(len(names)), covariance, noise)
+    rasters: dict[str, Any] = {
+        field: Raster(path, name, made) for field, name, made in _HELD if name in file.variables
+    }
     return Reference(
         grid=grid,
         version=str(file.reference_version),
-        elevation_m=np.asarray(file["reference_elevation"][:].filled(np.nan), dtype=np.float64),
-        random_variance_m2=_squared(file["reference_random_uncertainty"]),
-        roughness_m2=_squared(file["reference_roughness"]),
         shared=shared,
         scan_ids=tuple(str(file.scan_ids).split()),
-        intensity=np.asarray(file["reference_intensity"][:].filled(np.nan), dtype=np.float32),
-        variance_factor=np.asarray(file["reference_variance_factor"][:].filled(1.0), dtype=np.float32),
-        stable=np.asarray(file["reference_stable"][:]) == 1,
-        seen=np.asarray(file["reference_seen"][:].filled(np.nan), dtype=np.float32),
         habits=_habits(file),
+        **rasters,
     )
 
 
@@ -241,5 +271,17 @@ def _habits(file: netCDF4.Dataset) -> Habits:
     return Habits(**{field.name: float(file.getncattr(f"{HABIT}{field.name}")) for field in fields(Habits)})
 
 
-def _squared(variable: netCDF4.Variable[Any]) -> Floats32:
-    return np.asarray(variable[:].filled(np.nan) ** 2, dtype=np.float32)
+def _filled(values: np.ndarray[Any, Any], fill: float = np.nan) -> Floats32:
+    return np.where(values == np.float32(FILL), np.float32(fill), values)
+
+
+_HELD: tuple[tuple[str, str, Callable[[np.ndarray[Any, Any]], np.ndarray[Any, Any]]], ...] = (
+    ("elevation_m", "reference_elevation", lambda values: _filled(values).astype(np.float64)),
+    ("nodes_m", "reference_node", _filled),
+    ("random_variance_m2", "reference_random_uncertainty", lambda values: _filled(values) ** 2),
+    ("roughness_m2", "reference_roughness", lambda values: _filled(values) ** 2),
+    ("variance_factor", "reference_variance_factor", lambda values: _filled(values, 1.0)),
+    ("intensity", "reference_intensity", _filled),
+    ("stable", "reference_stable", lambda values: values == 1),
+    ("seen", "reference_seen", _filled),
+)

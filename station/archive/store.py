@@ -12,8 +12,9 @@ import h5py
 import netCDF4
 import numpy as np
 
-from station.archive.layout import Series, define, lay_out, put_raster, strings, text, written_whole
-from station.archive.variables import BY_NAME, TERMS, VARIABLES, VERDICTS
+from station.archive.layout import Series, define, lay_out, strings, text, written_whole
+from station.archive.rasters import write_rasters
+from station.archive.variables import BY_NAME, TERMS, VARIABLES, VERDICTS, Variable
 from station.errors import StoreError
 from station.quantities import Grid, Measurement, Shared
 
@@ -79,8 +80,10 @@ def write_epoch(series: Series, epoch: Epoch, newer_than: int = 0) -> Stored:
     revision = 1 + max(newer_than, *known)
     tail = f"_r{revision}" if revision > 1 else ""
     path = epoch_folder(series, start) / f"{series.station_id}_{start.strftime(STAMP)}{tail}.nc"
-    with written_whole(path) as beside, netCDF4.Dataset(beside, "w", clobber=False) as file:
-        _write(file, series, epoch, path.name)
+    with written_whole(path) as beside:
+        with netCDF4.Dataset(beside, "w", clobber=False) as file:
+            _write(file, series, epoch, path.name)
+        write_rasters(beside, _rasters(epoch.measurement))
     return Stored(path, start, revision)
 
 
@@ -253,7 +256,17 @@ def _write(file: netCDF4.Dataset, series: Series, epoch: Epoch, name: str) -> No
     lay_out(file, series, title, 1, parameters)
     file["time"][0] = (epoch.start_s + epoch.end_s) / 2
     file["time_bnds"][0] = (epoch.start_s, epoch.end_s)
-    measured = epoch.measurement
+    for row, _ in _rasters(epoch.measurement):
+        define(file, row, series, 1)
+    if shared is not None:
+        define(file, BY_NAME["shared_parameter"], series, 1)[0] = shared.estimate
+        define(file, BY_NAME["shared_parameter_covariance"], series, 1)[0] = shared.covariance
+        define(file, BY_NAME["shared_parameter_noise_variance"], series, 1)[0] = shared.noise_variance
+    _write_words(file, series, epoch, name)
+
+
+def _rasters(measured: Measurement) -> list[tuple[Variable, np.ndarray[Any, Any]]]:
+    """Return what lies on the grid, by variable."""
     rasters: dict[str, np.ndarray[Any, Any]] = {
         "elevation": measured.surface.elevation_m,
         "elevation_change": measured.surface.change_m,
@@ -264,13 +277,7 @@ def _write(file: netCDF4.Dataset, series: Series, epoch: Epoch, name: str) -> No
         "quality": measured.quality,
         **{term: measured.terms[term] for term in TERMS if term in measured.terms},
     }
-    for raster, values in rasters.items():
-        put_raster(define(file, BY_NAME[raster], series, 1), 0, values)
-    if shared is not None:
-        define(file, BY_NAME["shared_parameter"], series, 1)[0] = shared.estimate
-        define(file, BY_NAME["shared_parameter_covariance"], series, 1)[0] = shared.covariance
-        define(file, BY_NAME["shared_parameter_noise_variance"], series, 1)[0] = shared.noise_variance
-    _write_words(file, series, epoch, name)
+    return [(BY_NAME[name], values) for name, values in rasters.items()]
 
 
 def _write_words(file: netCDF4.Dataset, series: Series, epoch: Epoch, name: str) -> None:

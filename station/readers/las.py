@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from io import BufferedReader
 from pathlib import Path
@@ -88,13 +89,20 @@ class LasScan:
         """
         timed = self.time_range_s() is not None
         check = _Check(self._layout, self._range_max_m)
-        left = self._layout.count
-        with self._points(all_cores=True) as points:
-            while left:
-                records = points.read(min(left, BLOCKS_AT_ONCE * size))
-                left -= len(records)
-                for first in range(0, len(records), size):
-                    yield check.shots(records[first : first + size], timed=timed)
+        together = BLOCKS_AT_ONCE * size
+        stretches = range(0, self._layout.count, together)
+        rooms = np.empty(
+            (2, together * self._layout.record_bytes), np.uint8
+        )  # one is filled, one is looked at
+        with self._points(all_cores=True) as points, ThreadPoolExecutor(1) as ahead:
+            coming = ahead.submit(points.read, min(together, self._layout.count), rooms[0])
+            for number, first in enumerate(stretches, start=1):
+                records = coming.result()
+                left = self._layout.count - first - len(records)
+                if left:
+                    coming = ahead.submit(points.read, min(together, left), rooms[number % 2])
+                for start in range(0, len(records), size):
+                    yield check.shots(records[start : start + size], timed=timed)
 
     def time_range_s(self) -> tuple[float, float] | None:
         """Give the earliest and latest time stamp [s], from the chunks' starts and the end of the file.
@@ -184,13 +192,14 @@ class _Points:
             else:
                 self._decompressor.seek(number)
 
-    def read(self, count: int) -> Records:
-        """Decode the next `count` records; they must be there."""
-        raw = bytearray(count * self._layout.record_bytes)
+    def read(self, count: int, room: NDArray[np.uint8] | None = None) -> Records:
+        """Decode the next `count` records, into `room` if given; they must be there."""
+        length = count * self._layout.record_bytes
+        raw = np.empty(length, np.uint8) if room is None else room[:length]
         with foreign_code(f"corrupt after point {self.at:,}"):
             if self._decompressor is not None:
                 self._decompressor.decompress_many(raw)
-            elif self._file.readinto(raw) != len(raw):
+            elif self._file.readinto(raw.data) != length:
                 raise ScanError(f"cut off: ends before point {self.at + count:,} of {self._layout.count:,}")
         self.at += count
         return np.frombuffer(raw, dtype=self._layout.record)

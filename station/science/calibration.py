@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy import sparse, stats
+from scipy import sparse, special
 
 from station.quantities import Bools, Floats, Ints, Shared
 from station.science.shared import GLOBAL, Basis, Sensitivities, leans_between, line_variances
@@ -44,7 +44,7 @@ def _rms(z: Floats) -> float:
 
 
 def _robust(z: Floats) -> float:
-    return float(np.median(np.abs(z)) / stats.norm.ppf(0.75))
+    return float(np.median(np.abs(z)) / special.ndtri(0.75))
 
 
 @dataclass(frozen=True)
@@ -74,7 +74,7 @@ def scale(z_of_epochs: list[Floats]) -> Scale:
         np.log(max(spread(np.concatenate(known[:at] + known[at + 1 :])), LEAST)) for at in range(count)
     ]
     error = np.sqrt((count - 1) * np.var(without))
-    reach = stats.t.ppf(0.975, count - 1) * error
+    reach = special.stdtrit(count - 1, 0.975) * error
     factor, low, high = (float(np.exp(one)) for one in (log, log - reach, log + reach))
     away = max(factor, 1 / factor) > NEAR_ONE
     return Scale(factor, low, high, advised=bool(away and not low <= 1 <= high))

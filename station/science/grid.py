@@ -2,25 +2,68 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, TypeVar
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from station.science.terrain import Ground, ground
+from station.science.terrain import Ground, ground, means_below
 
 if TYPE_CHECKING:
     from station.quantities import Bools, Floats, Floats32, Grid, Ints, Reference
 
-# Sums are of multiples of 2^-20 m (and m²), so that adding float64 is exact up to 2^33 and the order in
-# which points come cannot matter.
+# Sums are whole numbers, of 2^-20 m (and m²), so that the order in which points come cannot matter.
 QUANTUM = 2.0**20
+BRIGHTEST = 65535.0  # intensity is of 16 bits
+BITS = 40  # of a number, in which brightness is summed up; the others count
+ONE = 1 << BITS
 STEP_MOST = 6.0  # sigmas: beyond, something happened
 CLASS_STEPS = 10.0  # what the class of a cell weighs against the steps from scan to scan of its own
 ALL = slice(None)
-T = TypeVar("T", bound=np.generic)
 ROUGHNESS_CELLS = 1.0  # one sigma of the neighbourhood that tells how rough a cell is
+
+
+@dataclass(frozen=True)
+class Sums:
+    """What the points of cells amount to, (ny, nx) each."""
+
+    tally: Ints  # number of points, and below `BITS` their brightness
+    residual: Ints
+    square: Ints
+
+    @property
+    def count(self) -> NDArray[np.int32]:
+        """Points in each cell (ny, nx)."""
+        return (self.tally >> BITS).astype(np.int32)
+
+    def mean_residual(self) -> Floats:
+        """Mean height above reference or datum (ny, nx) [m], NaN in empty cells.
+
+        Source: Hartzell et al. (2015), Eq. 11, of residuals (EQUATIONS 6.5).
+        """
+        count = self.count
+        mean_m = np.full(count.shape, np.nan)
+        np.divide(self.residual, count * QUANTUM, out=mean_m, where=count > 0)
+        return mean_m
+
+    def intensity(self) -> Floats32:
+        """Mean brightness of each cell (ny, nx), 0-1, NaN in empty cells and in scans that do not tell."""
+        brightness = self.tally & (ONE - 1)
+        bright = np.full(brightness.shape, np.nan, np.float32)
+        whole = self.count * BRIGHTEST
+        np.divide(brightness, whole, out=bright, where=brightness > 0, casting="same_kind")
+        return bright
+
+    def spread(self) -> Floats32:
+        """Standard deviation of the points in each cell (ny, nx) [m], NaN for fewer than two."""
+        spread_m = np.full(self.tally.shape, np.nan, np.float32)
+        several = self.tally >= 2 * ONE
+        count = (self.tally[several] >> BITS).astype(np.float64)
+        centred = self.square[several] / QUANTUM - (self.residual[several] / QUANTUM) ** 2 / count
+        spread_m[several] = np.sqrt(np.maximum(centred, 0.0) / (count - 1))
+        return spread_m
 
 
 class Gridder:
@@ -33,84 +76,72 @@ class Gridder:
     def __init__(self, grid: Grid, reference: Reference | None, datum_m: float) -> None:
         """Heights in cells without reference are taken from `datum_m`, to keep their sums small."""
         self.grid = grid
+        self._reference = reference
         self.ground: Ground | None = ground(reference) if reference else None
+        self._ground_datum_m = 0.0
         self.datum_m = float(np.round(datum_m))
-        cells = grid.nx * grid.ny
-        self.count = np.zeros(cells, np.int32)
-        self._residual = np.zeros(cells)
-        self._square = np.zeros(cells)
-        self._variance = np.zeros(cells)
-        self._brightness = np.zeros(cells)
+        # Of a cell side by side, for it is they that a shot has to wait for: number of points and brightness
+        # in one, heights, and their squares.
+        self._sums = np.zeros((*grid.shape, 3), np.int64)
 
-    def cells(self, x_m: Floats, y_m: Floats) -> tuple[Bools, Floats, Floats]:
-        """Tell which points (n,) lie on the grid, and the column and row of those, in fractions of cells.
+    def cells(self, x_m: Floats, y_m: Floats) -> tuple[Ints, Floats, Floats]:
+        """Number of each point (n,) that lies on the grid, and its column and row, in fractions of cells.
 
         A point on an edge belongs to the cell east or south of it.
         """
         column = (x_m - self.grid.west_m) / self.grid.cell_m
         row = (self.grid.north_m - y_m) / self.grid.cell_m
-        inside = (column >= 0) & (column < self.grid.nx) & (row >= 0) & (row < self.grid.ny)
+        inside = np.flatnonzero((column >= 0) & (column < self.grid.nx) & (row >= 0) & (row < self.grid.ny))
         return inside, column[inside], row[inside]
 
     def flat(self, column: Floats, row: Floats) -> Ints:
         """Index (n,) of each point's cell in the flattened grid."""
         return row.astype(np.int64) * self.grid.nx + column.astype(np.int64)
 
-    def known(self, cell: Ints) -> Bools:
-        """Tell for each point (n,) whether the reference is known in its cell."""
+    def below(self, cell: Ints, column: Floats, row: Floats) -> Floats:
+        """Height (n,) that the residual of each point is taken from [m]: of the reference, or the datum."""
         if self.ground is None:
-            return np.zeros(len(cell), bool)
-        return np.asarray(self.ground.known.ravel()[cell])
+            return np.full(len(cell), self.datum_m)
+        known = self.ground.known.ravel()[cell]
+        return np.where(known, self.ground.height(column, row), self.datum_m)
 
-    def add(self, cell: Ints, residual_m: Floats, variance_m2: Floats, intensity: Floats | None) -> None:
-        """Add points (n,): their cell, height above reference or datum, random variance and brightness."""
-        residual_m = np.rint(residual_m * QUANTUM) / QUANTUM
-        np.add.at(self.count, cell, 1)
-        np.add.at(self._residual, cell, residual_m)
-        np.add.at(self._square, cell, np.rint(residual_m**2 * QUANTUM) / QUANTUM)
-        np.add.at(self._variance, cell, np.rint(variance_m2 * QUANTUM) / QUANTUM)
-        if intensity is not None:
-            np.add.at(self._brightness, cell, np.rint(intensity * QUANTUM) / QUANTUM)
+    def below_cells(self, rows: slice) -> tuple[Bools, Floats]:
+        """Whether the reference is known (r, nx) in some rows, and the mean height [m] residuals are from."""
+        if self._reference is None:
+            shape = self._sums[rows].shape[:2]
+            return np.zeros(shape, bool), np.full(shape, self.datum_m)
+        if self.ground is not None:
+            known, means_m = self.ground.known[rows], self.ground.cell_means(rows)
+        else:
+            known, means_m = means_below(self._reference, self._ground_datum_m, rows)
+        return known, np.where(known, means_m, self.datum_m)
 
-    def mean_residual(self, rows: slice = ALL) -> Floats:
-        """Mean height above reference or datum (ny, nx) [m], NaN in empty cells; of some rows or all.
+    def complete(self) -> None:
+        """No more points come: let the ground go that only they need, where it can be had by rows."""
+        if self.ground is not None and self._reference is not None and self._reference.nodes_m is not None:
+            self._ground_datum_m, self.ground = self.ground.datum_m, None
 
-        Source: Hartzell et al. (2015), Eq. 11, of residuals (EQUATIONS 6.5).
-        """
-        count, residual = self._rows(self.count, rows), self._rows(self._residual, rows)
-        mean_m = np.full(count.shape, np.nan)
-        np.divide(residual, count, out=mean_m, where=count > 0)
-        return mean_m
+    def add(self, cell: Ints, residual_m: Floats, intensity: Floats | None) -> None:
+        """Add points (n,): their cell, height above reference or datum, and brightness, 0-1."""
+        sums = self._sums.reshape(-1)
+        steps = np.rint(residual_m * QUANTUM)
+        at = cell * 3
+        tally = ONE if intensity is None else ONE + np.rint(intensity * BRIGHTEST).astype(np.int64)
+        np.add.at(sums, at, tally)
+        np.add.at(sums, at + 1, steps.astype(np.int64))
+        np.add.at(sums, at + 2, np.rint(steps * steps / QUANTUM).astype(np.int64))
 
-    def intensity(self, rows: slice = ALL) -> Floats32:
-        """Mean brightness of each cell (ny, nx), 0-1, NaN in empty cells and in scans that do not tell."""
-        count, brightness = self._rows(self.count, rows), self._rows(self._brightness, rows)
-        bright = np.full(count.shape, np.nan, np.float32)
-        np.divide(brightness, count, out=bright, where=brightness > 0)
-        return bright
+    def sums(self, rows: slice = ALL) -> Sums:
+        """Take a copy of some rows, or all."""
+        return Sums(*np.ascontiguousarray(np.moveaxis(self._sums[rows], -1, 0)))
 
-    def spread(self) -> Floats32:
-        """Standard deviation of the points in each cell (ny, nx) [m], NaN for fewer than two."""
-        spread_m = np.full(len(self.count), np.nan, np.float32)
-        several = np.flatnonzero(self.count > 1)
-        count = self.count[several].astype(np.float64)
-        centred = self._square[several] - self._residual[several] ** 2 / count
-        spread_m[several] = np.sqrt(np.maximum(centred, 0.0) / (count - 1))
-        return spread_m.reshape(self.grid.shape)
+    def seen(self) -> Bools:
+        """Return which cells (ny, nx) have points."""
+        return np.asarray(self._sums[..., 0] > 0)
 
-    def random_variance(self, rows: slice = ALL) -> Floats32:
-        """Random variance of each cell's mean (ny, nx) [m²], NaN in empty cells; of some rows or all.
-
-        Source: Hartzell et al. (2015), Eq. 12.
-        """
-        count, variance = self._rows(self.count, rows), self._rows(self._variance, rows)
-        variance_m2 = np.full(count.shape, np.nan, np.float32)
-        seen = count > 0
-        variance_m2[seen] = variance[seen] / count[seen].astype(np.float64) ** 2
-        return variance_m2
-
-    def _rows(self, values: NDArray[T], rows: slice) -> NDArray[T]:
-        return values.reshape(self.grid.shape)[rows]
+    def memory(self) -> NDArray[np.float32]:
+        """Give the sums away: (ny, nx, 6), to be overwritten row by row once read."""
+        return self._sums.view(np.float32)
 
 
 class Stack:
@@ -127,31 +158,37 @@ class Stack:
         self._last: tuple[Floats32, Floats32] | None = None
 
     def add(
-        self, gridder: Gridder, correction_m: Floats32 | None = None, roughness_m2: Floats32 | None = None
+        self,
+        gridder: Gridder,
+        known: tuple[Floats32, Floats32] | None = None,
+        roughness_m2: Floats32 | None = None,
     ) -> None:
-        """Add a scan, its heights lowered by the correction (ny, nx).
+        """Add a scan.
 
-        `roughness_m2` of the reference it lies on, if any: then scans are also compared with each other.
+        `known`, on a reference: random variance of a shot and what to lower heights by, and the
+        `roughness_m2` of that reference, (ny, nx) each. Then scans are also compared with each other.
         """
-        count = gridder.count.reshape(self.grid.shape).astype(np.float64)
+        sums = gridder.sums()
+        count = sums.count.astype(np.float64)
         seen = count > 0
         self._seen += seen
         self._scans += 1
         self.count += count
-        mean_m = gridder.mean_residual()
-        if correction_m is not None:
+        mean_m = sums.mean_residual()
+        shot_m2 = np.zeros(self.grid.shape, np.float32)
+        if known is not None:
+            shot_m2, correction_m = known
             mean_m -= correction_m
         self._residual[seen] += mean_m[seen] * count[seen]
-        bright = gridder.intensity()
+        bright = sums.intensity()
         lit = np.where(np.isfinite(bright), count, 0).astype(np.float32)
         self._bright += np.nan_to_num(bright) * lit
         self._lit += lit
         if roughness_m2 is not None:
-            variance_m2 = gridder.random_variance()
-            variance_m2 += (roughness_m2 / np.maximum(count, 1)).astype(np.float32)
-            self._compare(mean_m.astype(np.float32), variance_m2)
-        self._variance[seen] += gridder.random_variance()[seen] * count[seen] ** 2
-        self._within += np.nan_to_num(gridder.spread()).astype(np.float64) ** 2 * np.maximum(count - 1, 0)
+            variance_m2 = (shot_m2 + roughness_m2) / np.maximum(count, 1)
+            self._compare(mean_m.astype(np.float32), variance_m2.astype(np.float32))
+        self._variance[seen] += shot_m2[seen] * count[seen]
+        self._within += np.nan_to_num(sums.spread()).astype(np.float64) ** 2 * np.maximum(count - 1, 0)
         self._freedom += np.maximum(count - 1, 0)
 
     def _compare(self, mean_m: Floats32, variance_m2: Floats32) -> None:

@@ -11,7 +11,6 @@ from dataclasses import dataclass, replace
 from itertools import combinations
 
 import numpy as np
-from scipy import stats
 
 from station.quantities import Bools, Floats, Ints, Shared
 from station.science.shared import Sensitivities, aggregate_variance
@@ -192,6 +191,8 @@ def interactions(
 
 def _repeated(model: Model, draw: Draw, groups: list[Bools], draws: int, seed: int) -> tuple[Floats, Floats]:
     """First and total indices (repetitions, groups)."""
+    from scipy import stats  # noqa: PLC0415 - a third of what a scan's process would load
+
     random = np.random.default_rng(seed)
     found = []
     for _ in range(REPETITIONS):

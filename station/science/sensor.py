@@ -9,7 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy import linalg, stats
+from scipy import linalg, special
 
 from station.quantities import Bools, Floats, Habits
 from station.science.adjustment import Adjustment
@@ -122,7 +122,7 @@ def _chance(estimate: Floats, variance: Floats) -> float:
     values, vectors = np.linalg.eigh(variance)
     seen = values > SEEN * values.max()
     size = np.sum((vectors.T @ estimate)[seen] ** 2 / values[seen])
-    return float(stats.chi2.sf(size, np.count_nonzero(seen)))
+    return float(special.chdtrc(np.count_nonzero(seen), size))
 
 
 def lateness(of: Expected, habits: Habits) -> Lateness | None:

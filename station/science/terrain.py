@@ -10,6 +10,7 @@ from scipy import ndimage
 from station.quantities import Bools, Floats, Floats32, Grid, Reference
 
 ALL = slice(None)
+BAND_ROWS = 128  # looked at together: what a store chunk is high
 
 
 def normal(slope_rad: Floats, aspect_rad: Floats) -> Floats:
@@ -84,27 +85,42 @@ class Ground:
     rise_m: Floats32
     known: Bools
 
+    def height(self, column: Floats, row: Floats) -> Floats:
+        """Height of the surface below points (n,) [m], as `under`."""
+        nw, ne, sw, se, u, v = self._corners(column, row)
+        return self._height(nw + (ne - nw) * u, sw + (se - sw) * u, v)
+
     def under(self, column: Floats, row: Floats) -> tuple[Floats, Floats, Floats]:
         """Height [m] and rise per metre eastward and northward below points (n,).
 
         Points are in cells from the north-west corner of the grid; the answer means something where the
         point's own cell is known.
         """
-        nx, ny = self.grid.nx, self.grid.ny
-        # Half a cell within the border of the grid the last slope goes on.
-        left = np.clip((column - 0.5).astype(np.intp), 0, max(nx - 2, 0))
-        top = np.clip((row - 0.5).astype(np.intp), 0, max(ny - 2, 0))
-        u, v = column - 0.5 - left, row - 0.5 - top
-        flat = self.rise_m.ravel()
-        first = top * nx + left
-        right, below = min(nx - 1, 1), min(ny - 1, 1) * nx
-        nw, ne = flat[first].astype(np.float64), flat[first + right].astype(np.float64)
-        sw, se = flat[first + below].astype(np.float64), flat[first + below + right].astype(np.float64)
+        nw, ne, sw, se, u, v = self._corners(column, row)
         north_side, south_side = nw + (ne - nw) * u, sw + (se - sw) * u
-        height_m = self.datum_m + north_side + (south_side - north_side) * v
         east = ((ne - nw) * (1 - v) + (se - sw) * v) / self.grid.cell_m
         north = (north_side - south_side) / self.grid.cell_m
-        return height_m, east, north
+        return self._height(north_side, south_side, v), east, north
+
+    def cell_means(self, rows: slice) -> Floats:
+        """Mean height over each cell (r, nx) of some rows [m]."""
+        around = _around(rows)
+        return self.datum_m + cell_means(self.rise_m[around])[rows.start - around.start :][: _height(rows)]
+
+    def _height(self, north_side: Floats, south_side: Floats, v: Floats) -> Floats:
+        return self.datum_m + north_side + (south_side - north_side) * v
+
+    def _corners(self, column: Floats, row: Floats) -> tuple[Floats, ...]:
+        """Rise of the nodes nw, ne, sw, se of points (n,); how far east and south of nw they are [cells]."""
+        nx, ny = self.grid.nx, self.grid.ny
+        # Half a cell within the border of the grid the last slope goes on; -0.5 counts as nought.
+        left = np.minimum((column - 0.5).astype(np.intp), max(nx - 2, 0))
+        top = np.minimum((row - 0.5).astype(np.intp), max(ny - 2, 0))
+        first = top * nx + left
+        right, below = min(nx - 1, 1), min(ny - 1, 1) * nx
+        rises = [self.rise_m.ravel().take(first + there) for there in (0, right, below, below + right)]
+        nw, ne, sw, se = (rise.astype(np.float64) for rise in rises)
+        return nw, ne, sw, se, column - 0.5 - left, row - 0.5 - top
 
 
 def cell_means(nodes: Floats | Floats32) -> Floats:
@@ -112,6 +128,26 @@ def cell_means(nodes: Floats | Floats32) -> Floats:
     around = np.pad(np.asarray(nodes, dtype=np.float64), 1, mode="reflect", reflect_type="odd")
     rows = (around[:-2] + 6 * around[1:-1] + around[2:]) / 8
     return np.asarray((rows[:, :-2] + 6 * rows[:, 1:-1] + rows[:, 2:]) / 8)
+
+
+def means_below(reference: Reference, datum_m: float, rows: slice) -> tuple[Bools, Floats]:
+    """Which cells (r, nx) of some rows a master surface knows, and its mean height over each [m].
+
+    As `Ground.cell_means`, of a reference that has its nodes, without the whole of them in memory.
+    """
+    assert reference.nodes_m is not None  # noqa: S101 - the caller's case
+    around = _around(rows)
+    rise_m = np.nan_to_num(reference.nodes_m[around] - datum_m).astype(np.float32)
+    means_m = datum_m + cell_means(rise_m)[rows.start - around.start :][: _height(rows)]
+    return np.isfinite(reference.elevation_m[rows]), means_m
+
+
+def _around(rows: slice) -> slice:
+    return slice(max(rows.start - 1, 0), rows.stop + 1)
+
+
+def _height(rows: slice) -> int:
+    return int(rows.stop - rows.start)
 
 
 def nodes_for(means: Floats) -> Floats:
@@ -126,10 +162,21 @@ def nodes_for(means: Floats) -> Floats:
 
 def ground(reference: Reference) -> Ground:
     """Prepare a master surface for looking up."""
-    known = np.isfinite(reference.elevation_m)
-    datum_m = float(np.round(np.mean(reference.elevation_m, where=known))) if known.any() else 0.0
-    rise_m = extend((reference.elevation_m - datum_m).astype(np.float32))
-    return Ground(reference.grid, datum_m, np.nan_to_num(rise_m, copy=False), known)
+    known = np.zeros(reference.grid.shape, bool)
+    total_m = 0.0
+    bands = [slice(top, top + BAND_ROWS) for top in range(0, reference.grid.ny, BAND_ROWS)]
+    for rows in bands:
+        elevation_m = reference.elevation_m[rows]
+        known[rows] = np.isfinite(elevation_m)
+        total_m += float(np.sum(elevation_m, where=known[rows]))
+    datum_m = float(np.round(total_m / max(int(np.count_nonzero(known)), 1)))
+    if reference.nodes_m is None:
+        rise_m = extend((reference.elevation_m[:] - datum_m).astype(np.float32))
+        return Ground(reference.grid, datum_m, np.nan_to_num(rise_m, copy=False), known)
+    rise_m = np.zeros(reference.grid.shape, np.float32)
+    for rows in bands:
+        rise_m[rows] = np.nan_to_num(reference.nodes_m[rows] - datum_m)
+    return Ground(reference.grid, datum_m, rise_m, known)
 
 
 def extend(values: Floats32) -> Floats32:

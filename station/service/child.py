@@ -37,7 +37,6 @@ PRELOAD = (
     "laspy",
     "lazrs",
     "netCDF4",
-    "scipy.signal",
 )
 # One scan is one core's work; and every further thread of a BLAS reserves address space against RLIMIT_AS.
 _ONE_THREAD = dict.fromkeys(("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "RAYON_NUM_THREADS"), "1")

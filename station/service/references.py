@@ -10,7 +10,7 @@ from station.archive.layout import Series, kept_of
 from station.archive.reference import Lineage, read_lineage, read_reference, versions, write_reference
 from station.config import Site
 from station.errors import StoreError
-from station.pipeline import corrections, gridder_for, survey
+from station.pipeline import gridder_for, on_reference, survey
 from station.quantities import Habits, Reference
 from station.readers.scan import utc_interval
 from station.science.adjustment import Adjustment
@@ -142,12 +142,13 @@ def _lay_on(
         start, end, _ = utc_interval(reader, site.scans.name)
         gathered = gather(site, reader, arrival.log, start, end)
         gridder = gridder_for(gathered.setup, surface)
-        survey(gridder, reader.blocks(), gathered.setup, gathered.pose, progress)
+        survey(gridder, reader.blocks(), gathered.pose, progress)
     levelled = levelled_to(site, gridder, gathered, surface)
-    correction_m = None
-    if levelled is not None and surface is not None:
-        correction_m = corrections(gridder, gathered.setup, levelled[0], surface, levelled[1])
-    stack.add(gridder, correction_m, surface.roughness_m2 if surface else None)
+    if surface is None:
+        stack.add(gridder)
+    else:
+        state = levelled[:2] if levelled is not None else None
+        stack.add(gridder, on_reference(gridder, gathered.setup, surface, state), surface.roughness_m2)
     progress()
     made = Made(
         scan_id=arrival.path.stem,

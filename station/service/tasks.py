@@ -18,7 +18,7 @@ import numpy as np
 from station import __version__
 from station.archive import store
 from station.archive.layout import Series, kept_of
-from station.archive.reference import current, read_reference, write_reference
+from station.archive.reference import current, open_reference, write_reference
 from station.config import Site
 from station.errors import ScanError
 from station.pipeline import (
@@ -201,8 +201,8 @@ def _measure(
             wait_for_weather=wait_for_weather,
         )
         gridder = gridder_for(gathered.setup, reference)
-        survey(gridder, reader.blocks(), gathered.setup, gathered.pose, progress)
-    if not gridder.count.any():
+        survey(gridder, reader.blocks(), gathered.pose, progress)
+    if not gridder.seen().any():
         raise ScanError("no point falls on the grid: wrong scans.frame, SOP, CRS or units?")
     progress()
     levelled = levelled_to(site, gridder, gathered, reference)
@@ -325,14 +325,14 @@ def reference_of(site: Site, version: str | None = None) -> Reference | None:
     if not isinstance(given, Path):
         made = current(series)
         newest = list(made)[-1] if made else None
-        return read_reference(series, version if version in made else newest)
-    held = read_reference(series)
+        return open_reference(series, version if version in made else newest)
+    held = open_reference(series)
     version = version_of_given(given)
     if held is None or held.version != version:
         elevation_m = nodes_for(read_geotiff(given, series.grid, series.crs))
         steep = ground.steep(elevation_m, series.grid.cell_m)
         write_reference(series, Reference.given(series.grid, version, elevation_m, steep))
-        held = read_reference(series)
+        held = open_reference(series)
     return held
 
 
@@ -402,7 +402,7 @@ def _figures(epoch: store.Epoch, seconds: float) -> dict[str, float | str]:
     change_m = measured.surface.change_m[np.isfinite(measured.surface.change_m)]
     if len(change_m):
         told["change_median_m"] = round(float(np.median(change_m)), 4)
-        significant = (measured.quality & Quality.CHANGE_SIGNIFICANT) > 0
+        significant = measured.flagged(Quality.CHANGE_SIGNIFICANT)
         told["significant_pct"] = round(100 * float(significant.sum()) / len(change_m), 1)
     for figure in ("stable_nmad", "stable_z_std"):
         if np.isfinite(epoch.numbers.get(figure, np.nan)):

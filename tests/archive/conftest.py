@@ -31,7 +31,7 @@ def make_epoch(hour, *, value=None, grid=GRID, terms=False):
     elevation = np.where(seen, 2800.0 + grid.y_m[:, None] / 1e6, np.nan)
     count = np.where(seen, 3, 0).astype(np.int32)
     sigma = np.where(seen, 0.05, np.nan).astype(np.float32)
-    surface = Surface(grid, elevation, change, count, sigma, sigma**2)
+    surface = Surface(grid, elevation, change, count, sigma)
     names = ("tilt_east", "tilt_north", "range_bias")
     return Epoch(
         start_s=START_S + 3600 * hour,

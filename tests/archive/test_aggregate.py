@@ -56,7 +56,7 @@ def epoch(hour, adjustment, unknown, *, empty=False):
     change_m = np.where(seen, rng.normal(hour / 10, 0.1, GRID.shape), np.nan).astype(np.float32)
     sigma_m = np.where(seen, rng.uniform(0.01, 0.1, GRID.shape), np.nan).astype(np.float32)
     elevation_m = np.where(seen, 2900.0, np.nan)
-    surface = Surface(GRID, elevation_m, change_m, seen.astype(np.int32), sigma_m, sigma_m**2)
+    surface = Surface(GRID, elevation_m, change_m, seen.astype(np.int32), sigma_m)
     return store.Epoch(
         start_s=START_S + 3600 * hour,
         end_s=START_S + 3600 * hour + 900,

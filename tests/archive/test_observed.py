@@ -83,9 +83,7 @@ def filled(folder, drawn, *, times=1.0, adjustment="joint"):
         change_m[: hour % 3, :] = np.nan
         seen = np.isfinite(change_m)
         flat = np.where(seen, np.float32(SIGMA_M), np.float32(np.nan))
-        surface = Surface(
-            GRID, np.where(seen, ELEVATION_M, np.nan), change_m, seen.astype(np.int32), flat, flat**2
-        )
+        surface = Surface(GRID, np.where(seen, ELEVATION_M, np.nan), change_m, seen.astype(np.int32), flat)
         quality = np.where(seen, stable, 0).astype(np.uint8)
         uncertainty_m = np.where(seen, sigma_m, np.nan).astype(np.float32)
         store.write_epoch(

@@ -66,7 +66,7 @@ def make_epoch(hour, *, grid=GRID, scan_id=None, reference="1"):
     count = np.where(seen, 4, 0).astype(np.int32)
     quality = np.where(significant(change_m, sigma_m), Quality.CHANGE_SIGNIFICANT, 0).astype(np.uint8)
     elevation_m = np.where(seen, 2800.0, np.nan)
-    surface = Surface(grid, elevation_m, change_m, count, random_m, random_m**2)
+    surface = Surface(grid, elevation_m, change_m, count, random_m)
     return store.Epoch(
         start_s=START_S + 3600 * hour,
         end_s=START_S + 3600 * hour + 900,

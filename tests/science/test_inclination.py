@@ -182,3 +182,12 @@ def test_real_log(shared_data):
     assert dropped == 0
     lean = inclination.relative_lean(kept, None, LEVEL, NOISE)
     assert math.degrees(lean.mean_roll_rad) == pytest.approx(-0.2868, abs=0.001)
+
+
+@pytest.mark.parametrize("count", [100, 257, 900])
+def test_the_spectrum_is_that_of_scipy(count):
+    values = np.random.default_rng(count).normal(size=count).cumsum()
+    frequency_hz, power = inclination.spectrum(values, 1.3)
+    wanted_hz, wanted = signal.welch(signal.detrend(values), fs=1.3, nperseg=min(256, count))
+    assert frequency_hz == pytest.approx(wanted_hz)
+    assert power == pytest.approx(wanted)

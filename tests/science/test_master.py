@@ -9,6 +9,7 @@ from station.science.master import improved
 GRID = Grid(west_m=1000.0, north_m=2000.0, cell_m=10.0, nx=60, ny=50)
 POSITION = (0.0, 0.0, 3000.0)
 NOISE_M = 0.05
+SHOT_M2 = np.full(GRID.shape, NOISE_M**2, np.float32)
 
 
 def base():
@@ -29,8 +30,8 @@ def scans(made, height, seed=1, count=24, rise=0.0):
         gridder = Gridder(GRID, made, POSITION[2])
         residual = (height - made.elevation_m + rise).ravel()[cell]
         noise = rng.normal(0, NOISE_M, len(cell))
-        gridder.add(cell, residual + noise, np.full(len(cell), NOISE_M**2), None)
-        stack.add(gridder, None, np.zeros(GRID.shape, np.float32))
+        gridder.add(cell, residual + noise, None)
+        stack.add(gridder, (SHOT_M2, np.zeros_like(SHOT_M2)), np.zeros_like(SHOT_M2))
     return stack
 
 
@@ -67,8 +68,8 @@ def test_cells_that_vary_more_than_modelled_are_told_so():
     sigma = np.where(restless, 0.15, NOISE_M).ravel()
     for _ in range(40):
         gridder = Gridder(GRID, made, POSITION[2])
-        gridder.add(cell, rng.normal(0, sigma), np.full(len(cell), NOISE_M**2), None)
-        stack.add(gridder, None, np.zeros(GRID.shape, np.float32))
+        gridder.add(cell, rng.normal(0, sigma), None)
+        stack.add(gridder, (SHOT_M2, np.zeros_like(SHOT_M2)), np.zeros_like(SHOT_M2))
     factor = improved(made, stack, POSITION, "2", Habits()).variance_factor
     assert 6 < np.median(factor[restless]) < 10  # nine, steps beyond six sigma cut
     assert 0.8 < np.median(factor[~restless]) < 1.5
@@ -81,7 +82,7 @@ def test_the_usual_view_is_the_share_of_scans_that_saw_a_cell():
     for scan in range(8):
         gridder = Gridder(GRID, made, POSITION[2])
         seen = cell[: len(cell) // 2] if scan < 6 else cell
-        gridder.add(seen, np.zeros(len(seen)), np.full(len(seen), NOISE_M**2), None)
+        gridder.add(seen, np.zeros(len(seen)), None)
         stack.add(gridder)
     better = improved(made, stack, POSITION, "2", Habits())
     assert np.unique(better.seen[:25]).tolist() == [1.0]

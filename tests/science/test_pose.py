@@ -125,3 +125,14 @@ def test_axes_are_those_of_the_map(crs):
     assert frame.to_axes[2] == pytest.approx(frame.to_local[2, :3])
     local = pose.frame_in_local_map(sop)
     assert local.to_axes == pytest.approx(sop[:3, :3])
+
+
+def test_a_lean_that_jumps_between_its_knots_turns_as_its_angle_does():
+    """Half a degree from one knot to the next, far away: as the rotation at the angle in between."""
+    tilt = Tilt(np.array([0.0, 1.0, 2.0]), np.radians([0.0, 0.5, -30.0]), np.radians([0.2, -0.3, 5.0]))
+    time_s = np.linspace(0, 2, 301)
+    far_m = np.array([4000.0, -3000.0, 800.0])
+    leant = np.stack(pose.lean(tuple(np.full(301, axis) for axis in far_m), time_s, tilt), axis=-1)
+    for at_s, found_m in zip(time_s, leant, strict=True):
+        roll, pitch = (np.interp(at_s, tilt.time_s, angle) for angle in (tilt.roll_rad, tilt.pitch_rad))
+        assert found_m == pytest.approx(pose.rotation_y(pitch) @ pose.rotation_x(roll) @ far_m, abs=1e-6)

@@ -95,7 +95,7 @@ def measured(change_m, sigma_m, seen=None):
     seen = chance(0.9) if seen is None else seen
     change_m = np.where(seen, change_m, np.nan).astype(np.float32)
     nought = np.zeros(GRID.shape, np.float32)
-    surface = Surface(GRID, change_m.astype(float), change_m, seen.astype(np.int32), nought, nought)
+    surface = Surface(GRID, change_m.astype(float), change_m, seen.astype(np.int32), nought)
     sigma = np.full(GRID.shape, sigma_m, np.float32)
     return Measurement(surface, sigma, sigma, nought.astype(np.uint8), {})
 

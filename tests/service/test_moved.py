@@ -24,7 +24,7 @@ STEP = np.radians(0.02)
 
 def epoch(hour, pose, **changes):
     flat = np.zeros(GRID.shape, np.float32)
-    surface = Surface(GRID, flat.astype(float), flat, flat.astype(np.int32), flat, flat)
+    surface = Surface(GRID, flat.astype(float), flat, flat.astype(np.int32), flat)
     size = len(GLOBAL)
     estimate = np.concatenate([pose, np.zeros(size - len(pose))])
     names, units = zip(*GLOBAL, strict=True)

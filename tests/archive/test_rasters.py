@@ -1,0 +1,93 @@
+"""Rasters written and read past the netCDF library, against that library."""
+
+import netCDF4
+import numpy as np
+import pytest
+
+from station.archive.layout import Series, define, lay_out, put_raster
+from station.archive.rasters import Raster, write_rasters
+from station.archive.variables import BY_NAME, FILL
+from station.errors import StoreError
+from station.quantities import Grid
+
+GRID = Grid(0.0, 300.0, 1.0, 210, 300)  # neither edge a whole number of chunks
+NAMES = ("elevation", "elevation_change_uncertainty", "point_count", "quality")
+
+
+def values():
+    rng = np.random.default_rng(4)
+    found = {
+        "elevation": rng.normal(3000, 400, GRID.shape),
+        "elevation_change_uncertainty": rng.uniform(0, 2, GRID.shape).astype(np.float32),
+        "point_count": rng.integers(0, 40, GRID.shape, dtype=np.int32),
+        "quality": rng.integers(0, 32, GRID.shape, dtype=np.uint8),
+    }
+    for name in NAMES[:2]:
+        found[name][rng.uniform(size=GRID.shape) < 0.5] = np.nan
+        found[name][:140, :130] = np.nan  # a chunk and more of nothing
+    return found
+
+
+def written(path, way):
+    series = Series(path.parent, "a", GRID, None)
+    with netCDF4.Dataset(path, "w") as file:
+        lay_out(file, series, "a test", 1)
+        file["time"][0], file["time_bnds"][0] = 1.0, (0.0, 2.0)
+        made = {name: define(file, BY_NAME[name], series, 1) for name in NAMES}
+        if way == "library":
+            for name, raster in values().items():
+                put_raster(made[name], 0, raster)
+    if way == "own":
+        write_rasters(path, [(BY_NAME[name], raster) for name, raster in values().items()])
+    return path
+
+
+def test_the_library_reads_what_it_would_have_written_itself(tmp_path):
+    own, library = (written(tmp_path / f"{way}.nc", way) for way in ("own", "library"))
+    with netCDF4.Dataset(own) as one, netCDF4.Dataset(library) as other:
+        for file in (one, other):
+            file.set_auto_mask(False)
+        for name in NAMES:
+            assert one[name].shape == (1, *GRID.shape)
+            assert np.array_equal(one[name][:], other[name][:]), name
+            assert one[name].filters() == other[name].filters()
+        assert one["elevation"][0, 0, 0] == np.float32(FILL)
+
+
+def as_they_are(raster):
+    return raster
+
+
+def test_rows_are_those_of_the_whole(tmp_path):
+    series = Series(tmp_path, "a", GRID, None)
+    path = tmp_path / "plane.nc"
+    given = np.random.default_rng(1).normal(size=GRID.shape).astype(np.float32)
+    given[:130] = np.nan
+    row = BY_NAME["sigma_geometry"]
+    plane = type(row)(row.name, ("y", "x"), "f4", "a plane")
+    with netCDF4.Dataset(path, "w") as file:
+        lay_out(file, series, "a test", None)
+        define(file, plane, series, 1)
+    write_rasters(path, [(plane, given)])
+    raster = Raster(path, plane.name, lambda found: np.where(found == np.float32(FILL), np.nan, found))
+    assert np.array_equal(np.asarray(raster), given, equal_nan=True)
+    for rows in (slice(0, 10), slice(120, 260), slice(290, 400), np.array([3, 140, 299])):
+        assert np.array_equal(raster[rows], given[rows], equal_nan=True)
+    assert (raster.shape, raster.dtype, len(raster)) == (GRID.shape, np.float32, GRID.ny)
+
+
+def test_a_damaged_chunk_is_told(tmp_path):
+    series = Series(tmp_path, "a", GRID, None)
+    plane = type(BY_NAME["quality"])("whole", ("y", "x"), "f4", "a plane")
+    damaged = tmp_path / "b.nc"
+    with netCDF4.Dataset(damaged, "w") as file:
+        lay_out(file, series, "a test", None)
+        define(file, plane, series, 1)
+    write_rasters(damaged, [(plane, values()["elevation"])])
+    raster = Raster(damaged, "whole", as_they_are)
+    size = damaged.stat().st_size
+    with damaged.open("r+b") as file:
+        file.seek(size - 60_000)
+        file.write(b"\xff" * 50_000)
+    with pytest.raises(StoreError, match="damaged"):
+        raster[:]

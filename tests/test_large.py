@@ -1,0 +1,25 @@
+"""A scan of the largest station: its memory does not grow with its points, nor its time beyond decoding."""
+
+import pytest
+
+from benchmarks.large import decoded, large_station, measured, prepared
+
+MOST_GB = 0.9
+POINTS = (1_440_000, 14_400_000)
+
+
+@pytest.mark.slow
+def test_memory_is_bounded_by_the_grid_not_by_the_points(tmp_path):
+    """4,000 x 5,000 cells, with the reference and the adjustment."""
+    peaks_gb = [measured(prepared(tmp_path, points)).peak_gb for points in POINTS]
+    assert max(peaks_gb) <= MOST_GB
+    assert max(peaks_gb) <= 1.1 * min(peaks_gb)
+
+
+def test_a_small_one_of_its_kind_is_adjusted_and_good(tmp_path):
+    site = prepared(tmp_path, 90_000, size=0.08)
+    taken = measured(site)  # raises where the verdict is not good
+    assert taken.points == pytest.approx(90_000, rel=0.02)
+    scan = max((site.parent / "inbox").glob("*.laz"))
+    assert decoded(scan).points == taken.points
+    assert large_station(tmp_path, 90_000, size=0.08) == site  # and not made again
