@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from datetime import UTC, datetime, timedelta
-from itertools import groupby, product
+from itertools import groupby
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +12,8 @@ import h5py
 import netCDF4
 
 from station.archive.layout import Series, define, written_whole
-from station.archive.series import HEAVY, Source, build_series, read_source, runs, write_words
+from station.archive.series import build_series, write_words
+from station.archive.sources import HEAVY, ORDINARY, Source, copy_chunks, is_laid_out_alike, read_source, runs
 from station.archive.store import JOINED, Row, epochs, joined, joined_revision, rows, rows_in, sources
 
 DAY_CLOSED = timedelta(hours=6)  # after its end; a later scan makes a new revision
@@ -37,7 +38,7 @@ def join_closed(series: Series, now: datetime, progress: Callable[[], None]) -> 
                 continue
             revision = 1 + max((joined_revision(path) for path in joined(series, kind, name)), default=0)
             place = series.folder / kind / found[0].start.strftime("%Y/%m" if kind == "days" else "%Y")
-            _join(series, held, place / f"{series.station_id}_{name}_r{revision}.nc", name, progress)
+            write_joined(series, held, place / f"{series.station_id}_{name}_r{revision}.nc", name, progress)
             made += 1
     if made:
         build_series(series)
@@ -61,7 +62,7 @@ def _is_joined(series: Series, found: list[Row], kind: str) -> bool:
     return kinds <= {"days", "months"} if kind == "days" else kinds == {"months"} and len(paths) == 1
 
 
-def _join(series: Series, held: list[Source], path: Path, name: str, progress: Callable[[], None]) -> None:
+def write_joined(series: Series, held: list[Source], path: Path, name: str, progress: Callable[[], None]) -> None:
     """Copy epochs into one file."""
     title = f"Elevation change at {series.name or series.station_id}, {name}"
     with written_whole(path) as beside:
@@ -70,7 +71,7 @@ def _join(series: Series, held: list[Source], path: Path, name: str, progress: C
             for row in HEAVY:
                 if any(row.name in source.shapes for source in held):
                     define(file, row, series, len(file["time"]))
-        with h5py.File(beside, "r+", libver=("earliest", "v110")) as file:
+        with h5py.File(beside, "r+", libver=ORDINARY) as file:
             for row in HEAVY:
                 if row.name in file:
                     file[row.name].resize(len(file["time"]), axis=0)
@@ -87,16 +88,11 @@ def _copy_rows(file: Any, source: Source, progress: Callable[[], None]) -> None:
 
 
 def _copy(origin: Any, first: int, made: Any, at: int) -> None:  # noqa: ANN401 - h5py has no types
-    """Copy a row of a large variable as it is, compressed: twenty times faster than decoding it."""
-    layout = ("chunks", "dtype", "compression", "compression_opts", "shuffle")
-    if any(getattr(origin, key) != getattr(made, key) for key in layout):  # written by an older version
+    """Copy a row of a large variable."""
+    if is_laid_out_alike(origin, made):
+        copy_chunks(origin, first, made, at)
+    else:  # written by an older version
         made[at] = origin[first]
-        return
-    steps = (range(0, size, step) for size, step in zip(origin.shape[1:], origin.chunks[1:], strict=True))
-    for corner in product(*steps):
-        if origin.id.get_chunk_info_by_coord((first, *corner)).size:  # nought where nothing was seen
-            mask, chunk = origin.id.read_direct_chunk((first, *corner))
-            made.id.write_direct_chunk((at, *corner), chunk, mask)
 
 
 def sweep(series: Series, now: datetime) -> list[Path]:
