@@ -29,7 +29,6 @@ from station.service.integrity import (
 )
 from station.service.journal import Entry, Journal, State
 from station.service.logs import logfmt
-from station.service.moved import moved_by
 from station.service.places import find_scan
 from station.service.references import (
     build_reference,
@@ -105,9 +104,7 @@ class Worker:
         self._mending(publish)
         remember(self._journal, arrival.name, outcome)
         _say(arrival.name, outcome)
-        if self._site.adjusts and (moved := self.run(moved_by, outcome.start_utc_s)):
-            log.warning("%s", logfmt(scan=arrival.name, moved=moved))
-        self.show()
+        self.show(arrival.name, outcome.start_utc_s)
         self._make_reference_when_due()
         return True
 
@@ -236,12 +233,20 @@ class Worker:
         self.show()
         return False
 
-    def show(self) -> None:
-        """Bring the page up to what is stored; what fails there keeps no scan from the store."""
+    def show(self, name: str = "", start_utc_s: float | None = None) -> None:
+        """Bring the page up to what is stored, and say if the scan just stored shows that the scanner moved.
+
+        What fails there keeps no scan from the store.
+        """
         try:
-            self.run(show)
+            shown = self.run(show, start_utc_s)
         except (StationError, RuntimeError) as error:
             log.warning("%s", logfmt(page="failed", reason=error))
+            return
+        if shown.news:
+            log.warning("%s", logfmt(scan=name, moved=shown.news))
+        if shown.fault:
+            log.warning("%s", logfmt(page="failed", reason=shown.fault))
 
     def _note_same(self, arrival: Arrival, same: Same) -> bool:
         """Put a scan back where it was, or aside if it is another's copy; tell whether it is stored."""
@@ -281,8 +286,7 @@ class Worker:
 
     def _usable(self) -> list[str]:
         """Return the scans that a reference may be made of, by their time."""
-        usable = [row for row in self._journal.rows(State.STORED) if row.verdict == "good"]
-        return [row.name for row in sorted(usable, key=lambda row: row.start_utc_s or 0.0)]
+        return self._journal.usable()
 
     def _make_reference_when_due(self) -> None:
         """Build the master surface once enough usable scans are stored; make a better one of ever more."""
@@ -317,9 +321,9 @@ class Worker:
 
     def _have_bare_done_again(self) -> None:
         """Redo what is stored without change: the power went between the reference and its first use."""
-        bare = [row.name for row in self._journal.rows(State.STORED) if not row.reference]
         inbox = self._site.scans.inbox
-        self._journal.again(name for name in bare if name in self._taken or (inbox / name).is_file())
+        again = [name for name in self._journal.bare() if name in self._taken or (inbox / name).is_file()]
+        self._journal.again(again)
 
     def _arrival(self, name: str) -> Arrival | None:
         """Find a scan again: where it was taken from, in the inbox or in the archive."""
