@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import fcntl
+import os
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from datetime import UTC, datetime, timedelta
 from itertools import groupby
 from pathlib import Path
@@ -12,37 +15,72 @@ import h5py
 import netCDF4
 
 from station.archive.layout import Series, define, written_whole
-from station.archive.series import build_series, write_words
+from station.archive.series import write_words
 from station.archive.sources import HEAVY, ORDINARY, Source, copy_chunks, is_laid_out_alike, read_source, runs
-from station.archive.store import JOINED, Row, epochs, joined, joined_revision, rows, rows_in, sources
+from station.archive.store import (
+    JOINED,
+    Row,
+    epochs,
+    joined,
+    joined_revision,
+    rows,
+    rows_in,
+    sources,
+    stored,
+)
 
 DAY_CLOSED = timedelta(hours=6)  # after its end; a later scan makes a new revision
 MONTH_CLOSED = timedelta(days=2)
 GRACE = timedelta(hours=48)  # a reader may hold an older series.nc as long
 
 
-def join_closed(series: Series, now: datetime, progress: Callable[[], None]) -> int:
-    """Join the epochs of closed days, and of closed months, anew where they are not; return how many files.
+def join_closed(
+    series: Series,
+    now: datetime,
+    progress: Callable[[], None],
+    prove: Callable[[Path], None] = lambda _: None,
+) -> list[Path]:
+    """Join the epochs of closed days, and of closed months, anew where they are not; return the files made.
 
-    Ends with a `series.nc` that names the joined files. Epochs that differ in their shared parameters (the
-    scanner was moved) are not joined with each other. `progress` is called after every epoch.
+    `series.nc` names them when it is built next. Epochs that differ in their shared parameters (the scanner was
+    moved) are not joined with each other. `progress` is called after every epoch; `prove` raises StoreError
+    where a file that is about to be copied is damaged. Nothing is done while another process joins.
     """
-    made = 0
-    for kind, stamp in JOINED.items():
-        for name, group in groupby(rows(series), key=lambda row: row.start.strftime(stamp)):
-            found = list(group)
-            if len(found) < 2 or not _closed(kind, found[0].start, now) or _is_joined(series, found, kind):
-                continue
-            held = [read_source(*run) for run in runs(found)]
-            if any(source.parameters != held[0].parameters for source in held):
-                continue
-            revision = 1 + max((joined_revision(path) for path in joined(series, kind, name)), default=0)
-            place = series.folder / kind / found[0].start.strftime("%Y/%m" if kind == "days" else "%Y")
-            write_joined(series, held, place / f"{series.station_id}_{name}_r{revision}.nc", name, progress)
-            made += 1
-    if made:
-        build_series(series)
+    made: list[Path] = []
+    with _only_here(series) as is_ours:
+        for kind, stamp in JOINED.items() if is_ours else ():
+            for name, group in groupby(rows(series), key=lambda row: row.start.strftime(stamp)):
+                found = list(group)
+                if len(found) < 2 or not _closed(kind, found[0].start, now) or _is_joined(series, found, kind):
+                    continue
+                held = [read_source(*run) for run in runs(found)]
+                if any(source.parameters != held[0].parameters for source in held):
+                    continue
+                revision = 1 + max((joined_revision(path) for path in joined(series, kind, name)), default=0)
+                place = series.folder / kind / found[0].start.strftime("%Y/%m" if kind == "days" else "%Y")
+                path = place / f"{series.station_id}_{name}_r{revision}.nc"
+                write_joined(series, held, path, name, progress, prove)
+                made.append(path)
     return made
+
+
+@contextmanager
+def _only_here(series: Series) -> Iterator[bool]:
+    """Tell whether no other process joins, and keep others from it: two would give one name to two files."""
+    folder = os.open(series.folder, os.O_RDONLY)
+    try:
+        fcntl.flock(folder, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        yield True
+    except BlockingIOError:
+        yield False
+    finally:
+        os.close(folder)
+
+
+def count_closed(series: Series, now: datetime) -> int:
+    """Return how many epochs of closed days the series finds in files of their own."""
+    alone = (stored(path) for path in sources(series.path))
+    return sum(one is not None and _closed("days", one.start, now) for one in alone)
 
 
 def _closed(kind: str, start: datetime, now: datetime) -> bool:
@@ -62,8 +100,15 @@ def _is_joined(series: Series, found: list[Row], kind: str) -> bool:
     return kinds <= {"days", "months"} if kind == "days" else kinds == {"months"} and len(paths) == 1
 
 
-def write_joined(series: Series, held: list[Source], path: Path, name: str, progress: Callable[[], None]) -> None:
-    """Copy epochs into one file."""
+def write_joined(
+    series: Series,
+    held: list[Source],
+    path: Path,
+    name: str,
+    progress: Callable[[], None],
+    prove: Callable[[Path], None] = lambda _: None,
+) -> None:
+    """Copy epochs into one file, called `name` in its title."""
     title = f"Elevation change at {series.name or series.station_id}, {name}"
     with written_whole(path) as beside:
         with netCDF4.Dataset(beside, "w", clobber=False) as file:
@@ -76,14 +121,16 @@ def write_joined(series: Series, held: list[Source], path: Path, name: str, prog
                 if row.name in file:
                     file[row.name].resize(len(file["time"]), axis=0)
             for source in held:
+                prove(source.path)
                 _copy_rows(file, source, progress)
 
 
 def _copy_rows(file: Any, source: Source, progress: Callable[[], None]) -> None:  # noqa: ANN401 - h5py has no types
     with h5py.File(source.path, "r") as origin:
+        pairs = [(origin[name], file[name]) for name in source.shapes]
         for row in range(source.count):
-            for name in source.shapes:
-                _copy(origin[name], source.first + row, file[name], source.at + row)
+            for one, made in pairs:
+                _copy(one, source.first + row, made, source.at + row)
             progress()
 
 

@@ -27,6 +27,7 @@ from station.service.integrity import (
     unopened,
     verify,
 )
+from station.service.joining import Joining
 from station.service.journal import Entry, Journal, State
 from station.service.logs import logfmt
 from station.service.places import find_scan
@@ -41,7 +42,7 @@ from station.service.retention import due_to_go, retire
 from station.service.show import show
 from station.service.stale import count_by_settings, late
 from station.service.tasks import Outcome, Past, Progress, Refused, Same, attend, open_only, series_of
-from station.service.upkeep import join_epochs, publish, sweep_store
+from station.service.upkeep import OPEN_EPOCHS, Checksums, join_epochs, publish, sweep_store
 
 log = logging.getLogger("station")
 T = TypeVar("T")
@@ -58,9 +59,12 @@ class Worker:
         *,
         on_progress: Progress = lambda: None,
         should_stop: Callable[[], bool] = lambda: False,
+        on_joined: Callable[[], None] = lambda: None,
         patient: bool = False,
     ) -> None:
-        """`patient`: as in the service, scans may wait for weather, and one only touched is not done again.
+        """`on_joined` is called, in another thread, when `note_joined` has something to do.
+
+        `patient`: as in the service, scans may wait for weather, and one only touched is not done again.
 
         Raises ConfigError where the store is of another grid.
         """
@@ -74,6 +78,7 @@ class Worker:
         self._taken: dict[str, Arrival] = {}
         self._verified_s = -math.inf
         self._told_stale = 0
+        self._joining = Joining(site, on_joined)
 
     def take(self, arrival: Arrival) -> bool:
         """Measure and store a scan, and say so in the journal and in one log line; tell whether it is stored.
@@ -101,11 +106,13 @@ class Worker:
             return self._set_aside(arrival, outcome.reason, outcome.sha256, outcome.log_sha256)
         if isinstance(outcome, Same):
             return self._note_same(arrival, outcome)
-        self._mending(publish)
+        alone = self._mending(publish)
         remember(self._journal, arrival.name, outcome)
         _say(arrival.name, outcome)
         self.show(arrival.name, outcome.start_utc_s)
         self._make_reference_when_due()
+        if self._patient and alone > OPEN_EPOCHS:
+            self.begin_joining()
         return True
 
     def glance(self, arrival: Arrival) -> None:
@@ -154,8 +161,31 @@ class Worker:
 
     def join_closed(self) -> None:
         """Join closed days and months; sum up the day that is over."""
-        self._mending(join_epochs)
-        self.seal()
+        self._note_joined(self._mending(join_epochs, self._journal.files()))
+
+    def begin_joining(self) -> None:
+        """Have closed days and months joined while scans are taken; `note_joined` ends it."""
+        self._joining.begin(self._journal.files())
+
+    def note_joined(self) -> None:
+        """Have the series name what was joined meanwhile, if that is done; sum up the day that is over."""
+        try:
+            made = self._joining.take()
+        except StoreError:
+            if not self._mend():
+                raise
+            return  # it is joined at its next time
+        if made is not None:
+            self._note_joined(made)
+
+    def close(self) -> None:
+        """End what is done beside the scans."""
+        self._joining.close()
+
+    def _note_joined(self, made: Checksums) -> None:
+        if made:
+            self._journal.note_files(made)
+            self._mending(publish)
         self._sum_up()
 
     def _sum_up(self) -> None:

@@ -127,6 +127,7 @@ def test_joining_days_computes_nothing(series, epoch, update, told):
     before = opened(update())
     told.asked.clear()
     join_closed(series, datetime(2026, 2, 1, tzinfo=UTC), lambda: None)
+    build_series(series)
     assert opened(update()).equals(before)
     (series.folder / "areas.nc").unlink()
     assert opened(update()).equals(before)
