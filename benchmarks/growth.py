@@ -127,7 +127,9 @@ def epoch_of(grid: Grid, start: datetime, seen: float = 0.31) -> store.Epoch:
         end_s=start.timestamp() + 900,
         scan_id=f"{start:%y%m%d_%H%M%S}",
         measurement=Measurement(surface, np.hypot(random_m, 0.01), random_m, there.astype(np.uint8), {}),
-        shared=Shared(of.names, of.units, random.normal(size=size) * 1e-5, np.eye(size) * 1e-10, np.zeros(size)),
+        shared=Shared(
+            of.names, of.units, random.normal(size=size) * 1e-5, np.eye(size) * 1e-10, np.zeros(size)
+        ),
         verdict="good",
         verdict_reason="",
         numbers={
@@ -321,7 +323,9 @@ def _join_once(series: Series, there: Connection) -> None:
     began_s, before_s = time.monotonic(), time.process_time()
     join.join_closed(series, datetime(2026, 7, 3, tzinfo=UTC), lambda: None)
     taken = time.monotonic() - began_s, time.process_time() - before_s
-    told = Path("/proc/self/status").read_text().split("VmHWM:")[1].split()[0]  # kB; rusage tells the parent's
+    told = (
+        Path("/proc/self/status").read_text().split("VmHWM:")[1].split()[0]
+    )  # kB; rusage tells the parent's
     there.send((*taken, int(told) / 2**20))
 
 

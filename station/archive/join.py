@@ -42,16 +42,20 @@ def join_closed(
 ) -> list[Path]:
     """Join the epochs of closed days, and of closed months, anew where they are not; return the files made.
 
-    `series.nc` names them when it is built next. Epochs that differ in their shared parameters (the scanner was
-    moved) are not joined with each other. `progress` is called after every epoch; `prove` raises StoreError
-    where a file that is about to be copied is damaged. Nothing is done while another process joins.
+    `series.nc` names them when it is built next. Epochs that differ in their shared parameters (the scanner
+    was moved) are not joined with each other. `progress` is called after every epoch; `prove` raises
+    StoreError where a file about to be copied is damaged. Nothing is done while another process joins.
     """
     made: list[Path] = []
     with _only_here(series) as is_ours:
         for kind, stamp in JOINED.items() if is_ours else ():
             for name, group in groupby(rows(series), key=lambda row: row.start.strftime(stamp)):
                 found = list(group)
-                if len(found) < 2 or not _closed(kind, found[0].start, now) or _is_joined(series, found, kind):
+                if (
+                    len(found) < 2
+                    or not _closed(kind, found[0].start, now)
+                    or _is_joined(series, found, kind)
+                ):
                     continue
                 held = [read_source(*run) for run in runs(found)]
                 if any(source.parameters != held[0].parameters for source in held):

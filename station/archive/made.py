@@ -79,7 +79,8 @@ def newer(series: Series) -> tuple[Made, list[Source]] | None:
     epochs = sorted((one for one in came if one is not None), key=lambda one: one.start)
     if len(epochs) < len(came):  # a joined file
         return None
-    start_s, last_s, fresh = made.newest_start_s, made.last_s, []
+    start_s, last_s = made.newest_start_s, made.last_s
+    fresh: list[Source] = []
     for one in epochs:
         source = read_source(one.path, 0, made.count + len(fresh), 1)
         time_s = float(source.words["time"][0])
@@ -104,9 +105,12 @@ def _noted(series: Series) -> dict[str, Any] | None:
 
 def _source(series: Series, told: dict[str, Any], parameters: Parameters) -> Source:
     own = told["parameters"]
+    first, at, count = told["rows"]
     return Source(
         series.folder / told["name"],
-        *told["rows"],
+        first,
+        at,
+        count,
         words={},
         shapes={name: tuple(shape) for name, shape in told["shapes"].items()},
         parameters=parameters if own is None else own,

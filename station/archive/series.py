@@ -27,6 +27,7 @@ from station.archive.sources import (
 from station.archive.store import rows, sources
 from station.archive.variables import FILL, Variable
 from station.errors import StoreError
+
 VIRTUAL = ("v110", "v110")  # bounds of the format: with newer ones only xarray can read it
 
 

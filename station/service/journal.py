@@ -312,9 +312,7 @@ class Journal:
 
     def bare(self) -> list[str]:
         """Return the scans stored without a change, by name."""
-        told = (
-            "SELECT name FROM scan WHERE state = 'stored' AND coalesce(reference, '') = '' ORDER BY name"
-        )
+        told = "SELECT name FROM scan WHERE state = 'stored' AND coalesce(reference, '') = '' ORDER BY name"
         with self._faults():
             return [name for (name,) in self._rows.execute(told)]
 

@@ -36,7 +36,7 @@ def moved(site: Site) -> str:
 
 
 def moved_by(site: Site, start_utc_s: float | None) -> tuple[str, str]:
-    """Say how the scanner was last moved, and again if the scan of this start shows it: without it nothing does.
+    """Say how the scanner was last moved, and again if it is the scan of this start that shows it.
 
     Raises StoreError where the series cannot be read.
     """

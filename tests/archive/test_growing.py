@@ -24,7 +24,7 @@ TOGETHER = 4  # epochs of a chunk, so that a dozen fill some
 class Told:
     """Says of an epoch its hour in centimetres."""
 
-    def area(self, cells, row):
+    def area(self, _, row):
         return AreaChange(row.start.hour / 100, 0.02, row.start.hour / 50, 0.03, 0.5)
 
 
@@ -50,17 +50,18 @@ def grown(series):
 def content(path):
     """Everything in a file: values, types, chunks, attributes, what is virtual of what."""
     with h5py.File(path) as file:
-        return {
-            name: (
-                one[...].tobytes() if one.shape is not None else None, one.dtype.str, one.shape, one.chunks,
-                {k: str(v) for k, v in one.attrs.items() if k not in {"DIMENSION_LIST", "REFERENCE_LIST"}},
-                [
-                    (m.file_name, m.dset_name, m.vspace.get_select_bounds(), m.src_space.get_select_bounds())
-                    for m in (one.virtual_sources() if one.is_virtual else ())
-                ],
-            )
-            for name, one in file.items()
-        } | {"attributes": {key: str(value) for key, value in file.attrs.items() if key != "_NCProperties"}}  # fmt: skip
+        told = {name: described(one) for name, one in file.items()}
+        return told | {"attributes": {k: str(v) for k, v in file.attrs.items() if k != "_NCProperties"}}
+
+
+def described(one):
+    attributes = {k: str(v) for k, v in one.attrs.items() if k not in {"DIMENSION_LIST", "REFERENCE_LIST"}}
+    parts = [
+        (part.file_name, part.dset_name, part.vspace.get_select_bounds(), part.src_space.get_select_bounds())
+        for part in (one.virtual_sources() if one.is_virtual else ())
+    ]
+    values = one[...].tobytes() if one.shape is not None else None
+    return values, one.dtype.str, one.shape, one.chunks, attributes, parts
 
 
 def contents(series):
