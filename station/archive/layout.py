@@ -279,4 +279,4 @@ def kept_of(value: str, dim: str) -> str:
 def strings(characters: np.ndarray[Any, Any]) -> list[str]:
     """Return characters (n, length) as strings: what `text` was given."""
     rows = np.ascontiguousarray(characters).view(f"S{characters.shape[-1]}")
-    return [value.decode("ascii") for value in rows[:, 0].tolist()]
+    return b"\0".join(rows[:, 0].tolist()).decode("ascii").split("\0") if len(rows) else []  # all at once

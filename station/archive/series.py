@@ -125,6 +125,7 @@ def _point_all(file: Any, series: Series, held: list[Source], parameters: Parame
     Below h5py's comfort, which takes most of the time of a hundred files.
     """
     paths = [os.path.relpath(source.path, series.folder).encode() for source in held]
+    known: dict[tuple[object, ...], list[tuple[Any, Any]]] = {}  # rasters lie alike
     for row in HEAVY:
         if not any(row.name in source.shapes for source in held):
             continue
@@ -133,30 +134,39 @@ def _point_all(file: Any, series: Series, held: list[Source], parameters: Parame
         layout.set_fill_value(np.array(FILL if row.dtype[0] == "f" else 0, row.dtype))
         for source, path in zip(held, paths, strict=True):
             if row.name in source.shapes:
-                for at, there, size in _pieces(source, row, parameters, shape):
-                    here, origin = (h5py.h5s.create_simple(one) for one in (shape, source.shapes[row.name]))
-                    here.select_hyperslab(at, size)
-                    origin.select_hyperslab(there, size)
+                key = (source.at, shape, source.shapes[row.name])
+                if key not in known:
+                    known[key] = list(_spaces(source, row, parameters, shape))
+                for here, origin in known[key]:
                     layout.set_virtual(here, path, row.name.encode(), origin)
         kind = h5py.h5t.py_create(np.dtype(row.dtype), logical=True)
         made = h5py.h5d.create(file.id, row.name.encode(), kind, h5py.h5s.create_simple(shape), layout)
         _dress(h5py.Dataset(made), file, row, series)
 
 
-def _pieces(
+def _spaces(
     source: Source, row: Variable, parameters: Parameters, shape: tuple[int, ...]
-) -> Iterator[tuple[tuple[int, ...], tuple[int, ...], tuple[int, ...]]]:
-    """Yield what of a large variable lies where: corner in the series, in the file, and size."""
+) -> Iterator[tuple[Any, Any]]:
+    """Yield what of a large variable lies where: in the series, and in the file."""
     if row.is_raster:
-        yield (source.at, 0, 0), (source.first, 0, 0), (source.count, *shape[1:])
-        return
-    blocks = _blocks(_places(source, parameters))
-    for (there_1, at_1, size_1), (there_2, at_2, size_2) in product(blocks, blocks):
-        yield (source.at, at_1, at_2), (source.first, there_1, there_2), (source.count, size_1, size_2)
+        pieces = [((source.at, 0, 0), (source.first, 0, 0), (source.count, *shape[1:]))]
+    else:
+        blocks = _blocks(_places(source, parameters))
+        pieces = [
+            ((source.at, at_1, at_2), (source.first, there_1, there_2), (source.count, size_1, size_2))
+            for (there_1, at_1, size_1), (there_2, at_2, size_2) in product(blocks, blocks)
+        ]
+    for at, there, size in pieces:
+        here, origin = (h5py.h5s.create_simple(one) for one in (shape, source.shapes[row.name]))
+        here.select_hyperslab(at, size)
+        origin.select_hyperslab(there, size)
+        yield here, origin
 
 
 def _blocks(places: list[int]) -> list[tuple[int, int, int]]:
     """Cut places into stretches that follow one another: (from, to, how many)."""
+    if places == list(range(len(places))):  # as nearly always
+        return [(0, 0, len(places))]
     blocks = []
     for _, group in groupby(enumerate(places), key=lambda pair: pair[1] - pair[0]):
         pairs = list(group)

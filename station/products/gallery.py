@@ -10,6 +10,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from datetime import datetime, timedelta
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from PIL import Image
@@ -29,9 +30,8 @@ GRACE_S = 3600.0  # a page that is open somewhere may still name a map that is k
 SIGMAS_TO_THE_END = 10.0
 
 
-@dataclass(frozen=True)
-class Measured:
-    """An epoch that has a reference."""
+class Measured(NamedTuple):
+    """An epoch that has a reference; thousands are made for a page."""
 
     rows: Sequence[Row]
     at: int  # its place among these

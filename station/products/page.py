@@ -137,11 +137,12 @@ def _health(record: Record, told: Told) -> dict[str, Any]:
     few = _picked(len(record))
     digits = {"platform_roll": 4, "platform_pitch": 4, "air_temperature": 1, "air_pressure": 1}
     digits |= {"stable_median": 4, "stable_nmad": 4, "stable_z_std": 2}
-    seconds = np.array([told.seconds.get(one, np.nan) for one in record.words["scan_id"]], dtype=np.float64)
+    shown = record.words["scan_id"][few]
+    seconds = np.array([told.seconds.get(one, np.nan) for one in shown], dtype=np.float64)
     return {
         "time_s": _numbers(record.start_s[few], 0),
         **{name: _numbers(record.numbers[name][few], places) for name, places in digits.items()},
-        "seconds": _numbers(seconds[few], 1),
+        "seconds": _numbers(seconds, 1),
     }
 
 

@@ -163,3 +163,16 @@ def test_what_else_a_series_says_is_brought_up_too(grown, epoch):
     build_series(dataclasses.replace(series, name="Kesselwandferner"))
     with h5py.File(series.path) as file:
         assert file.attrs["station_name"] == b"Kesselwandferner"
+
+
+@pytest.mark.slow
+def test_a_year_of_epochs_costs_hardly_more_than_a_few(tmp_path, monkeypatch):
+    """Fifteen times as many in as many files, windows of the page and of the poses full in both."""
+    from benchmarks import growth
+
+    monkeypatch.undo()
+    taken = []
+    for epochs in (600, 8760):
+        site = growth.station_of(tmp_path / str(epochs), growth.SMALL)
+        taken.append(sum(growth.cost(site, growth.fill(site, epochs)).values()))
+    assert taken[1] < 1.2 * taken[0]
