@@ -19,6 +19,7 @@ from station.archive.series import write_words
 from station.archive.sources import HEAVY, ORDINARY, Source, copy_chunks, is_laid_out_alike, read_source, runs
 from station.archive.store import (
     JOINED,
+    Named,
     Row,
     epochs,
     joined,
@@ -81,8 +82,14 @@ def _only_here(series: Series) -> Iterator[bool]:
         os.close(folder)
 
 
-def count_closed(series: Series, now: datetime) -> int:
-    """Return how many epochs of closed days the series finds in files of their own."""
+def now_of(series: Series) -> datetime:
+    """Return when the newest epoch of the series began: amid a backlog, days long over still fill."""
+    return datetime.fromtimestamp(float(Named(series).start_s[-1]), UTC)
+
+
+def count_closed(series: Series) -> int:
+    """Return how many epochs of days that are closed in the time of the series lie in files of their own."""
+    now = now_of(series)
     alone = (stored(path) for path in sources(series.path))
     return sum(one is not None and _closed("days", one.start, now) for one in alone)
 

@@ -24,10 +24,10 @@ class Joining:
         self._thread = ThreadPoolExecutor(max_workers=1)
         self._under_way: Future[Checksums] | None = None
 
-    def begin(self, known: Mapping[str, str]) -> None:
-        """Begin, unless it is under way; `known` are the checksums of the store's files."""
+    def begin(self, known: Mapping[str, str], *, in_backlog: bool) -> None:
+        """Begin, unless it is under way; see `upkeep.join_epochs`."""
         if self._under_way is None:
-            self._under_way = self._thread.submit(self._run, dict(known))
+            self._under_way = self._thread.submit(self._run, dict(known), in_backlog)
             self._under_way.add_done_callback(lambda _: self._on_done())
 
     def take(self) -> Checksums | None:
@@ -48,11 +48,12 @@ class Joining:
         self._stop.set()
         self._thread.shutdown()
 
-    def _run(self, known: Mapping[str, str]) -> Checksums:
+    def _run(self, known: Mapping[str, str], in_backlog: bool) -> Checksums:  # noqa: FBT001
         return child.run(
             join_beside,
             self._site,
             known,
+            in_backlog,
             memory_gb=self._site.service.memory_gb,
             timeout_s=math.inf,
             should_stop=self._stop.is_set,

@@ -34,20 +34,23 @@ def publish(site: Site, progress: Progress) -> int:
     series = series_of(site)
     settle_reference(series)
     if len(store.sources(series.path)) > MOST_SOURCES:
-        join.join_closed(series, datetime.now(UTC), progress)
+        join.join_closed(series, join.now_of(series), progress)
     build_series(series)
     progress()
     try:
         update_areas(series, areas_of(site), Aggregates(series), progress)
     except (OSError, RuntimeError) as error:
         raise StoreError(f"{series.folder}: an epoch is damaged: {error}") from error
-    return join.count_closed(series, datetime.now(UTC))
+    return join.count_closed(series)
 
 
-def join_epochs(site: Site, known: Mapping[str, str], progress: Progress) -> Checksums:
+def join_epochs(
+    site: Site, known: Mapping[str, str], progress: Progress, *, in_backlog: bool = False
+) -> Checksums:
     """Join closed days and months; return the checksums of the files that made.
 
-    `known` are those of the store's files. Raises StoreError where one that is to be joined does not match.
+    `known` are those of the store's files. `in_backlog`: what is closed in the time of the series. Raises
+    StoreError where a file that is to be joined does not match.
     """
     series = series_of(site)
 
@@ -57,7 +60,8 @@ def join_epochs(site: Site, known: Mapping[str, str], progress: Progress) -> Che
         if name in known and sha256_of(path) != known[name]:
             raise StoreError(f"{path}: damaged: its checksum is another")
 
-    made = join.join_closed(series, datetime.now(UTC), progress, prove) if store.listing(series) else []
+    now = join.now_of(series) if in_backlog else datetime.now(UTC)
+    made = join.join_closed(series, now, progress, prove) if store.listing(series) else []
     found = {}
     for path in made:
         progress()
@@ -65,10 +69,15 @@ def join_epochs(site: Site, known: Mapping[str, str], progress: Progress) -> Che
     return found
 
 
-def join_beside(site: Site, known: Mapping[str, str], progress: Progress) -> Checksums:
+def join_beside(
+    site: Site,
+    known: Mapping[str, str],
+    in_backlog: bool,  # noqa: FBT001 - a task has no keywords
+    progress: Progress,
+) -> Checksums:
     """Do as `join_epochs`, and let the scans that are taken meanwhile go first."""
     os.nice(LEAST_URGENT)
-    return join_epochs(site, known, progress)
+    return join_epochs(site, known, progress, in_backlog=in_backlog)
 
 
 def sweep_store(site: Site, progress: Progress) -> list[str]:

@@ -112,7 +112,7 @@ class Worker:
         self.show(arrival.name, outcome.start_utc_s)
         self._make_reference_when_due()
         if self._patient and alone > OPEN_EPOCHS:
-            self.begin_joining()
+            self.begin_joining(in_backlog=True)
         return True
 
     def glance(self, arrival: Arrival) -> None:
@@ -163,9 +163,9 @@ class Worker:
         """Join closed days and months; sum up the day that is over."""
         self._note_joined(self._mending(join_epochs, self._journal.files()))
 
-    def begin_joining(self) -> None:
+    def begin_joining(self, *, in_backlog: bool = False) -> None:
         """Have closed days and months joined while scans are taken; `note_joined` ends it."""
-        self._joining.begin(self._journal.files())
+        self._joining.begin(self._journal.files(), in_backlog=in_backlog)
 
     def note_joined(self) -> None:
         """Have the series name what was joined meanwhile, if that is done; sum up the day that is over."""

@@ -11,7 +11,7 @@ import xarray as xr
 
 import station
 from station.archive import store
-from station.archive.join import join_closed, sweep
+from station.archive.join import count_closed, join_closed, now_of, sweep
 from station.archive.series import build_series
 from station.archive.store import rows, sources
 from station.errors import StoreError
@@ -201,3 +201,17 @@ def test_a_source_that_is_gone_is_noticed(filled):
         assert np.isnan(told.elevation_change[1]).all()  # what others would read without a word
     with pytest.raises(StoreError, match="hef_20251121T050000Z"):
         station.open(filled.folder)
+
+
+def test_amid_a_backlog_a_day_is_joined_when_later_ones_have_come(series, epoch):
+    """By the clock of the wall all of it is long over, and would be joined anew with each scan."""
+    for hour in (1, 5, 9, 25, 29):
+        store.write_epoch(series, epoch(hour))
+        build_series(series)
+        assert count_closed(series) == 0
+    assert join(series, now_of(series)) == 0
+    store.write_epoch(series, epoch(31))
+    build_series(series)
+    assert count_closed(series) == 3
+    assert join(series, now_of(series)) == 1
+    assert count_closed(series) == 0
