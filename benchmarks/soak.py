@@ -53,6 +53,7 @@ def main() -> None:
     parser.add_argument("--scans", type=int, default=2000)
     parser.add_argument("--folder", type=Path)
     asked = parser.parse_args()
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell has its background jobs ignore it
     with tempfile.TemporaryDirectory() as passing:
         samples, counts = soak(asked.folder or Path(passing), asked.scans)
     _show(samples, counts)

@@ -14,9 +14,17 @@ import netCDF4
 import numpy as np
 
 from station.archive.aggregate import AreaChange
-from station.archive.layout import Series, define, introduce, strings, time_axis, written_whole
-from station.archive.series import read_source, runs
-from station.archive.store import Row, rows
+from station.archive.layout import (
+    TIMES_TOGETHER,
+    Series,
+    define,
+    introduce,
+    strings,
+    time_axis,
+    written_whole,
+)
+from station.archive.sources import ORDINARY, read_source, runs, take_over
+from station.archive.store import Named, Row
 from station.archive.variables import BY_NAME, FILL, TEXT, TEXT_LENGTH, Variable
 from station.quantities import Bools
 from station.science.change import SIGNIFICANT_SIGMAS
@@ -77,27 +85,31 @@ def update_areas(
     nothing, where there is no area or no epoch. `progress` is called after each epoch computed. Raises
     StoreError where an epoch is damaged or it cannot write; then the old file stays.
     """
-    found = rows(series) if areas else []
+    found = Named(series) if areas else ()
     if not found:
         return None
     path = series.folder / "areas.nc"
     masks = fingerprint(series, areas)
-    known = _read(path, masks, len(areas))
-    place = {key: index for index, key in enumerate(_keys(known))}
-    at = [place.get((row.time_s, row.epoch_file), LACKING) for row in found]
+    whole, known = _read(path, masks, len(areas), found)
+    place = {key: index for index, key in enumerate(_keys(known["time"], _names(known["epoch_file"])))}
+    at = [place.get(key, LACKING) for key in _keys(found.time_s[whole:], found.epoch_file[whole:])]
     if at == list(range(len(place))):
         return path
     size_m2 = np.array([np.count_nonzero(cells) for cells in areas.values()]) * series.grid.cell_m**2
-    lacking = [row for row, index in zip(found, at, strict=True) if index == LACKING]
+    lacking = [found[whole + index] for index, place in enumerate(at) if place == LACKING]
     measured = _measure(lacking, areas, size_m2, aggregator, progress)
     is_known = np.array(at) != LACKING
-    columns = _blank(len(found), len(areas))
+    columns = _blank(len(at), len(areas))
     for name, column in columns.items():
         column[is_known] = known[name][[index for index in at if index != LACKING]]
         column[~is_known] = measured[name]
-    with written_whole(path) as beside, netCDF4.Dataset(beside, "w", clobber=False) as file:
-        _write(file, series, tuple(areas), size_m2, columns)
-        file.setncattr(MASKS, masks)
+    with written_whole(path) as beside:
+        with netCDF4.Dataset(beside, "w", clobber=False) as file:
+            _write(file, series, tuple(areas), size_m2, columns, whole)
+            file.setncattr(MASKS, masks)
+        if whole:
+            with h5py.File(path, "r") as old, h5py.File(beside, "r+", libver=ORDINARY) as file:
+                take_over(old, file, tuple(columns), whole)
     return path
 
 
@@ -132,24 +144,38 @@ def _blank(times: int, areas: int) -> Columns:
     }
 
 
-def _keys(columns: Columns) -> list[tuple[float, str]]:
+def _keys(time_s: np.ndarray[Any, Any], epoch_file: np.ndarray[Any, Any]) -> list[tuple[float, bytes]]:
     """Return what tells one epoch from another: its time and file."""
-    return list(zip(columns["time"].tolist(), strings(columns["epoch_file"]), strict=True))
+    return list(zip(time_s.tolist(), epoch_file.tolist(), strict=True))
 
 
-def _read(path: Path, masks: str, areas: int) -> Columns:
-    """Read what the file holds of these areas: nothing where it is not there, damaged or of others."""
+def _names(letters: np.ndarray[Any, Any]) -> np.ndarray[Any, Any]:
+    """Return characters (n, length) as names (n,)."""
+    return np.ascontiguousarray(letters).view(f"S{letters.shape[-1]}")[:, 0]
+
+
+def _read(path: Path, masks: str, areas: int, named: Named) -> tuple[int, Columns]:
+    """Read what the file holds of these areas: how many epochs stand as they are, and what comes after them.
+
+    Those that stand fill whole chunks. Nothing where the file is not there, damaged or of other areas.
+    """
     blank = _blank(0, areas)
     try:
         with h5py.File(path, "r") as file:
             if file.attrs[MASKS] != np.bytes_(masks):
-                return blank
-            found = {name: np.asarray(file[name][:], dtype=blank[name].dtype) for name in blank}
+                return 0, blank
+            times = len(file["time"])
+            if any(file[name].shape != (times, *column.shape[1:]) for name, column in blank.items()):
+                return 0, blank
+            stands = np.array_equal(file["time"][:], named.time_s[:times])
+            stands = stands and np.array_equal(_names(file["epoch_file"][:]), named.epoch_file[:times])
+            stands = stands and all(file[name].chunks[0] == TIMES_TOGETHER for name in blank)
+            whole = times // TIMES_TOGETHER * TIMES_TOGETHER if stands else 0
+            return whole, {
+                name: np.asarray(file[name][whole:], dtype=column.dtype) for name, column in blank.items()
+            }
     except (OSError, RuntimeError, KeyError, TypeError, ValueError):
-        return blank
-    times = found["time"].shape
-    whole = all(found[name].shape == (*times, *column.shape[1:]) for name, column in blank.items())
-    return found if whole else blank
+        return 0, blank
 
 
 def _measure(
@@ -199,8 +225,10 @@ def _write(
     names: tuple[str, ...],
     size_m2: np.ndarray[Any, Any],
     columns: Columns,
+    first: int,
 ) -> None:
-    times = len(columns["time"])
+    """Write the areas, and their columns from the `first` epoch on."""
+    times = first + len(columns["time"])
     spelt = np.array([name.encode() for name in names])
     introduce(file, series, f"Elevation change of areas at {series.name or series.station_id}")
     for dim, length in {
@@ -220,5 +248,6 @@ def _write(
     file.set_auto_chartostring(False)
     file["area_name"].setncattr("_Encoding", "utf-8")
     letters = spelt.view("S1").reshape(len(names), -1)
-    for name, column in ({"area_name": letters, "area_size": size_m2} | columns).items():
-        file[name][:] = column
+    file["area_name"][:], file["area_size"][:] = letters, size_m2
+    for name, column in columns.items():
+        file[name][first:times] = column

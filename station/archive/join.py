@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import fcntl
+import os
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from datetime import UTC, datetime, timedelta
-from itertools import groupby, product
+from itertools import groupby
 from pathlib import Path
 from typing import Any
 
@@ -12,36 +15,83 @@ import h5py
 import netCDF4
 
 from station.archive.layout import Series, define, written_whole
-from station.archive.series import HEAVY, Source, build_series, read_source, runs, write_words
-from station.archive.store import JOINED, Row, epochs, joined, joined_revision, rows, rows_in, sources
+from station.archive.series import write_words
+from station.archive.sources import HEAVY, ORDINARY, Source, copy_chunks, is_laid_out_alike, read_source, runs
+from station.archive.store import (
+    JOINED,
+    Named,
+    Row,
+    epochs,
+    joined,
+    joined_revision,
+    rows,
+    rows_in,
+    sources,
+    stored,
+)
 
 DAY_CLOSED = timedelta(hours=6)  # after its end; a later scan makes a new revision
 MONTH_CLOSED = timedelta(days=2)
 GRACE = timedelta(hours=48)  # a reader may hold an older series.nc as long
 
 
-def join_closed(series: Series, now: datetime, progress: Callable[[], None]) -> int:
-    """Join the epochs of closed days, and of closed months, anew where they are not; return how many files.
+def join_closed(
+    series: Series,
+    now: datetime,
+    progress: Callable[[], None],
+    prove: Callable[[Path], None] = lambda _: None,
+) -> list[Path]:
+    """Join the epochs of closed days, and of closed months, anew where they are not; return the files made.
 
-    Ends with a `series.nc` that names the joined files. Epochs that differ in their shared parameters (the
-    scanner was moved) are not joined with each other. `progress` is called after every epoch.
+    `series.nc` names them when it is built next. Epochs that differ in their shared parameters (the scanner
+    was moved) are not joined with each other. `progress` is called after every epoch; `prove` raises
+    StoreError where a file about to be copied is damaged. Nothing is done while another process joins.
     """
-    made = 0
-    for kind, stamp in JOINED.items():
-        for name, group in groupby(rows(series), key=lambda row: row.start.strftime(stamp)):
-            found = list(group)
-            if len(found) < 2 or not _closed(kind, found[0].start, now) or _is_joined(series, found, kind):
-                continue
-            held = [read_source(*run) for run in runs(found)]
-            if any(source.parameters != held[0].parameters for source in held):
-                continue
-            revision = 1 + max((joined_revision(path) for path in joined(series, kind, name)), default=0)
-            place = series.folder / kind / found[0].start.strftime("%Y/%m" if kind == "days" else "%Y")
-            _join(series, held, place / f"{series.station_id}_{name}_r{revision}.nc", name, progress)
-            made += 1
-    if made:
-        build_series(series)
+    made: list[Path] = []
+    with _only_here(series) as is_ours:
+        for kind, stamp in JOINED.items() if is_ours else ():
+            for name, group in groupby(rows(series), key=lambda row: row.start.strftime(stamp)):
+                found = list(group)
+                if (
+                    len(found) < 2
+                    or not _closed(kind, found[0].start, now)
+                    or _is_joined(series, found, kind)
+                ):
+                    continue
+                held = [read_source(*run) for run in runs(found)]
+                if any(source.parameters != held[0].parameters for source in held):
+                    continue
+                revision = 1 + max((joined_revision(path) for path in joined(series, kind, name)), default=0)
+                place = series.folder / kind / found[0].start.strftime("%Y/%m" if kind == "days" else "%Y")
+                path = place / f"{series.station_id}_{name}_r{revision}.nc"
+                write_joined(series, held, path, name, progress, prove)
+                made.append(path)
     return made
+
+
+@contextmanager
+def _only_here(series: Series) -> Iterator[bool]:
+    """Tell whether no other process joins, and keep others from it: two would give one name to two files."""
+    folder = os.open(series.folder, os.O_RDONLY)
+    try:
+        fcntl.flock(folder, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        yield True
+    except BlockingIOError:
+        yield False
+    finally:
+        os.close(folder)
+
+
+def now_of(series: Series) -> datetime:
+    """Return when the newest epoch of the series began: amid a backlog, days long over still fill."""
+    return datetime.fromtimestamp(float(Named(series).start_s[-1]), UTC)
+
+
+def count_closed(series: Series) -> int:
+    """Return how many epochs of days that are closed in the time of the series lie in files of their own."""
+    now = now_of(series)
+    alone = (stored(path) for path in sources(series.path))
+    return sum(one is not None and _closed("days", one.start, now) for one in alone)
 
 
 def _closed(kind: str, start: datetime, now: datetime) -> bool:
@@ -61,8 +111,15 @@ def _is_joined(series: Series, found: list[Row], kind: str) -> bool:
     return kinds <= {"days", "months"} if kind == "days" else kinds == {"months"} and len(paths) == 1
 
 
-def _join(series: Series, held: list[Source], path: Path, name: str, progress: Callable[[], None]) -> None:
-    """Copy epochs into one file."""
+def write_joined(
+    series: Series,
+    held: list[Source],
+    path: Path,
+    name: str,
+    progress: Callable[[], None],
+    prove: Callable[[Path], None] = lambda _: None,
+) -> None:
+    """Copy epochs into one file, called `name` in its title."""
     title = f"Elevation change at {series.name or series.station_id}, {name}"
     with written_whole(path) as beside:
         with netCDF4.Dataset(beside, "w", clobber=False) as file:
@@ -70,33 +127,30 @@ def _join(series: Series, held: list[Source], path: Path, name: str, progress: C
             for row in HEAVY:
                 if any(row.name in source.shapes for source in held):
                     define(file, row, series, len(file["time"]))
-        with h5py.File(beside, "r+", libver=("earliest", "v110")) as file:
+        with h5py.File(beside, "r+", libver=ORDINARY) as file:
             for row in HEAVY:
                 if row.name in file:
                     file[row.name].resize(len(file["time"]), axis=0)
             for source in held:
+                prove(source.path)
                 _copy_rows(file, source, progress)
 
 
 def _copy_rows(file: Any, source: Source, progress: Callable[[], None]) -> None:  # noqa: ANN401 - h5py has no types
     with h5py.File(source.path, "r") as origin:
+        pairs = [(origin[name], file[name]) for name in source.shapes]
         for row in range(source.count):
-            for name in source.shapes:
-                _copy(origin[name], source.first + row, file[name], source.at + row)
+            for one, made in pairs:
+                _copy(one, source.first + row, made, source.at + row)
             progress()
 
 
 def _copy(origin: Any, first: int, made: Any, at: int) -> None:  # noqa: ANN401 - h5py has no types
-    """Copy a row of a large variable as it is, compressed: twenty times faster than decoding it."""
-    layout = ("chunks", "dtype", "compression", "compression_opts", "shuffle")
-    if any(getattr(origin, key) != getattr(made, key) for key in layout):  # written by an older version
+    """Copy a row of a large variable."""
+    if is_laid_out_alike(origin, made):
+        copy_chunks(origin, first, made, at)
+    else:  # written by an older version
         made[at] = origin[first]
-        return
-    steps = (range(0, size, step) for size, step in zip(origin.shape[1:], origin.chunks[1:], strict=True))
-    for corner in product(*steps):
-        if origin.id.get_chunk_info_by_coord((first, *corner)).size:  # nought where nothing was seen
-            mask, chunk = origin.id.read_direct_chunk((first, *corner))
-            made.id.write_direct_chunk((at, *corner), chunk, mask)
 
 
 def sweep(series: Series, now: datetime) -> list[Path]:

@@ -286,4 +286,5 @@ def _cut(value: str, dim: str) -> bytes:
 def strings(characters: np.ndarray[Any, Any]) -> list[str]:
     """Return characters (n, length) as strings: what `text` was given."""
     rows = np.ascontiguousarray(characters).view(f"S{characters.shape[-1]}")
-    return [value.decode(ENCODING, "replace") for value in rows[:, 0].tolist()]
+    together = b"\0".join(rows[:, 0].tolist())
+    return together.decode(ENCODING, "replace").split("\0") if len(rows) else []  # all at once

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import os
-from dataclasses import dataclass
-from itertools import groupby
+from collections.abc import Iterator
+from dataclasses import replace
+from itertools import groupby, product
 from pathlib import Path
 from typing import Any
 
@@ -12,36 +13,50 @@ import h5py
 import netCDF4
 import numpy as np
 
-from station.archive.layout import Series, attributes, define, lay_out, strings, written_whole
-from station.archive.store import Row, rows, sources
-from station.archive.variables import FILL, VARIABLES, Variable
+from station.archive.layout import TIMES_TOGETHER, Series, attributes, define, lay_out, written_whole
+from station.archive.made import Made, newer, note
+from station.archive.sources import (
+    HEAVY,
+    LIGHT,
+    Parameters,
+    Source,
+    read_source,
+    runs,
+    take_over,
+)
+from station.archive.store import rows, sources
+from station.archive.variables import FILL, Variable
 from station.errors import StoreError
 
-Parameters = dict[str, str]  # unit of each shared parameter, by its name
-
-PARAMETER = ("parameter_name", "parameter_unit")
-LIGHT = tuple(row for row in VARIABLES if not row.is_heavy)
-HEAVY = tuple(row for row in VARIABLES if row.is_heavy)
-
-
-@dataclass(frozen=True)
-class Source:
-    """A file that holds epochs: which of its rows are wanted, and all of it that is small."""
-
-    path: Path
-    first: int  # row of the file
-    at: int  # row of the series
-    count: int
-    words: dict[str, np.ndarray[Any, Any]]  # the wanted rows of every small variable
-    shapes: dict[str, tuple[int, ...]]  # of the large variables
-    parameters: Parameters
+VIRTUAL = ("v110", "v110")  # bounds of the format: with newer ones only xarray can read it
 
 
 def build_series(series: Series) -> Path:
-    """Write `series.nc` anew over the files that exist and put it in place of the old one.
+    """Bring `series.nc` up to the files that exist: a new one takes the place of the old.
 
-    Raises StoreError where a file is damaged, nothing is stored yet, or it cannot write.
+    Where only newer epochs came, what the old one holds of the others is taken over, and of the files only
+    theirs are opened. Raises StoreError where a file is damaged, nothing is stored yet, or it cannot write.
     """
+    grown = newer(series)
+    if grown is None:
+        return _build_anew(series)
+    made, fresh = grown
+    if not fresh:
+        return series.path
+    whole = made.count // TIMES_TOGETHER * TIMES_TOGETHER
+    known = read_source(series.path, whole, whole, made.count - whole)
+    with written_whole(series.path) as beside:
+        with netCDF4.Dataset(beside, "w", clobber=False) as file:
+            write_words(file, series, _title(series), [known, *fresh], made.parameters)
+        with h5py.File(beside, "r+", libver=VIRTUAL) as file:
+            with h5py.File(series.path, "r") as old:
+                take_over(old, file, ("time", "time_bnds", *(row.name for row in LIGHT)), whole)
+            _point_all(file, series, [*made.sources, *fresh], made.parameters)
+    note(series, replace(made, sources=[*made.sources, *fresh]))
+    return series.path
+
+
+def _build_anew(series: Series) -> Path:
     found = rows(series)
     if not found:
         raise StoreError(f"{series.folder}: nothing is stored yet")
@@ -51,14 +66,17 @@ def build_series(series: Series) -> Path:
         parameters = source.parameters | parameters
     with written_whole(series.path) as beside:
         with netCDF4.Dataset(beside, "w", clobber=False) as file:
-            title = f"Elevation change at {series.name or series.station_id}"
-            write_words(file, series, title, held, parameters)
-        with h5py.File(beside, "r+", libver=("v110", "v110")) as file:
-            for row in HEAVY:
-                if any(row.name in source.shapes for source in held):
-                    _point(file, series, row, held, parameters)
+            write_words(file, series, _title(series), held, parameters)
+        with h5py.File(beside, "r+", libver=VIRTUAL) as file:
+            _point_all(file, series, held, parameters)
         _retire(sources(series.path) - {source.path for source in held})
+    newest_start_s = max(row.start for row in found).timestamp()
+    note(series, Made(held, parameters, found[-1].time_s, newest_start_s))
     return series.path
+
+
+def _title(series: Series) -> str:
+    return f"Elevation change at {series.name or series.station_id}"
 
 
 def _retire(paths: set[Path]) -> None:
@@ -68,58 +86,16 @@ def _retire(paths: set[Path]) -> None:
             os.utime(path)
 
 
-def runs(found: list[Row]) -> list[tuple[Path, int, int, int]]:
-    """Group rows that lie in one file in the same order: (path, first row there, first row here, count)."""
-    grouped = groupby(enumerate(found), key=lambda pair: (pair[1].path, pair[1].index - pair[0]))
-    runs = []
-    for (path, shift), group in grouped:
-        at = [place for place, _ in group]
-        runs.append((path, at[0] + shift, at[0], len(at)))
-    return runs
-
-
-def read_source(path: Path, first: int, at: int, count: int) -> Source:
-    """Read what is small of some rows of a file; raise StoreError where it is damaged."""
-    wanted = slice(first, first + count)
-    try:
-        with h5py.File(path, "r") as file:
-            names = set(file)
-            light = {"time", "time_bnds", *(row.name for row in LIGHT)} & names
-            told = [
-                strings(_read(file, name)) for name in ("parameter_name", "parameter_unit") if name in names
-            ]
-            return Source(
-                path=path,
-                first=first,
-                at=at,
-                count=count,
-                words={name: _read(file, name)[wanted] for name in light},
-                shapes={row.name: _open(file, row.name).shape for row in HEAVY if row.name in names},
-                parameters=dict(zip(*told, strict=True)) if told else {},
-            )
-    except (OSError, RuntimeError, KeyError) as error:
-        raise StoreError(f"{path}: damaged, cannot be read: {error}") from error
-
-
-def _open(file: Any, name: str) -> Any:  # noqa: ANN401 - h5py has no types
-    """Open a variable. Below h5py's comfort, which takes most of the time of hundreds of small files."""
-    return h5py.h5d.open(file.id, name.encode())
-
-
-def _read(file: Any, name: str) -> np.ndarray[Any, Any]:  # noqa: ANN401
-    variable = _open(file, name)
-    values = np.empty(variable.shape, variable.dtype)
-    variable.read(h5py.h5s.ALL, h5py.h5s.ALL, values)
-    return values
-
-
 def write_words(
     file: netCDF4.Dataset, series: Series, title: str, held: list[Source], parameters: Parameters
 ) -> None:
-    """Write a file of many epochs but for its large variables. What a source lacks stays missing."""
+    """Write a file of many epochs but for its large variables. What a source lacks stays missing.
+
+    Epochs before the first source are left for others to write.
+    """
     file.set_auto_mask(False)
     file.set_auto_chartostring(False)
-    count = sum(source.count for source in held)
+    first, count = held[0].at, held[-1].at + held[-1].count
     lay_out(file, series, title, count, (tuple(parameters), tuple(parameters.values())))
     for row in LIGHT:
         if all(dim in file.dimensions for dim in row.dims):
@@ -128,13 +104,13 @@ def write_words(
         if variable.dimensions[:1] != ("time",):
             continue
         fill = {"S": b"", "f": FILL}.get(variable.dtype.kind, 0)
-        values = np.full((count, *variable.shape[1:]), fill, variable.dtype)
+        values = np.full((count - first, *variable.shape[1:]), fill, variable.dtype)
         for source in held:
             if name in source.words:
-                at = slice(source.at, source.at + source.count)
+                at = slice(source.at - first, source.at + source.count - first)
                 where = _places(source, parameters) if "parameter" in variable.dimensions else ...
                 values[at, where] = source.words[name]
-        variable[:] = values
+        variable[first:count] = values
 
 
 def _places(source: Source, parameters: Parameters) -> list[int]:
@@ -143,34 +119,58 @@ def _places(source: Source, parameters: Parameters) -> list[int]:
     return [place[name] for name in source.parameters]
 
 
-def _point(file: Any, series: Series, row: Variable, held: list[Source], parameters: Parameters) -> None:  # noqa: ANN401 - h5py has no types
-    """Add a large variable as a virtual one, with paths relative to the series."""
-    shape = tuple(len(file[dim]) for dim in row.dims)
-    layout = h5py.VirtualLayout(shape, row.dtype)
-    for source in held:
-        if row.name not in source.shapes:
+def _point_all(file: Any, series: Series, held: list[Source], parameters: Parameters) -> None:  # noqa: ANN401 - h5py has no types
+    """Add the large variables as virtual ones, with paths relative to the series.
+
+    Below h5py's comfort, which takes most of the time of a hundred files.
+    """
+    paths = [os.path.relpath(source.path, series.folder).encode() for source in held]
+    known: dict[tuple[object, ...], list[tuple[Any, Any]]] = {}  # rasters lie alike
+    for row in HEAVY:
+        if not any(row.name in source.shapes for source in held):
             continue
-        whole = source.shapes[row.name]
-        origin = h5py.VirtualSource(os.path.relpath(source.path, series.folder), row.name, whole, row.dtype)
-        at, there = (slice(start, start + source.count) for start in (source.at, source.first))
-        if row.is_raster:
-            layout[at] = origin if source.count == whole[0] else origin[there]
-            continue
+        shape = tuple(len(file[dim]) for dim in row.dims)
+        layout = h5py.h5p.create(h5py.h5p.DATASET_CREATE)
+        layout.set_fill_value(np.array(FILL if row.dtype[0] == "f" else 0, row.dtype))
+        for source, path in zip(held, paths, strict=True):
+            if row.name in source.shapes:
+                key = (source.at, shape, source.shapes[row.name])
+                if key not in known:
+                    known[key] = list(_spaces(source, row, parameters, shape))
+                for here, origin in known[key]:
+                    layout.set_virtual(here, path, row.name.encode(), origin)
+        kind = h5py.h5t.py_create(np.dtype(row.dtype), logical=True)
+        made = h5py.h5d.create(file.id, row.name.encode(), kind, h5py.h5s.create_simple(shape), layout)
+        _dress(h5py.Dataset(made), file, row, series)
+
+
+def _spaces(
+    source: Source, row: Variable, parameters: Parameters, shape: tuple[int, ...]
+) -> Iterator[tuple[Any, Any]]:
+    """Yield what of a large variable lies where: in the series, and in the file."""
+    if row.is_raster:
+        pieces = [((source.at, 0, 0), (source.first, 0, 0), (source.count, *shape[1:]))]
+    else:
         blocks = _blocks(_places(source, parameters))
-        for there_1, at_1 in blocks:
-            for there_2, at_2 in blocks:
-                layout[at, at_1, at_2] = origin[there, there_1, there_2]
-    fill = FILL if row.dtype[0] == "f" else 0
-    _dress(file.create_virtual_dataset(row.name, layout, fillvalue=fill), file, row, series)
+        pieces = [
+            ((source.at, at_1, at_2), (source.first, there_1, there_2), (source.count, size_1, size_2))
+            for (there_1, at_1, size_1), (there_2, at_2, size_2) in product(blocks, blocks)
+        ]
+    for at, there, size in pieces:
+        here, origin = (h5py.h5s.create_simple(one) for one in (shape, source.shapes[row.name]))
+        here.select_hyperslab(at, size)
+        origin.select_hyperslab(there, size)
+        yield here, origin
 
 
-def _blocks(places: list[int]) -> list[tuple[slice, slice]]:
-    """Cut places into stretches that follow one another: pairs of (from, to)."""
+def _blocks(places: list[int]) -> list[tuple[int, int, int]]:
+    """Cut places into stretches that follow one another: (from, to, how many)."""
+    if places == list(range(len(places))):  # as nearly always
+        return [(0, 0, len(places))]
     blocks = []
     for _, group in groupby(enumerate(places), key=lambda pair: pair[1] - pair[0]):
         pairs = list(group)
-        (first, to), count = pairs[0], len(pairs)
-        blocks.append((slice(first, first + count), slice(to, to + count)))
+        blocks.append((*pairs[0], len(pairs)))
     return blocks
 
 

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import os
 import re
+from bisect import bisect_right
+from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, overload
 
 import h5py
 import netCDF4
@@ -14,7 +17,7 @@ import numpy as np
 
 from station.archive.layout import Series, define, lay_out, strings, text, written_whole
 from station.archive.rasters import write_rasters
-from station.archive.variables import BY_NAME, TERMS, VARIABLES, VERDICTS, Variable
+from station.archive.variables import BY_NAME, TERMS, TEXT_LENGTH, VARIABLES, VERDICTS, Variable
 from station.errors import StoreError
 from station.quantities import Grid, Measurement, Shared
 
@@ -114,6 +117,16 @@ def stored(path: Path) -> Stored | None:
     return Stored(path, start, int(told[2] or 1))
 
 
+def listing(series: Series) -> set[str]:
+    """Return every file that holds epochs, relative to the store."""
+    found = set()
+    for kind in ("epochs", *JOINED):
+        for folder, _, names in os.walk(series.folder / kind):
+            place = os.path.relpath(folder, series.folder)
+            found |= {f"{place}/{name}" for name in names if name.endswith(".nc") and name[0] != "."}
+    return found
+
+
 def joined(series: Series, kind: str, name: str = "*") -> list[Path]:
     """Return the joined files of `kind` (days or months) and of the day or month `name`, oldest first."""
     found = (series.folder / kind).glob(f"**/{series.station_id}_{name}_r*.nc")
@@ -169,6 +182,58 @@ def _increasing(found: list[Row]) -> list[Row]:
         if not kept or row.time_s > kept[-1].time_s:
             kept.append(row)
     return kept
+
+
+class Named(Sequence[Row]):
+    """The epochs that a `series.nc` names, as it tells them: no other file is opened, no row made in vain.
+
+    `time_s` and `start_s` (n,) are in seconds since 1970, `epoch_file` (n,) holds names as bytes.
+    """
+
+    def __init__(self, series: Series) -> None:
+        """Raise StoreError where it cannot be read; without a series there are none."""
+        self.time_s, self.start_s = np.empty((2, 0))
+        self.epoch_file = np.empty(0, f"S{TEXT_LENGTH['text']}")
+        self._at: list[int] = []  # row at which each file begins
+        self._there: list[tuple[Path, int]] = []
+        if not series.path.is_file():
+            return
+        try:
+            with h5py.File(series.path, "r") as file:
+                self.time_s = np.asarray(file["time"][:], dtype=np.float64)
+                self.start_s = np.asarray(file["time_bnds"][:, 0], dtype=np.float64)
+                self.epoch_file = file["epoch_file"][:].view(self.epoch_file.dtype)[:, 0]
+                for one in file["elevation"].virtual_sources():
+                    whole = one.src_space.get_select_type() == h5py.h5s.SEL_ALL
+                    first = 0 if whole else one.src_space.get_select_bounds()[0][0]
+                    self._at.append(one.vspace.get_select_bounds()[0][0])
+                    self._there.append((series.folder / one.file_name, first))
+        except (OSError, RuntimeError, KeyError, ValueError) as error:
+            raise StoreError(f"{series.path}: damaged, cannot be read: {error}") from error
+
+    def __len__(self) -> int:
+        """Return how many there are."""
+        return len(self.time_s)
+
+    @overload
+    def __getitem__(self, at: int) -> Row: ...
+
+    @overload
+    def __getitem__(self, at: slice) -> list[Row]: ...
+
+    def __getitem__(self, at: int | slice) -> Row | list[Row]:
+        """Return an epoch, or several."""
+        if isinstance(at, slice):
+            return [self[index] for index in range(*at.indices(len(self)))]
+        index = range(len(self))[at]
+        name = self.epoch_file[index].decode("ascii")
+        told = stored(Path(name))
+        if told is None:
+            raise StoreError(f"series.nc: damaged, names no epoch file in row {index}")
+        place = bisect_right(self._at, index) - 1
+        path, first = self._there[place]
+        there = first + index - self._at[place]
+        return Row(name, told.start, told.revision, path, there, float(self.time_s[index]))
 
 
 def sources(series_path: Path) -> set[Path]:

@@ -6,10 +6,11 @@ import hashlib
 import json
 import time
 import zipfile
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from datetime import datetime, timedelta
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from PIL import Image
@@ -27,6 +28,21 @@ DAILY_FOR = timedelta(days=60)  # … and before that the last of each month
 MOST_DRAWN = 8  # at a time: an archive that was there before the page is shown bit by bit
 GRACE_S = 3600.0  # a page that is open somewhere may still name a map that is kept no longer
 SIGMAS_TO_THE_END = 10.0
+
+
+class Measured(NamedTuple):
+    """An epoch that has a reference; thousands are made for a page."""
+
+    rows: Sequence[Row]
+    at: int  # its place among these
+    start: datetime
+    version: str  # of the reference
+    verdict: str  # what the caption says of it
+
+    @property
+    def row(self) -> Row:
+        """Return where it lies."""
+        return self.rows[self.at]
 
 
 @dataclass(frozen=True)
@@ -60,14 +76,14 @@ class Gallery:
 def hang(
     series: Series,
     folder: Path,
-    found: list[tuple[Row, str, str]],
+    found: list[Measured],
     style: Style,
     progress: Callable[[], None],
 ) -> Gallery:
     """Draw the maps that lack, newest first, and take down those that are kept no longer.
 
-    `found` are the epochs that have a reference, in the order of time: row, its version, what the caption
-    says of its verdict. Raises StoreError where something cannot be read or written.
+    `found` are the epochs that have a reference, in the order of time. Raises StoreError where something
+    cannot be read or written.
     """
     if not found:
         return Gallery([], None, None, style.limit_m, (0, 0))
@@ -75,16 +91,17 @@ def hang(
     told = json.dumps([style.station, style.width_px, limit_m, __version__])
     tag = hashlib.sha256(told.encode()).hexdigest()[:8]
     place = folder / "maps"
-    kept = [found[index] for index in thinned([row.start for row, _, _ in found])]
+    kept = [found[index] for index in thinned([one.start for one in found])]
     drawn, hung = 0, []
-    for row, version, verdict in reversed(kept):
+    for one in reversed(kept):
+        row = one.row
         name = f"{Path(row.epoch_file).stem}_{tag}.webp"
-        last = row is found[-1][0]
-        if not all((place / one).is_file() for one in _names(name, last=last)):
+        last = one is found[-1]
+        if not all((place / file).is_file() for file in _names(name, last=last)):
             if drawn == MOST_DRAWN:
                 continue
-            caption = Caption(style.station, f"{row.start:%Y-%m-%d %H:%M} UTC", verdict)
-            _draw(series, folder, row, version, caption, style.width_px, limit_m, name, last=last)
+            caption = Caption(style.station, f"{row.start:%Y-%m-%d %H:%M} UTC", one.verdict)
+            _draw(series, folder, row, one.version, caption, style.width_px, limit_m, name, last=last)
             drawn += 1
             progress()
         hung.append(Hung(row.start, f"maps/{name}"))
@@ -175,14 +192,14 @@ def kept_base(series: Series, folder: Path, version: str, pixels: int) -> Base:
     return base
 
 
-def _limit(series: Series, folder: Path, first: tuple[Row, str, str]) -> float:
+def _limit(series: Series, folder: Path, first: Measured) -> float:
     """Return where the colours of change end [m]: fixed once, by the first epoch there is then."""
     path = folder / "limit.json"
     try:
         return float(json.loads(path.read_text(encoding="ascii"))["change_limit_m"])
     except (OSError, ValueError, KeyError, TypeError):
         pass
-    limit_m = default_limit(series, *first[:2])
+    limit_m = default_limit(series, first.row, first.version)
     put(path, json.dumps({"change_limit_m": limit_m}).encode("ascii"))
     return limit_m
 

@@ -15,8 +15,8 @@ import numpy as np
 
 from station import __version__
 from station.archive.layout import Series
-from station.archive.store import rows
-from station.products.gallery import Gallery, Style, hang, put
+from station.archive.store import Named
+from station.products.gallery import Gallery, Measured, Style, hang, put
 from station.products.maps import ASSETS
 from station.products.record import AreaRecord, Record, read_areas, read_record
 from station.quantities import Floats
@@ -63,13 +63,14 @@ def write_page(
     Maps come first, then the data, then the page that names them.
     """
     record = read_record(series) if series.path.is_file() else None
-    areas = read_areas(series)[:MOST_AREAS]
+    all_areas = read_areas(series)
+    areas = all_areas[:MOST_AREAS]
     if record is not None:
         areas = [_without_unusable(area, record) for area in areas]
     gallery = Gallery([], None, None, None, (0, 0))
     if record is not None:
         style = Style(told.name or series.station_id, width_px, limit_m)
-        gallery = hang(series, folder, _epochs(series, record), style, progress)
+        gallery = hang(series, folder, _measured(series, record), style, progress)
     for name, parts in STATIC.items():
         put(folder / name, b"".join((ASSETS / part).read_bytes() for part in parts))
     data = {
@@ -83,7 +84,7 @@ def write_page(
     }
     _script(folder / "data.js", "STATION", data)
     _script(folder / "written.js", "STATION_WRITTEN_S", told.written_s)
-    put(folder / "index.html", _rendered(series, told, record, areas, gallery).encode())
+    put(folder / "index.html", _rendered(series, told, record, areas, gallery, len(all_areas)).encode())
 
 
 def _script(path: Path, name: str, value: object) -> None:
@@ -92,20 +93,17 @@ def _script(path: Path, name: str, value: object) -> None:
     put(path, f"window.{name}={body};\n".encode("ascii"))
 
 
-def _epochs(series: Series, record: Record) -> list[tuple[Any, str, str]]:
-    """Return the epochs that have a reference: where each lies, its version, what its verdict is."""
-    told = {
-        name: (version, "" if verdict == "good" else f"{verdict}: {reason}")
-        for name, version, verdict, reason in zip(
-            record.words["epoch_file"],
-            record.words["reference_version"],
-            record.verdict,
-            record.words["verdict_reason"],
-            strict=True,
-        )
-    }
-    known = ((row, *told.get(row.epoch_file, ("", ""))) for row in rows(series))
-    return [one for one in known if one[1]]
+def _measured(series: Series, record: Record) -> list[Measured]:
+    """Return the epochs that have a reference."""
+    rows = Named(series)
+    starts = (datetime.fromtimestamp(start_s, UTC) for start_s in record.start_s.tolist())
+    told = zip(starts, record.words["reference_version"], record.verdict, strict=True)
+    reasons = record.words["verdict_reason"]
+    return [
+        Measured(rows, at, start, version, "" if verdict == "good" else f"{verdict}: {reasons[at]}")
+        for at, (start, version, verdict) in enumerate(told)
+        if version
+    ]
 
 
 def _picked(count: int) -> slice:
@@ -139,24 +137,25 @@ def _health(record: Record, told: Told) -> dict[str, Any]:
     few = _picked(len(record))
     digits = {"platform_roll": 4, "platform_pitch": 4, "air_temperature": 1, "air_pressure": 1}
     digits |= {"stable_median": 4, "stable_nmad": 4, "stable_z_std": 2}
-    seconds = np.array([told.seconds.get(one, np.nan) for one in record.words["scan_id"]], dtype=np.float64)
+    shown = record.words["scan_id"][few]
+    seconds = np.array([told.seconds.get(one, np.nan) for one in shown], dtype=np.float64)
     return {
         "time_s": _numbers(record.start_s[few], 0),
         **{name: _numbers(record.numbers[name][few], places) for name, places in digits.items()},
-        "seconds": _numbers(seconds[few], 1),
+        "seconds": _numbers(seconds, 1),
     }
 
 
 def _rendered(
-    series: Series, told: Told, record: Record | None, areas: list[AreaRecord], gallery: Gallery
+    series: Series,
+    told: Told,
+    record: Record | None,
+    areas: list[AreaRecord],
+    gallery: Gallery,
+    area_count: int,
 ) -> str:
-    environment = jinja2.Environment(
-        loader=jinja2.FileSystemLoader(ASSETS), autoescape=True, undefined=jinja2.StrictUndefined,
-        trim_blocks=True, lstrip_blocks=True,
-    )  # fmt: skip
-    environment.filters |= {"number": _number, "utc": _utc}
     recent = range(max(0, len(record) - TABLE_ROWS), len(record))[::-1] if record is not None else []
-    return environment.get_template("page.html").render(
+    return PAGE.render(
         id=series.station_id,
         told=told,
         version=__version__,
@@ -167,7 +166,7 @@ def _rendered(
         waiting=told.waiting[:LISTED],
         set_aside=told.set_aside[-LISTED:][::-1],
         listed=LISTED,
-        areas_left_out=len(read_areas(series)) - len(areas),
+        areas_left_out=area_count - len(areas),
     )
 
 
@@ -218,3 +217,15 @@ def _number(value: float | None, digits: int, sign: bool = False) -> str:  # noq
 
 def _utc(moment_s: float) -> str:
     return f"{datetime.fromtimestamp(moment_s, UTC):%Y-%m-%d %H:%M}"
+
+
+def _template() -> jinja2.Template:
+    environment = jinja2.Environment(
+        loader=jinja2.FileSystemLoader(ASSETS), autoescape=True, undefined=jinja2.StrictUndefined,
+        trim_blocks=True, lstrip_blocks=True,
+    )  # fmt: skip
+    environment.filters |= {"number": _number, "utc": _utc}
+    return environment.get_template("page.html")
+
+
+PAGE = _template()  # once, before children are forked: compiling it takes as long as drawing a map

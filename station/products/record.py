@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import h5py
 import netCDF4
 import numpy as np
 
 from station.archive.areas import AREA_VARIABLES
 from station.archive.layout import Series, strings
-from station.archive.variables import VERDICTS
+from station.archive.variables import FILL, VERDICTS
 from station.errors import StoreError
 from station.quantities import Floats
 
@@ -47,13 +48,13 @@ class AreaRecord:
 def read_record(series: Series) -> Record:
     """Read it from `series.nc`; raise StoreError where that cannot be."""
     try:
-        with netCDF4.Dataset(series.path) as file:
-            file.set_auto_chartostring(False)
+        with h5py.File(series.path, "r") as file:
+            numbers = {name: np.asarray(file[name][:], dtype=np.float64) for name in NUMBERS}
             return Record(
                 start_s=np.asarray(file["time_bnds"][:, 0], dtype=np.float64),
-                verdict=[VERDICTS[int(one)] for one in file["verdict"][:]],
-                numbers={name: _column(file[name]) for name in NUMBERS},
-                words={name: strings(np.ma.getdata(file[name][:])) for name in WORDS},
+                verdict=[VERDICTS[one] for one in file["verdict"][:].tolist()],
+                numbers={name: np.where(one < FILL / 2, one, np.nan) for name, one in numbers.items()},
+                words={name: strings(file[name][:]) for name in WORDS},
             )
     except (OSError, RuntimeError, KeyError, IndexError) as error:
         raise StoreError(f"{series.path}: cannot be read: {error}") from error

@@ -54,17 +54,24 @@ def steps(time_s: Floats, pose: Floats, habit: Floats) -> list[Step]:
     """
     level = pose.astype(np.float64).copy()
     told: list[Step] = []
+    drifts: dict[int, _Drift] = {}  # by the scan they are known up to: three newest scans ask for each
     for newest in range(FEWEST - 1, len(level)):
         since = told[-1].last_before + 1 if told else 0
-        found = _step_at(time_s[: newest + 1], level[: newest + 1], habit, since)
+        found = _step_at(time_s[: newest + 1], level[: newest + 1], habit, since, drifts)
         if found is not None:
             told.append(found)
             level[found.last_before + 1 :] -= found.size
+            drifts.clear()
     return told
 
 
-def _step_at(time_s: Floats, level: Floats, habit: Floats, since: int) -> Step | None:
-    """Return the most significant step after which just scans enough have come, if it is significant."""
+def _step_at(
+    time_s: Floats, level: Floats, habit: Floats, since: int, drifts: dict[int, _Drift]
+) -> Step | None:
+    """Return the most significant step after which just scans enough have come, if it is significant.
+
+    `drifts` are those found before, by the last scan that each was learned from.
+    """
     newest = len(level) - 1
     best: Step | None = None
     for after in range(AFTER[0], AFTER[1] + 1):
@@ -72,8 +79,10 @@ def _step_at(time_s: Floats, level: Floats, habit: Floats, since: int) -> Step |
         if newest - after < since:
             continue
         known = slice(max(newest - after + 1 - HISTORY, 0), newest - after + 1)
-        drift = _drift(time_s[known], level[known], habit)
-        apart = np.median(level[newest - after + 1 :], axis=0) - np.median(level[known][-LATELY:], axis=0)
+        if newest - after not in drifts:
+            drifts[newest - after] = _drift(time_s[known], level[known], habit)
+        drift = drifts[newest - after]
+        apart = _median(level[newest - after + 1 :]) - _median(level[known][-LATELY:])
         if np.all(apart**2 < QUIET**2 * drift.noise):
             continue
         window = slice(first, newest + 1)
@@ -97,16 +106,23 @@ class _Drift:
 def _drift(time_s: Floats, level: Floats, habit: Floats) -> _Drift:
     """Learn how a pose moves from the median differences over several lags, which outliers leave alone."""
     lags = np.array([lag for lag in LAGS if lag < len(level) / 2])
-    apart_s = np.array([np.median(time_s[lag:] - time_s[:-lag]) for lag in lags])
-    found = np.stack([(1.4826 * np.median(np.abs(level[lag:] - level[:-lag]), axis=0)) ** 2 for lag in lags])
+    apart_s = np.array([_median(time_s[lag:] - time_s[:-lag]) for lag in lags])
+    found = np.stack([(1.4826 * _median(np.abs(level[lag:] - level[:-lag]))) ** 2 for lag in lags])
     design = np.stack([apart_s / apart_s[0], np.full(len(lags), 2.0)], axis=-1)
     walk, noise = np.linalg.lstsq(design, found, rcond=None)[0]
     scans = len(level)
     worth = HABITS_WORTH / (scans + HABITS_WORTH)
     walk = np.clip(walk, 0.02 * found[0], found[0]) * (1 - worth) + habit**2 * worth
     noise = np.maximum(noise, 0.1 * found[0]) * (1 - worth) + habit**2 * worth
-    one_apart = np.median(np.abs(np.diff(level, axis=0)), axis=0)
+    one_apart = _median(np.abs(np.diff(level, axis=0)))
     return _Drift(walk / apart_s[0], noise, one_apart**2 + noise)
+
+
+def _median(values: Floats) -> Floats:
+    """Median over the first axis: of so few values, numpy's own takes several times as long."""
+    half, rest = divmod(len(values), 2)
+    parted = np.partition(values, half if rest else (half - 1, half), axis=0)
+    return np.asarray(parted[half] if rest else (parted[half - 1] + parted[half]) / 2)
 
 
 def _fit(time_s: Floats, level: Floats, later: Bools, drift: _Drift) -> tuple[Floats, Floats, Bools]:

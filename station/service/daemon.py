@@ -40,7 +40,9 @@ class Takes(Protocol):
     def recover(self) -> None: ...  # noqa: D102
     def take(self, arrival: Arrival) -> bool: ...  # noqa: D102
     def glance(self, arrival: Arrival) -> None: ...  # noqa: D102
-    def join_closed(self) -> None: ...  # noqa: D102
+    def begin_joining(self) -> None: ...  # noqa: D102
+    def note_joined(self) -> None: ...  # noqa: D102
+    def close(self) -> None: ...  # noqa: D102
     def sweep(self) -> None: ...  # noqa: D102
 
 
@@ -145,6 +147,9 @@ class Daemon:
             self._due.discard(Wake.EXPECTED)
             self._note_silence()
             self._metrics.write()
+        if Wake.JOINED in self._due:
+            self._due.discard(Wake.JOINED)
+            worker.note_joined()
         self._looked_s = time.monotonic()
         listing = inbox.look()
         self._note_new(listing.new)
@@ -171,7 +176,7 @@ class Daemon:
 
     def _tidy(self, worker: Takes) -> None:
         """Do what the clockwork asked for, when no scan waits for it; what fails comes again at its time."""
-        for wake, tidy in ((Wake.JOIN, worker.join_closed), (Wake.SWEEP, worker.sweep)):
+        for wake, tidy in ((Wake.JOIN, worker.begin_joining), (Wake.SWEEP, worker.sweep)):
             if wake in self._due and not self._is_stopping():
                 self._due.discard(wake)
                 tidy()
@@ -197,6 +202,7 @@ class Daemon:
             journal,
             on_progress=self._heart.ping,
             should_stop=lambda: time.monotonic() > self._stop_s,
+            on_joined=lambda: self.wake(Wake.JOINED),
             patient=True,
         )
         inbox = Inbox(site, journal, suffixes())
@@ -228,6 +234,7 @@ class Daemon:
 
     def _let_go(self) -> None:
         if self._parts is not None:
+            self._parts[0].close()
             self._parts[2].close()
             self._parts[3].stop()
             self._parts = None

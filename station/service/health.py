@@ -134,45 +134,52 @@ def status(site: Site) -> Status:
     Reads the journal beside a running service or without one; raises StoreError where it cannot be read.
     """
     data = site.station.data
-    running = in_use(data)
     with Journal(data / "journal.sqlite", read_only=True) as journal:
+        queue = _queue(site, journal)
         counts = journal.counts()
-        waiting = [_waits(entry) for entry in journal.waiting()]
-        set_aside = [
-            {"scan": entry.name, "reason": entry.reason, "since": _utc(entry.changed_utc_s)}
-            for entry in journal.rows(State.SET_ASIDE)
-        ]
         last = journal.last_stored()
-        known = journal.glimpses()
-    inbox_fault = ""
-    try:
-        names = {quoted(name) for name in list_folder(site.scans.inbox) if is_scan(name, suffixes())}
-    except NotReadyError as error:
-        names, inbox_fault = set(), str(error)
-    unseen = "the service to look at it" if running else "the service, which is not running"
-    waiting += [
-        {"scan": name, "state": "new", "for": unseen, "next_try": None}
-        for name in sorted(names - known.keys())
-    ]
     return {
         "station": site.station.id,
         "name": site.station.name,
-        "service": "running" if running else "not running",
+        "service": "running" if in_use(data) else "not running",
         "counts": counts,
-        "waiting": waiting,
-        "set_aside": set_aside,
+        "waiting": queue["waiting"],
+        "set_aside": queue["set_aside"],
         "last": _last(last) if last else None,
         "moved": _moved(site),
         "alarms": firing(data),
         "stale": _stale(site),
         "series": str(data / "series.nc") if (data / "series.nc").exists() else None,
         "disk_free_gb": round(shutil.disk_usage(data).free / 1e9, 2) if data.is_dir() else None,
-        "faults": [
-            fault
-            for fault in (inbox_fault, _room_fault(site), clock_fault(data, time.time()), _late_log(site))
-            if fault
-        ],
+        "faults": [*queue["faults"], *filter(None, [_late_log(site)])],
     }
+
+
+def queue(site: Site) -> Status:
+    """Return of `status` what waits, what was set aside and what is wrong: all that needs no series."""
+    with Journal(site.station.data / "journal.sqlite", read_only=True) as journal:
+        return _queue(site, journal)
+
+
+def _queue(site: Site, journal: Journal) -> Status:
+    waiting = [_waits(entry) for entry in journal.waiting()]
+    set_aside = [
+        {"scan": entry.name, "reason": entry.reason, "since": _utc(entry.changed_utc_s)}
+        for entry in journal.rows(State.SET_ASIDE)
+    ]
+    inbox_fault = ""
+    try:
+        names = {quoted(name) for name in list_folder(site.scans.inbox) if is_scan(name, suffixes())}
+    except NotReadyError as error:
+        names, inbox_fault = set(), str(error)
+    running = in_use(site.station.data)
+    unseen = "the service to look at it" if running else "the service, which is not running"
+    waiting += [
+        {"scan": name, "state": "new", "for": unseen, "next_try": None}
+        for name in sorted(names - journal.names())
+    ]
+    faults = (inbox_fault, _room_fault(site), clock_fault(site.station.data, time.time()))
+    return {"waiting": waiting, "set_aside": set_aside, "faults": [fault for fault in faults if fault]}
 
 
 def describe(found: Status) -> str:

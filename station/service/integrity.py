@@ -149,7 +149,8 @@ def unknown(site: Site, entries: Iterable[Entry], progress: Progress) -> list[En
     series = series_of(site)
     told = {Path(entry.epoch).name for entry in entries if entry.epoch}
     progress()
-    return [_entry(site, one) for one in held(series, rows(series)) if one.row.epoch_file not in told]
+    found = [row for row in rows(series) if row.epoch_file not in told]
+    return [_entry(site, one) for one in held(series, found)]
 
 
 def prove(
@@ -247,10 +248,22 @@ def restore_zeros(site: Site, progress: Progress) -> None:
     """Write the zeros of lean again that are gone, as the epochs tell them."""
     if site.inclination is None or site.inclination.mode == "absolute":
         return
-    for one in held(series_of(site)):
+    for sop_id, zero in _zeros(series_of(site)).items():
         progress()
-        if one.made.lean_zero and kept_zero(site, one.made.sop_id) is None:
-            write_zero(site, one.made.sop_id, Cycle(**json.loads(one.made.lean_zero)))
+        if zero and kept_zero(site, sop_id) is None:
+            write_zero(site, sop_id, Cycle(**json.loads(zero)))
+
+
+def _zeros(series: Series) -> dict[str, str]:
+    """Return the zero of lean that the first epoch of each SOP tells; of the series, unless it is lost."""
+    try:
+        with h5py.File(series.path, "r") as file:
+            told = [strings(file[name][:]) for name in ("sop_id", "lean_zero")]
+    except (OSError, RuntimeError, KeyError):
+        made = [one.made for one in held(series)]
+        told = [[one.sop_id for one in made], [one.lean_zero for one in made]]
+    pairs = [(sop_id, zero) for sop_id, zero in zip(*told, strict=True) if zero]
+    return dict(reversed(pairs))
 
 
 def _entry(site: Site, one: Held) -> Entry:

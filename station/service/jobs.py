@@ -21,6 +21,7 @@ class Wake(Enum):
     LOOK = auto()  # something happened in the inbox
     EXPECTED = auto()  # is a scan overdue?
     JOIN = auto()  # closed days and months
+    JOINED = auto()  # they are: the series may name them
     SWEEP = auto()  # files that no longer serve
     RELOAD = auto()
     STOP = auto()

@@ -299,6 +299,23 @@ class Journal:
             for name, size, mtime_ns, state, next_s in found
         }
 
+    def names(self) -> set[str]:
+        """Return the name of every row."""
+        with self._faults():
+            return {name for (name,) in self._rows.execute("SELECT name FROM scan")}
+
+    def usable(self) -> list[str]:
+        """Return the scans stored with a good verdict, by their start."""
+        told = "SELECT name FROM scan WHERE state = 'stored' AND verdict = 'good' ORDER BY start_utc_s, name"
+        with self._faults():
+            return [name for (name,) in self._rows.execute(told)]
+
+    def bare(self) -> list[str]:
+        """Return the scans stored without a change, by name."""
+        told = "SELECT name FROM scan WHERE state = 'stored' AND coalesce(reference, '') = '' ORDER BY name"
+        with self._faults():
+            return [name for (name,) in self._rows.execute(told)]
+
     def waiting(self) -> list[Entry]:
         """Return the rows that are neither stored nor set aside, by name."""
         return self._select("WHERE state IN ('waiting', 'later') ORDER BY name")

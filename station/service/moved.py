@@ -18,7 +18,7 @@ from station.errors import StoreError
 from station.quantities import Bools, Floats
 from station.science.motion import Step, steps, usual
 from station.science.shared import GLOBAL
-from station.service.tasks import Progress, series_of
+from station.service.tasks import series_of
 
 LOOKED_AT = 200  # newest scans of the series
 SAME_SCANS = 3  # by which the place of a step may differ when one scan more or less is there to tell
@@ -32,26 +32,32 @@ def moved(site: Site) -> str:
     Only scans adjusted under one SOP are compared: another one is another pose. Raises StoreError where the
     series cannot be read.
     """
-    series = series_of(site)
-    start_s, pose = _poses(series)
-    found = steps(start_s, pose, usual(read_habits(series)))
-    return _words(found[-1], start_s) if found else ""
+    return moved_by(site, None)[0]
 
 
-def moved_by(site: Site, start_utc_s: float, progress: Progress) -> str:
-    """Say that the scanner was moved if the series shows it with the scan of this start, but not without."""
+def moved_by(site: Site, start_utc_s: float | None) -> tuple[str, str]:
+    """Say how the scanner was last moved, and again if it is the scan of this start that shows it.
+
+    Raises StoreError where the series cannot be read.
+    """
     series = series_of(site)
     start_s, pose = _poses(series)
     habit = usual(read_habits(series))
-    progress()
     found = steps(start_s, pose, habit)
-    if not found or start_utc_s not in start_s:
-        return ""
-    others = start_s != start_utc_s
+    if not found:
+        return "", ""
+    last = _words(found[-1], start_s)
+    if start_utc_s not in start_s:
+        return last, ""
+    if start_utc_s == start_s[-1]:  # what was told before it came does not depend on it
+        known_s = [start_s[step.last_before] for step in found if step.told_at < len(start_s) - 1]
+    else:
+        others = start_s != start_utc_s
+        known = steps(start_s[others], pose[others], habit)
+        known_s = [start_s[others][step.last_before] for step in known]
     near_s = SAME_SCANS * float(np.median(np.diff(start_s)))
     when_s = start_s[found[-1].last_before]
-    known_s = [start_s[others][step.last_before] for step in steps(start_s[others], pose[others], habit)]
-    return "" if any(abs(when_s - one) <= near_s for one in known_s) else _words(found[-1], start_s)
+    return last, "" if any(abs(when_s - one) <= near_s for one in known_s) else last
 
 
 def _poses(series: Series) -> tuple[Floats, Floats]:

@@ -18,7 +18,7 @@ import numpy as np
 
 from station.archive.layout import Series, kept_of, strings
 from station.archive.reference import current
-from station.archive.series import read_source, runs
+from station.archive.sources import read_source, runs
 from station.archive.store import AIR, Row, rows
 from station.archive.variables import FILL, VERDICTS
 from station.config import Site

@@ -27,9 +27,9 @@ from station.service.integrity import (
     unopened,
     verify,
 )
+from station.service.joining import Joining
 from station.service.journal import Entry, Journal, State
 from station.service.logs import logfmt
-from station.service.moved import moved_by
 from station.service.places import find_scan
 from station.service.references import (
     build_reference,
@@ -42,7 +42,7 @@ from station.service.retention import due_to_go, retire
 from station.service.show import show
 from station.service.stale import count_by_settings, late
 from station.service.tasks import Outcome, Past, Progress, Refused, Same, attend, open_only, series_of
-from station.service.upkeep import join_epochs, publish, sweep_store
+from station.service.upkeep import OPEN_EPOCHS, Checksums, join_epochs, publish, sweep_store
 
 log = logging.getLogger("station")
 T = TypeVar("T")
@@ -59,9 +59,12 @@ class Worker:
         *,
         on_progress: Progress = lambda: None,
         should_stop: Callable[[], bool] = lambda: False,
+        on_joined: Callable[[], None] = lambda: None,
         patient: bool = False,
     ) -> None:
-        """`patient`: as in the service, scans may wait for weather, and one only touched is not done again.
+        """`on_joined` is called, in another thread, when `note_joined` has something to do.
+
+        `patient`: as in the service, scans may wait for weather, and one only touched is not done again.
 
         Raises ConfigError where the store is of another grid.
         """
@@ -75,6 +78,7 @@ class Worker:
         self._taken: dict[str, Arrival] = {}
         self._verified_s = -math.inf
         self._told_stale = 0
+        self._joining = Joining(site, on_joined)
 
     def take(self, arrival: Arrival) -> bool:
         """Measure and store a scan, and say so in the journal and in one log line; tell whether it is stored.
@@ -102,13 +106,13 @@ class Worker:
             return self._set_aside(arrival, outcome.reason, outcome.sha256, outcome.log_sha256)
         if isinstance(outcome, Same):
             return self._note_same(arrival, outcome)
-        self._mending(publish)
+        alone = self._mending(publish)
         remember(self._journal, arrival.name, outcome)
         _say(arrival.name, outcome)
-        if self._site.adjusts and (moved := self.run(moved_by, outcome.start_utc_s)):
-            log.warning("%s", logfmt(scan=arrival.name, moved=moved))
-        self.show()
+        self.show(arrival.name, outcome.start_utc_s)
         self._make_reference_when_due()
+        if self._patient and alone > OPEN_EPOCHS:
+            self.begin_joining(in_backlog=True)
         return True
 
     def glance(self, arrival: Arrival) -> None:
@@ -157,8 +161,31 @@ class Worker:
 
     def join_closed(self) -> None:
         """Join closed days and months; sum up the day that is over."""
-        self._mending(join_epochs)
-        self.seal()
+        self._note_joined(self._mending(join_epochs, self._journal.files()))
+
+    def begin_joining(self, *, in_backlog: bool = False) -> None:
+        """Have closed days and months joined while scans are taken; `note_joined` ends it."""
+        self._joining.begin(self._journal.files(), in_backlog=in_backlog)
+
+    def note_joined(self) -> None:
+        """Have the series name what was joined meanwhile, if that is done; sum up the day that is over."""
+        try:
+            made = self._joining.take()
+        except StoreError:
+            if not self._mend():
+                raise
+            return  # it is joined at its next time
+        if made is not None:
+            self._note_joined(made)
+
+    def close(self) -> None:
+        """End what is done beside the scans."""
+        self._joining.close()
+
+    def _note_joined(self, made: Checksums) -> None:
+        if made:
+            self._journal.note_files(made)
+            self._mending(publish)
         self._sum_up()
 
     def _sum_up(self) -> None:
@@ -236,12 +263,20 @@ class Worker:
         self.show()
         return False
 
-    def show(self) -> None:
-        """Bring the page up to what is stored; what fails there keeps no scan from the store."""
+    def show(self, name: str = "", start_utc_s: float | None = None) -> None:
+        """Bring the page up to what is stored, and say if the scan just stored shows that the scanner moved.
+
+        What fails there keeps no scan from the store.
+        """
         try:
-            self.run(show)
+            shown = self.run(show, start_utc_s)
         except (StationError, RuntimeError) as error:
             log.warning("%s", logfmt(page="failed", reason=error))
+            return
+        if shown.news:
+            log.warning("%s", logfmt(scan=name, moved=shown.news))
+        if shown.fault:
+            log.warning("%s", logfmt(page="failed", reason=shown.fault))
 
     def _note_same(self, arrival: Arrival, same: Same) -> bool:
         """Put a scan back where it was, or aside if it is another's copy; tell whether it is stored."""
@@ -281,8 +316,7 @@ class Worker:
 
     def _usable(self) -> list[str]:
         """Return the scans that a reference may be made of, by their time."""
-        usable = [row for row in self._journal.rows(State.STORED) if row.verdict == "good"]
-        return [row.name for row in sorted(usable, key=lambda row: row.start_utc_s or 0.0)]
+        return self._journal.usable()
 
     def _make_reference_when_due(self) -> None:
         """Build the master surface once enough usable scans are stored; make a better one of ever more."""
@@ -317,9 +351,9 @@ class Worker:
 
     def _have_bare_done_again(self) -> None:
         """Redo what is stored without change: the power went between the reference and its first use."""
-        bare = [row.name for row in self._journal.rows(State.STORED) if not row.reference]
         inbox = self._site.scans.inbox
-        self._journal.again(name for name in bare if name in self._taken or (inbox / name).is_file())
+        again = [name for name in self._journal.bare() if name in self._taken or (inbox / name).is_file()]
+        self._journal.again(again)
 
     def _arrival(self, name: str) -> Arrival | None:
         """Find a scan again: where it was taken from, in the inbox or in the archive."""

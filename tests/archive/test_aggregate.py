@@ -290,7 +290,8 @@ def test_epochs_in_a_joined_file_say_the_same(filled):
     # The epoch without parameters differs from the others, which join only among themselves.
     store.revisions(filled, alone.row(ALONE).start)[0].path.unlink()
     store.write_epoch(filled, later)
-    assert join_closed(filled, datetime(2025, 11, 23, tzinfo=UTC), lambda: None) == 1
+    assert len(join_closed(filled, datetime(2025, 11, 23, tzinfo=UTC), lambda: None)) == 1
+    build_series(filled)
     found = Aggregates(filled)
     rows = [found.row(i) for i in range(4)]
     assert {row.path.parts[-4] for row in rows} == {"days"}

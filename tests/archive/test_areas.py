@@ -12,6 +12,7 @@ from station.archive import store
 from station.archive.aggregate import AreaChange
 from station.archive.areas import update_areas
 from station.archive.join import join_closed
+from station.archive.series import build_series
 from station.errors import StoreError
 
 
@@ -42,6 +43,8 @@ def areas(series):
 @pytest.fixture
 def update(series, areas, told):
     def update(given=None, by=told):
+        if store.epochs(series):
+            build_series(series)
         return update_areas(series, areas if given is None else given, by, lambda: None)
 
     return update
@@ -124,6 +127,7 @@ def test_joining_days_computes_nothing(series, epoch, update, told):
     before = opened(update())
     told.asked.clear()
     join_closed(series, datetime(2026, 2, 1, tzinfo=UTC), lambda: None)
+    build_series(series)
     assert opened(update()).equals(before)
     (series.folder / "areas.nc").unlink()
     assert opened(update()).equals(before)
@@ -222,6 +226,7 @@ def test_an_aggregator_that_fails_leaves_the_old_file(series, epoch, update):
 
 def test_progress_after_each_epoch(series, epoch, areas, told):
     write(series, epoch, 1, 2, 3)
+    build_series(series)
     steps = []
     update_areas(series, areas, told, lambda: steps.append(len(told.asked)))
     assert steps == [2, 4, 6]

@@ -11,7 +11,7 @@ import xarray as xr
 
 import station
 from station.archive import store
-from station.archive.join import join_closed, sweep
+from station.archive.join import count_closed, join_closed, now_of, sweep
 from station.archive.series import build_series
 from station.archive.store import rows, sources
 from station.errors import StoreError
@@ -19,6 +19,12 @@ from station.quantities import Shared
 
 DAY_AFTER = datetime(2025, 11, 23, 12, tzinfo=UTC)
 MONTH_AFTER = datetime(2026, 1, 5, tzinfo=UTC)
+
+
+def join(series, now, progress=lambda: None):
+    made = join_closed(series, now, progress)
+    build_series(series)
+    return len(made)
 
 
 def values(series):
@@ -36,24 +42,24 @@ def filled(series, epoch):
 
 def test_joining_changes_no_value_and_names_fewer_files(filled):
     before = values(filled)
-    assert join_closed(filled, datetime(2025, 11, 22, 12, tzinfo=UTC), lambda: None) == 1
+    assert join(filled, datetime(2025, 11, 22, 12, tzinfo=UTC)) == 1
     kinds = [row.path.relative_to(filled.folder).parts[0] for row in rows(filled)]
     assert kinds == ["days", "days", "days", "epochs", "epochs"]
-    assert join_closed(filled, DAY_AFTER, lambda: None) == 1
+    assert join(filled, DAY_AFTER) == 1
     assert len({row.path for row in rows(filled)}) == 2
     assert values(filled).identical(before)
-    assert join_closed(filled, MONTH_AFTER, lambda: None) == 1
+    assert join(filled, MONTH_AFTER) == 1
     assert len({row.path for row in rows(filled)}) == 1
     assert values(filled).identical(before)
-    assert join_closed(filled, MONTH_AFTER, lambda: None) == 0
+    assert join(filled, MONTH_AFTER) == 0
 
 
 def test_a_late_scan_makes_a_new_revision_of_its_day(filled, epoch):
-    join_closed(filled, DAY_AFTER, lambda: None)
+    join(filled, DAY_AFTER)
     store.write_epoch(filled, epoch(7))
     build_series(filled)
     assert values(filled).sizes["time"] == 6
-    assert join_closed(filled, DAY_AFTER, lambda: None) == 1
+    assert join(filled, DAY_AFTER) == 1
     names = sorted({row.path.name for row in rows(filled)})
     assert names == ["hef_20251121_r2.nc", "hef_20251122_r1.nc"]
     assert np.all(np.diff(values(filled).time.values.astype(np.int64)) > 0)
@@ -61,13 +67,13 @@ def test_a_late_scan_makes_a_new_revision_of_its_day(filled, epoch):
 
 def test_a_day_that_lies_beside_its_month_is_left_for_the_month(filled, epoch):
     """Where the month cannot be joined, for a scan from another place, it must not be made anew each time."""
-    join_closed(filled, MONTH_AFTER, lambda: None)
+    join(filled, MONTH_AFTER)
     store.write_epoch(filled, epoch(5, value=0.5))
     elsewhere = Shared(("heading",), ("rad",), np.zeros(1), np.eye(1), np.zeros(1))
     store.write_epoch(filled, dataclasses.replace(epoch(25), shared=elsewhere))
     build_series(filled)
     before = values(filled)
-    made = [join_closed(filled, MONTH_AFTER, lambda: None) for _ in range(4)]
+    made = [join(filled, MONTH_AFTER) for _ in range(4)]
     assert made == [1, 0, 0, 0]
     assert values(filled).identical(before)
 
@@ -75,7 +81,7 @@ def test_a_day_that_lies_beside_its_month_is_left_for_the_month(filled, epoch):
 def test_parts_go_only_after_the_grace(filled):
     before = values(filled)
     now = datetime.now(UTC)
-    join_closed(filled, MONTH_AFTER, lambda: None)
+    join(filled, MONTH_AFTER)
     assert sweep(filled, now) == []
     assert sweep(filled, now + timedelta(hours=47)) == []
     gone = sweep(filled, now + timedelta(hours=49))
@@ -96,7 +102,7 @@ def test_left_over_parts_go(filled):
 def test_a_file_that_the_series_still_names_never_goes(filled):
     """Where the disk was full after a join, the old series serves on."""
     before = filled.path.read_bytes()
-    join_closed(filled, DAY_AFTER, lambda: None)
+    join(filled, DAY_AFTER)
     filled.path.write_bytes(before)
     assert sweep(filled, datetime.now(UTC) + timedelta(hours=49)) == []
     assert values(filled).sizes["time"] == 5
@@ -104,7 +110,7 @@ def test_a_file_that_the_series_still_names_never_goes(filled):
 
 def test_the_grace_begins_when_the_series_names_a_file_no_longer(filled):
     before = filled.path.read_bytes()
-    join_closed(filled, DAY_AFTER, lambda: None)
+    join(filled, DAY_AFTER)
     filled.path.write_bytes(before)
     long_ago = (datetime.now(UTC) - timedelta(days=9)).timestamp()
     for path in filled.folder.glob("**/*.nc"):
@@ -115,7 +121,7 @@ def test_the_grace_begins_when_the_series_names_a_file_no_longer(filled):
 
 
 def test_what_is_measured_again_after_the_sweep_wins(filled, epoch):
-    join_closed(filled, DAY_AFTER, lambda: None)
+    join(filled, DAY_AFTER)
     sweep(filled, datetime.now(UTC) + timedelta(hours=49))
     again = store.write_epoch(filled, epoch(5, value=9.0))
     assert again.path.name == "hef_20251121T050000Z_r2.nc"
@@ -125,11 +131,11 @@ def test_what_is_measured_again_after_the_sweep_wins(filled, epoch):
 
 def test_a_joined_file_never_changes_under_its_name(filled, epoch):
     for hour in (7, 8):
-        join_closed(filled, DAY_AFTER, lambda: None)
+        join(filled, DAY_AFTER)
         sweep(filled, datetime.now(UTC) + timedelta(hours=49))
         store.write_epoch(filled, epoch(hour))
     held = {path.name: path.read_bytes() for path in filled.folder.glob("days/**/*.nc")}
-    join_closed(filled, DAY_AFTER, lambda: None)
+    join(filled, DAY_AFTER)
     assert "hef_20251121_r3.nc" in {path.name for path in sources(filled.path)}
     for path in filled.folder.glob("days/**/*.nc"):
         assert held.get(path.name, path.read_bytes()) == path.read_bytes()
@@ -137,7 +143,7 @@ def test_a_joined_file_never_changes_under_its_name(filled, epoch):
 
 def test_progress_is_told_after_every_epoch(filled):
     told = []
-    join_closed(filled, DAY_AFTER, lambda: told.append(1))
+    join(filled, DAY_AFTER, lambda: told.append(1))
     assert len(told) == 5
 
 
@@ -153,7 +159,7 @@ def test_epochs_before_and_after_a_move_stand_in_one_series_each_with_its_parame
     build_series(filled)
     for months in (False, True):
         if months:
-            assert join_closed(filled, MONTH_AFTER, lambda: None) == 1  # the day before the move
+            assert join(filled, MONTH_AFTER) == 1  # the day before the move
         told = values(filled)
         names = [str(name) for name in told.parameter_name.values]
         assert sorted(names) == ["lean_090.0", "range_bias", "tilt_east", "tilt_north"]
@@ -185,7 +191,7 @@ def test_epochs_of_an_older_version_join_with_newer_ones(filled):
     assert np.isnan(told.elevation_spread[:2]).all()
     changed = ["elevation_spread"]
     assert told.drop_vars(changed).identical(before.drop_vars(changed))
-    join_closed(filled, DAY_AFTER, lambda: None)
+    join(filled, DAY_AFTER)
     assert values(filled).identical(told)
 
 
@@ -195,3 +201,17 @@ def test_a_source_that_is_gone_is_noticed(filled):
         assert np.isnan(told.elevation_change[1]).all()  # what others would read without a word
     with pytest.raises(StoreError, match="hef_20251121T050000Z"):
         station.open(filled.folder)
+
+
+def test_amid_a_backlog_a_day_is_joined_when_later_ones_have_come(series, epoch):
+    """By the clock of the wall all of it is long over, and would be joined anew with each scan."""
+    for hour in (1, 5, 9, 25, 29):
+        store.write_epoch(series, epoch(hour))
+        build_series(series)
+        assert count_closed(series) == 0
+    assert join(series, now_of(series)) == 0
+    store.write_epoch(series, epoch(31))
+    build_series(series)
+    assert count_closed(series) == 3
+    assert join(series, now_of(series)) == 1
+    assert count_closed(series) == 0

@@ -70,6 +70,7 @@ def test_compliance_checker_finds_nothing(built, which, tmp_path):
 @pytest.mark.parametrize("which", ["series.nc", "months/2025/hef_202511_r1.nc"])
 def test_compliance_checker_finds_nothing_in_what_was_joined(built, series, which, tmp_path):
     join_closed(series, datetime(2026, 2, 1, tzinfo=UTC), lambda: None)
+    build_series(series)
     assert findings(built.parent / which, tmp_path / "report.json") == []
 
 
@@ -87,6 +88,7 @@ def test_compliance_checker_finds_nothing_without_a_map(series, epoch, which, tm
 
 def test_other_programs_read_what_was_joined(built, series, tmp_path):
     join_closed(series, datetime(2026, 2, 1, tzinfo=UTC), lambda: None)
+    build_series(series)
     for path in (built, built.parent / "months/2025/hef_202511_r1.nc"):
         assert "elevation_change" in run(tool("cdo"), "infon", path).stdout
         assert run(tool("ncdump"), "-v", "scan_id", path).stdout.count('"251121_0') == 4

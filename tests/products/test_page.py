@@ -16,7 +16,7 @@ from station.archive import store
 from station.archive.reference import write_reference
 from station.archive.series import build_series
 from station.products import gallery, page
-from station.products.gallery import Style, hang, kept_base, thinned
+from station.products.gallery import Measured, Style, hang, kept_base, thinned
 from station.products.look import base_of
 from station.products.maps import MOST_BYTES
 from station.products.record import AreaRecord, Record, read_record
@@ -156,7 +156,8 @@ def test_the_limit_is_fixed_once(write, series, small):
 
 def test_the_newest_come_first_and_few_at_a_time(series, site, monkeypatch):
     monkeypatch.setattr(gallery, "MOST_DRAWN", 2)
-    found = [(row, "1", "") for row in store.rows(series)]
+    rows = store.Named(series)
+    found = [Measured(rows, at, row.start, "1", "") for at, row in enumerate(rows)]
     folder, style = site.station.data / "page", Style("x", 400, 0.5)
     seen = [len(hang(series, folder, found, style, lambda: None).change) for _ in range(4)]
     assert seen == [2, 4, 6, 6]
@@ -209,7 +210,8 @@ def test_years_of_scans_stay_under_the_weight(write, told, monkeypatch):
             start_s,
             ["degraded"] * count,
             {name: rng.normal(size=count) for name in short.numbers},
-            {name: [f"251121_{n:06d} {name} {'why ' * 20}" for n in range(count)] for name in short.words},
+            {name: [f"251121_{n:06d} {name} {'why ' * 20}" for n in range(count)] for name in short.words}
+            | {"reference_version": [""] * count},
         )
 
     folder = write()

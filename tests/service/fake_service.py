@@ -18,9 +18,9 @@ from station.service.daemon import Pace, run
 class FakeWorker:
     """Keeps a line of what it was asked to do in `<data>/did`."""
 
-    def __init__(self, site, journal, *, on_progress, should_stop, patient):
+    def __init__(self, site, journal, *, on_progress, should_stop, on_joined, patient):
         self.site, self.journal, self.patient = site, journal, patient
-        self.on_progress, self.should_stop = on_progress, should_stop
+        self.on_progress, self.should_stop, self.on_joined = on_progress, should_stop, on_joined
         self.folder = site.station.data / "stored"
         self.folder.mkdir(exist_ok=True)
 
@@ -32,8 +32,14 @@ class FakeWorker:
         self.say("recover")
         self.on_progress()
 
-    def join_closed(self):
+    def begin_joining(self):
         self.say("join")
+
+    def note_joined(self):
+        pass
+
+    def close(self):
+        pass
 
     def sweep(self):
         self.say("sweep")

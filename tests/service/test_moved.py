@@ -73,7 +73,7 @@ def heard(site, monkeypatch, poses, known, hours):
         known = sorted([*known, hour])
         series = START_S + 3600.0 * np.array(known), poses[known]
         monkeypatch.setattr(moved, "_poses", lambda _, held=series: held)
-        if text := moved.moved_by(site, START_S + 3600 * hour, lambda: None):
+        if text := moved.moved_by(site, START_S + 3600 * hour)[1]:
             said[hour] = text
     return said
 
@@ -95,7 +95,7 @@ def test_the_stored_series_tells_the_same(site, poses):
     write(site, (epoch(hour, pose) for hour, pose in enumerate(poses)))
     text = moved.moved(site)
     assert "between 2025-11-21 19:00 and 2025-11-21 20:00 UTC" in text
-    assert moved.moved_by(site, START_S + 3600 * 3, lambda: None) == ""
+    assert moved.moved_by(site, START_S + 3600 * 3) == (text, "")
     assert health._moved(site) == text
 
 

@@ -26,7 +26,7 @@ def test_a_page_that_cannot_be_written_keeps_no_scan_from_the_store(tmp_path, ca
         assert series.sizes["time"] == 2
 
     page_folder(site).unlink()
-    show(site, lambda: None)
+    show(site, None, lambda: None)
     body = (page_folder(site) / "data.js").read_text()
     data = json.loads(body.removeprefix("window.STATION=").removesuffix(";\n"))
     assert len(data["maps"]) == 2
