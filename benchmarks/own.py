@@ -1,0 +1,271 @@
+"""The station's own work on a scan, each part in a process of its own, and as the running service does it."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import laspy
+import numpy as np
+
+from benchmarks.cost import run_job
+from benchmarks.growth import growth
+from benchmarks.large import REFERENCE_SCANS, large_station
+from station.config import Site, read_site
+from station.errors import StoreError
+from station.pipeline import gridder_for, survey
+from station.quantities import Shots
+from station.readers.scan import ScanReader, utc_interval
+from station.service.gather import Gathered, gather
+from station.service.journal import Journal, State
+from station.service.places import arrival_of
+from station.service.references import build_reference
+from station.service.tasks import opened, process, reference_of
+
+CHUNK = 1_000_000
+LOOKS_S = 0.05
+QUIET_S = 3.0  # without a child: nothing more comes of a scan
+LASTING = 3  # processes of an idle service: it, the tracker of its resources, the server of its children
+PATIENCE_S = 900.0
+
+
+def make(folder: str, points: int, scans: int, size: float) -> dict[str, Any]:
+    """Make a station; return its site file and its scans, those of the reference first."""
+    site = large_station(Path(folder), points, scans=scans, size=size)
+    return {"site": str(site), "scans": [str(path) for path in sorted((site.parent / "inbox").glob("*.laz"))]}
+
+
+def work(site: str, scan: str, before: str) -> dict[str, Any]:
+    """Return what peers are told of a scan: the grid, and the way there as one matrix (4, 4)."""
+    told = read_site(Path(site))
+    grid = told.grid_cells
+    with _gathered(told, scan) as (_, gathered):
+        frame = gathered.pose.frame
+    assert frame is not None  # noqa: S101 - the scan is in the scanner's frame
+    corners_m = np.hstack([np.zeros((3, 1)), np.eye(3)])
+    turned_m = frame.to_local[:3, :3] @ corners_m
+    mapped_m = np.stack(frame.to_map((turned_m[0], turned_m[1], turned_m[2])))
+    mapped_m -= np.array([[grid.west_m], [grid.north_m - grid.ny * grid.cell_m], [0.0]])
+    matrix = np.eye(4)
+    matrix[:3, :3], matrix[:3, 3] = mapped_m[:, 1:] - mapped_m[:, :1], mapped_m[:, 0]
+    return {
+        "scan": scan,
+        "before": before,
+        "matrix": matrix.tolist(),
+        "cell_m": grid.cell_m,
+        "nx": grid.nx,
+        "ny": grid.ny,
+    }
+
+
+def hot(site: str, scan: str) -> dict[str, float]:
+    """Lay a scan on the grid: decode, lean, SOP, air, map, residuals, σ of each shot, sums of each cell."""
+    told = read_site(Path(site))
+    with _gathered(told, scan) as (reader, gathered):
+        gridder = gridder_for(gathered.setup, reference_of(told))
+        survey(gridder, reader.blocks(), gathered.setup, gathered.pose, _quiet)
+    return {"cells": int(np.count_nonzero(gridder.count)), "points": int(gridder.count.sum())}
+
+
+def chunks(site: str, scan: str) -> dict[str, float]:
+    """Do the same as `hot` by the same functions, a million points at once and all of each decoded."""
+    told = read_site(Path(site))
+    with _gathered(told, scan) as (reader, gathered):
+        gridder = gridder_for(gathered.setup, reference_of(told))
+        survey(gridder, _millions(reader.path), gathered.setup, gathered.pose, _quiet)
+    return {"cells": int(np.count_nonzero(gridder.count)), "points": int(gridder.count.sum())}
+
+
+def _millions(path: Path) -> Iterator[Shots]:
+    with laspy.open(path, laz_backend=laspy.LazBackend.Lazrs) as scan:
+        for chunk in scan.chunk_iterator(CHUNK):
+            brightness = np.asarray(chunk.intensity) / 65535
+            yield Shots(*(np.asarray(chunk[axis]) for axis in "xyz"), np.asarray(chunk.gps_time), brightness)
+
+
+def epoch(site: str, scan: str) -> dict[str, float]:
+    """Measure a scan and write its epoch, as a child of the service does."""
+    told = read_site(Path(site))
+    process(told, arrival_of(told, Path(scan)), _quiet)
+    return {}
+
+
+def serve(site: str, scans: list[str]) -> dict[str, Any]:
+    """Run the service over a station; return what each scan took that came after those of the reference."""
+    told = read_site(Path(site))
+    log = Path("service.log")
+    with log.open("w", encoding="utf-8") as out:
+        service = subprocess.Popen([sys.executable, "-m", "station.cli", "run", site], stderr=out)
+    took = []
+    try:
+        for path in map(Path, scans[:REFERENCE_SCANS]):
+            _give(path, told.scans.inbox)
+        _until_quiet(service, told, REFERENCE_SCANS)
+        for number, path in enumerate(map(Path, scans[REFERENCE_SCANS:]), REFERENCE_SCANS + 1):
+            before_s = _cpu_s(_family(service.pid))
+            given_s = time.monotonic() + told.scans.settle_s
+            _give(path, told.scans.inbox)
+            ended_s, peak_gb = _until_quiet(service, told, number)
+            took.append({
+                "cpu_s": _cpu_s(_family(service.pid)) - before_s,
+                "wall_s": ended_s - given_s,
+                "peak_gb": peak_gb,
+            })  # fmt: skip
+    finally:
+        service.send_signal(signal.SIGTERM)
+        service.wait(120)
+    return {"took": took}
+
+
+def alone(site: str) -> dict[str, str]:
+    """Return a site file without adjustment, in a store of its own that has the same reference."""
+    held = read_site(Path(site)).station.data
+    path = _with(Path(site), "alone", 'method = "joint"', 'method = "none"')
+    data = read_site(path).station.data
+    data.mkdir()
+    for one in held.glob("reference*"):
+        shutil.copy(one, data)
+    shutil.copytree(held / "lean_zero", data / "lean_zero")
+    return {"site": str(path)}
+
+
+def referenced(site: str, scans: list[str]) -> dict[str, str]:
+    """Return a site file without adjustment, in a store of its own that has a reference of these scans."""
+    path = _with(Path(site), "alone", 'method = "joint"', 'method = "none"')
+    told = read_site(path)
+    build_reference(told, [arrival_of(told, Path(scan)) for scan in scans], "1", _quiet)
+    return {"site": str(path)}
+
+
+def served(site: str) -> dict[str, str]:
+    """Return a site file with an inbox and a store that are empty."""
+    path = _with(Path(site), "served", 'inbox = "inbox"', 'inbox = "arrivals"')
+    inbox = read_site(path).scans.inbox
+    shutil.rmtree(inbox, ignore_errors=True)
+    inbox.mkdir()
+    return {"site": str(path)}
+
+
+def _with(site: Path, name: str, says: str, instead: str) -> Path:
+    """Write a site file that says something else, with an empty store of its own; return it."""
+    told, data = site.read_text(encoding="utf-8"), read_site(site).station.data
+    path = site.with_name(f"{name}.toml")
+    path.write_text(
+        told.replace(f'data = "{data.name}"', f'data = "{name}"').replace(says, instead), encoding="utf-8"
+    )
+    shutil.rmtree(site.with_name(name), ignore_errors=True)
+    return path
+
+
+def epochs() -> dict[str, float]:
+    """Return the CPU seconds of what follows an epoch, where few are stored and where a year is."""
+    found = growth(Path("epochs"))
+    return {
+        word: sum(value for name, value in found.items() if name.endswith(f"_s_{word}"))
+        for word in ("few", "year")
+    }
+
+
+def start(site: str) -> dict[str, float]:
+    """Start the service over a store; return what it took until it is ready for scans."""
+    log = Path("start.log")
+    began_s = time.monotonic()
+    with log.open("w", encoding="utf-8") as out:
+        service = subprocess.Popen([sys.executable, "-m", "station.cli", "run", site], stderr=out)
+    try:
+        while "service=running" not in log.read_text(encoding="utf-8"):
+            if service.poll() is not None or time.monotonic() > began_s + PATIENCE_S:
+                raise RuntimeError(f"the service does not start: {log.read_text(encoding='utf-8')}")
+            time.sleep(LOOKS_S)
+        wall_s, cpu_s = time.monotonic() - began_s, _cpu_s(_family(service.pid))
+    finally:
+        service.send_signal(signal.SIGTERM)
+        service.wait(120)
+    return {"cpu_s": cpu_s, "wall_s": wall_s}
+
+
+@contextmanager
+def _gathered(site: Site, scan: str) -> Iterator[tuple[ScanReader, Gathered]]:
+    arrival = arrival_of(site, Path(scan))
+    with opened(site, arrival.path) as reader:
+        start, end, _ = utc_interval(reader, site.scans.name)
+        yield reader, gather(site, reader, arrival.log, start, end, keep_zero=False)
+
+
+def _give(scan: Path, inbox: Path) -> None:
+    """Put a scan into the inbox, its log first."""
+    log = scan.with_name(f"{scan.stem}-incl.txt")
+    os.link(log, inbox / log.name)
+    os.link(scan, inbox / scan.name)
+
+
+def _until_quiet(service: subprocess.Popen[bytes], site: Site, stored: int) -> tuple[float, float]:
+    """Wait until so many scans are stored and all is still; return since when, and the peak [GB]."""
+    peak_kb, busy_s = 0, time.monotonic()
+    until_s = busy_s + PATIENCE_S
+    while time.monotonic() < until_s:
+        if service.poll() is not None:
+            raise RuntimeError(f"the service ended with {service.returncode}")
+        children = _family(service.pid)[LASTING:]
+        if children:
+            busy_s = time.monotonic()
+            peak_kb = max(peak_kb, *map(_peak_kb, children))
+        elif time.monotonic() > busy_s + QUIET_S and _stored(site) >= stored:
+            return busy_s, peak_kb / 2**20
+        time.sleep(LOOKS_S)
+    raise RuntimeError(f"the service took more than {PATIENCE_S:g} s for a scan")
+
+
+def _stored(site: Site) -> int:
+    try:
+        with Journal(site.station.data / "journal.sqlite", read_only=True) as journal:
+            return journal.counts()[State.STORED]
+    except StoreError:  # it has not begun
+        return 0
+
+
+def _family(pid: int) -> list[int]:
+    """Return a process and all below it, nearest first."""
+    found = [pid]
+    for one in found:
+        for task in Path(f"/proc/{one}/task").glob("*/children"):
+            found += [int(child) for child in _told(task).split()]
+    return found
+
+
+def _cpu_s(family: list[int]) -> float:
+    """User and system time of processes and of all children they have waited for [s]."""
+    ticks = 0
+    for one in family:
+        fields = _told(Path(f"/proc/{one}/stat")).rpartition(")")[2].split()
+        ticks += sum(map(int, fields[11:15]))
+    return ticks / os.sysconf("SC_CLK_TCK")
+
+
+def _peak_kb(pid: int) -> int:
+    lines = _told(Path(f"/proc/{pid}/status")).splitlines()
+    return next((int(line.split()[1]) for line in lines if line.startswith("VmHWM")), 0)
+
+
+def _told(path: Path) -> str:
+    try:
+        return path.read_text()
+    except OSError:  # it has just ended
+        return ""
+
+
+def _quiet() -> None:
+    """Nobody waits for progress."""
+
+
+if __name__ == "__main__":
+    jobs = make, work, hot, chunks, epoch, serve, alone, referenced, served, epochs, start
+    run_job({job.__name__: job for job in jobs})
