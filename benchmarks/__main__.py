@@ -70,18 +70,19 @@ def measured(run: Run) -> list[tuple[str, list[Row]]]:
     scans = made["scans"]
     of_reference, coming = scans[:-rounds], scans[-rounds:]
     floor = middle([run.decode(scan) for scan in coming])
+    _say("the reference")
+    _, alone = run.own("referenced", site=made["site"], scans=of_reference)
+    _, served = run.own("served", site=made["site"], alone=alone["site"])
     _say("the service")
-    _, served = run.own("served", site=made["site"])
-    _, told = run.own("serve", site=served["site"], scans=scans)
+    _, told = run.own("serve", site=served["site"], scans=coming)
     service = middle([Cost(**one) for one in told["took"]])
-    _, alone = run.own("alone", site=served["site"])
     station = [
         Row("laspy + lazrs, one thread", floor, floor),
-        Row("station, on the grid", _own(run, "hot", served["site"], coming), floor),
+        Row("station, on the grid", _own(run, "hot", alone["site"], coming), floor),
         Row("station, epoch written", _own(run, "epoch", alone["site"], coming), floor,
             MUST_EPOCH | {"peak_gb": MUST_PEAK_GB}, AIM_EPOCH, "no adjustment, no pictures"),
         Row("station, running service", service, floor, MUST_SERVED | {"peak_gb": MUST_PEAK_GB}),
-        Row("station's functions, a million points at once", _own(run, "chunks", served["site"], coming),
+        Row("station's functions, a million points at once", _own(run, "chunks", alone["site"], coming),
             floor, note="on the grid, all decoded"),
     ]  # fmt: skip
     peers = [_peer(run, peer, made["site"], of_reference[0], coming, floor) for peer in PEERS]

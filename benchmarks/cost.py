@@ -47,7 +47,7 @@ def cost_of(command: Sequence[str], folder: Path, env: dict[str, str] | None = N
     if child.returncode:
         told = (folder / "stderr").read_text(encoding="utf-8", errors="replace").strip() or said.strip()
         raise FailedError(f"exit status {child.returncode}: {told.splitlines()[-1] if told else ''}")
-    return Cost(used.ru_utime + used.ru_stime, wall_s, used.ru_maxrss / 2**20), said
+    return Cost(used.ru_utime + used.ru_stime, wall_s, used.ru_maxrss * 1024 / 1e9), said
 
 
 def job_cost(module: str, name: str, cwd: Path, /, **told: object) -> tuple[Cost, dict[str, Any]]:
