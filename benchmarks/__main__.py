@@ -76,20 +76,31 @@ def measured(run: Run) -> list[tuple[str, list[Row]]]:
     _say("the service")
     _, told = run.own("serve", site=served["site"], scans=coming)
     service = middle([Cost(**one) for one in told["took"]])
+    epoch = Row(
+        "station, epoch written",
+        _own(run, "epoch", alone["site"], coming),
+        floor,
+        MUST_EPOCH | {"peak_gb": MUST_PEAK_GB},
+        AIM_EPOCH,
+        "adjustment, pictures",
+    )
     station = [
         Row("laspy + lazrs, one thread", floor, floor),
-        Row("station, on the grid", _own(run, "hot", alone["site"], coming), floor),
-        Row("station, epoch written", _own(run, "epoch", alone["site"], coming), floor,
-            MUST_EPOCH | {"peak_gb": MUST_PEAK_GB}, AIM_EPOCH, "no adjustment, no pictures"),
+        Row("station, on the grid", _own(run, "hot", alone["site"], coming), floor, note="epoch, adjustment"),
+        epoch,
         Row("station, running service", service, floor, MUST_SERVED | {"peak_gb": MUST_PEAK_GB}),
-        Row("station's functions, a million points at once", _own(run, "chunks", alone["site"], coming),
-            floor, note="on the grid, all decoded"),
+        Row("its functions, a million points at once", _own(run, "chunks", alone["site"], coming), floor,
+            note="epoch, adjustment"),
     ]  # fmt: skip
-    peers = [_peer(run, peer, made["site"], of_reference[0], coming, floor) for peer in PEERS]
+    told = [run.own("work", site=made["site"], scan=scan, before=of_reference[0])[1] for scan in coming]
+    peers = [_peer(run, peer, [Work(**one) for one in told], floor) for peer in PEERS]
     return [
         (f"{run.points / 1e6:g} million points: ratios to decoding them", station + peers),
-        ("growth over points: epoch written; ratios to decoding them", _over_points(run, alone["site"])),
-        ("growth over cells: epoch written; ratios to the smallest grid", _over_cells(run)),
+        (
+            "growth over points: epoch written; ratios to decoding them",
+            _over_points(run, alone["site"], epoch),
+        ),
+        ("growth over cells: epoch written; ratios to the smallest grid", _over_cells(run, alone["site"])),
         ("growth over epochs: what follows an epoch; ratios to the fewest", _over_epochs(run)),
         ("start-up", _startup(run)),
     ]
@@ -100,43 +111,43 @@ def _own(run: Run, job: str, site: str, scans: list[str]) -> Cost:
     return middle([run.own(job, site=site, scan=scan)[0] for scan in scans])
 
 
-def _peer(run: Run, peer: Peer, site: str, before: str, scans: list[str], floor: Cost) -> Row:
+def _peer(run: Run, peer: Peer, works: list[Work], floor: Cost) -> Row:
     """Return the row of a peer, also where it is not there or fails."""
     if not peer.is_there:
         return Row(peer.title, None, note="not installed")
     _say(peer.title)
     try:
-        costs = []
-        for scan in scans:
-            _, told = run.own("work", site=site, scan=scan, before=before)
-            costs.append(take(peer, Work(**told), run.folder)[0])
+        costs = [take(peer, work, run.folder)[0] for work in works]
     except FailedError as error:
         return Row(peer.title, None, note=f"failed: {error}")
     return Row(peer.title, middle(costs), floor, note=peer.lacks)
 
 
-def _over_points(run: Run, site: str) -> list[Row]:
-    rows: list[Row] = []
-    for points in (round(run.points * FEW_SHARE), run.points, run.points * (1 if run.quick else MANY_TIMES)):
+def _over_points(run: Run, site: str, measured: Row) -> list[Row]:
+    """Return what fewer and more points than those measured take."""
+    taken = {run.points: (measured.cost, measured.base)}
+    for points in (round(run.points * FEW_SHARE), run.points * (2 if run.quick else MANY_TIMES)):
         _say(f"{points:,} points")
         _, made = run.own("make", points=points, scans=1, size=run.size, folder=str(run.folder))
         scan = made["scans"][-1]
-        cost, base = run.own("epoch", site=site, scan=scan)[0], run.decode(scan)
-        smallest = min([cost.peak_gb, *(row.cost.peak_gb for row in rows if row.cost)])
-        must = {"peak_gb": min(MUST_PEAK_GB, MUST_PEAK_GROWTH * smallest)}
-        rows.append(Row(f"{points / 1e6:g} million", cost, base, must))
-    return rows
+        taken[points] = run.own("epoch", site=site, scan=scan)[0], run.decode(scan)
+    least_gb = min(cost.peak_gb for cost, _ in taken.values() if cost)
+    must = {"peak_gb": min(MUST_PEAK_GB, MUST_PEAK_GROWTH * least_gb)}
+    return [Row(f"{points / 1e6:g} million", *taken[points], must) for points in sorted(taken)]
 
 
-def _over_cells(run: Run) -> list[Row]:
+def _over_cells(run: Run, full: str) -> list[Row]:
     rows: list[Row] = []
     for share in SIZES:
         size = share * run.size
         _say(f"{4000 * size:,.0f} x {5000 * size:,.0f} cells")
         points = round(run.points * FEW_SHARE)
         _, made = run.own("make", points=points, scans=1, size=size, folder=str(run.folder))
-        _, held = run.own("referenced", site=made["site"], scans=made["scans"][:-1])
-        cost, _ = run.own("epoch", site=held["site"], scan=made["scans"][-1])
+        site = full
+        if size != run.size:
+            _, alone = run.own("referenced", site=made["site"], scans=made["scans"][:-1])
+            site = alone["site"]
+        cost, _ = run.own("epoch", site=site, scan=made["scans"][-1])
         base = rows[0].cost if rows else cost
         rows.append(Row(f"{4000 * size:,.0f} x {5000 * size:,.0f}", cost, base))
     return rows

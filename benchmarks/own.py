@@ -31,7 +31,7 @@ from station.service.references import build_reference
 from station.service.tasks import opened, process, reference_of
 
 CHUNK = 1_000_000
-LOOKS_S = 0.05
+LOOKS_S = 0.03
 QUIET_S = 3.0  # without a child: nothing more comes of a scan
 LASTING = 3  # processes of an idle service: it, the tracker of its resources, the server of its children
 PATIENCE_S = 3600.0
@@ -121,11 +121,8 @@ def served(site: str, alone: str) -> dict[str, str]:
 
 def serve(site: str, scans: list[str]) -> dict[str, Any]:
     """Run the service over a station that has its reference; return what each scan took."""
-    told = read_site(Path(site))
-    with Path("service.log").open("w", encoding="utf-8") as out:
-        service = subprocess.Popen([sys.executable, "-m", "station.cli", "run", site], stderr=out)
-    took = []
-    try:
+    told, took = read_site(Path(site)), []
+    with _service(site) as service:
         _until_quiet(service, told, 0)
         for number, path in enumerate(map(Path, scans), 1):
             before_s = _cpu_s(_family(service.pid))
@@ -134,10 +131,31 @@ def serve(site: str, scans: list[str]) -> dict[str, Any]:
             ended_s, peak_gb = _until_quiet(service, told, number)
             cpu_s = _cpu_s(_family(service.pid)) - before_s
             took.append({"cpu_s": cpu_s, "wall_s": ended_s - given_s, "peak_gb": peak_gb})
+    return {"took": took}
+
+
+def start(site: str) -> dict[str, float]:
+    """Start the service over a store; return what it took until it was ready for scans."""
+    began_s = time.monotonic()
+    with _service(site) as service:
+        return {"cpu_s": _cpu_s(_family(service.pid)), "wall_s": time.monotonic() - began_s}
+
+
+@contextmanager
+def _service(site: str) -> Iterator[subprocess.Popen[bytes]]:
+    """Run the service, from when it is ready for scans."""
+    log = Path("service.log")
+    with log.open("w", encoding="utf-8") as out:
+        service = subprocess.Popen([sys.executable, "-m", "station.cli", "run", site], stderr=out)
+    try:
+        while "service=running" not in log.read_text(encoding="utf-8"):
+            if service.poll() is not None:
+                raise RuntimeError(f"the service does not start: {log.read_text(encoding='utf-8')}")
+            time.sleep(LOOKS_S)
+        yield service
     finally:
         service.send_signal(signal.SIGTERM)
         service.wait(120)
-    return {"took": took}
 
 
 def _with(site: Path, name: str, says: str, instead: str) -> Path:
@@ -158,24 +176,6 @@ def epochs() -> dict[str, float]:
         word: sum(value for name, value in found.items() if name.endswith(f"_s_{word}"))
         for word in ("few", "year")
     }
-
-
-def start(site: str) -> dict[str, float]:
-    """Start the service over a store; return what it took until it is ready for scans."""
-    log = Path("start.log")
-    began_s = time.monotonic()
-    with log.open("w", encoding="utf-8") as out:
-        service = subprocess.Popen([sys.executable, "-m", "station.cli", "run", site], stderr=out)
-    try:
-        while "service=running" not in log.read_text(encoding="utf-8"):
-            if service.poll() is not None or time.monotonic() > began_s + PATIENCE_S:
-                raise RuntimeError(f"the service does not start: {log.read_text(encoding='utf-8')}")
-            time.sleep(LOOKS_S)
-        wall_s, cpu_s = time.monotonic() - began_s, _cpu_s(_family(service.pid))
-    finally:
-        service.send_signal(signal.SIGTERM)
-        service.wait(120)
-    return {"cpu_s": cpu_s, "wall_s": wall_s}
 
 
 @contextmanager

@@ -48,8 +48,7 @@ class Row:
         return [name for name, most in self.must.items() if self.figures.get(name, 0.0) > most]
 
 
-WORDS = {"cpu": "CPU × {:g}", "wall": "wall × {:g}", "cpu_s": "{:g} CPU-s",
-         "wall_s": "{:g} s", "peak_gb": "{:g} GB"}  # fmt: skip
+X  # fmt: skip
 
 
 def show(sections: Iterable[tuple[str, list[Row]]]) -> None:
@@ -59,7 +58,7 @@ def show(sections: Iterable[tuple[str, list[Row]]]) -> None:
     for head in HEADS:
         table.add_column(head, justify="right")
     table.add_column("must (aim)")
-    table.add_column("without, or why not")
+    table.add_column("without")
     for title, rows in sections:
         table.add_section()
         table.add_row(f"[bold]{title}")
