@@ -48,7 +48,13 @@ class Row:
         return [name for name, most in self.must.items() if self.figures.get(name, 0.0) > most]
 
 
-X  # fmt: skip
+WORDS = {
+    "cpu": "CPU × {:g}",
+    "wall": "wall × {:g}",
+    "cpu_s": "{:g} CPU-s",
+    "wall_s": "{:g} s",
+    "peak_gb": "{:.2f} GB",
+}
 
 
 def show(sections: Iterable[tuple[str, list[Row]]]) -> None:
