@@ -13,6 +13,7 @@ from pathlib import Path
 from statistics import median
 from typing import Any
 
+LASTING = 3  # processes of an idle service: it, the tracker of its resources, the server of its children
 ONE_THREAD = {"OPENBLAS_NUM_THREADS": "1"}  # a BLAS that spins for work would be counted as work
 
 
@@ -80,3 +81,34 @@ _startup_s: list[float] = []
 def middle(costs: Sequence[Cost]) -> Cost:
     """Return the median of each figure."""
     return Cost(*(median(getattr(one, name) for one in costs) for name in Cost.__annotations__))
+
+
+def family(pid: int) -> list[int]:
+    """Return a process and all below it, nearest first."""
+    found = [pid]
+    for one in found:
+        for task in Path(f"/proc/{one}/task").glob("*/children"):
+            found += [int(child) for child in _told(task).split()]
+    return found
+
+
+def cpu_of(pids: Sequence[int]) -> float:
+    """User and system time of processes and of all children they have waited for [s]."""
+    ticks = 0
+    for one in pids:
+        fields = _told(Path(f"/proc/{one}/stat")).rpartition(")")[2].split()
+        ticks += sum(map(int, fields[11:15]))
+    return ticks / os.sysconf("SC_CLK_TCK")
+
+
+def peak_of(pid: int) -> float:
+    """Most memory that a process has held [GB]."""
+    lines = _told(Path(f"/proc/{pid}/status")).splitlines()
+    return next((int(line.split()[1]) * 1024 / 1e9 for line in lines if line.startswith("VmHWM")), 0.0)
+
+
+def _told(path: Path) -> str:
+    try:
+        return path.read_text()
+    except OSError:  # it has just ended
+        return ""

@@ -16,7 +16,7 @@ from typing import Any
 import laspy
 import numpy as np
 
-from benchmarks.cost import run_job
+from benchmarks.cost import LASTING, cpu_of, family, peak_of, run_job
 from benchmarks.growth import growth
 from benchmarks.large import large_station
 from station.config import Site, read_site
@@ -33,7 +33,6 @@ from station.service.tasks import opened, process, reference_of
 CHUNK = 1_000_000
 LOOKS_S = 0.03
 QUIET_S = 3.0  # without a child: nothing more comes of a scan
-LASTING = 3  # processes of an idle service: it, the tracker of its resources, the server of its children
 PATIENCE_S = 3600.0
 
 
@@ -125,11 +124,11 @@ def serve(site: str, scans: list[str]) -> dict[str, Any]:
     with _service(site) as service:
         _until_quiet(service, told, 0)
         for number, path in enumerate(map(Path, scans), 1):
-            before_s = _cpu_s(_family(service.pid))
+            before_s = cpu_of(family(service.pid))
             given_s = time.monotonic() + told.scans.settle_s
             _give(path, told.scans.inbox)
             ended_s, peak_gb = _until_quiet(service, told, number)
-            cpu_s = _cpu_s(_family(service.pid)) - before_s
+            cpu_s = cpu_of(family(service.pid)) - before_s
             took.append({"cpu_s": cpu_s, "wall_s": ended_s - given_s, "peak_gb": peak_gb})
     return {"took": took}
 
@@ -138,7 +137,7 @@ def start(site: str) -> dict[str, float]:
     """Start the service over a store; return what it took until it was ready for scans."""
     began_s = time.monotonic()
     with _service(site) as service:
-        return {"cpu_s": _cpu_s(_family(service.pid)), "wall_s": time.monotonic() - began_s}
+        return {"cpu_s": cpu_of(family(service.pid)), "wall_s": time.monotonic() - began_s}
 
 
 @contextmanager
@@ -195,17 +194,17 @@ def _give(scan: Path, inbox: Path) -> None:
 
 def _until_quiet(service: subprocess.Popen[bytes], site: Site, stored: int) -> tuple[float, float]:
     """Wait until so many scans are stored and all is still; return since when, and the peak [GB]."""
-    peak_kb, busy_s = 0, time.monotonic()
+    peak_gb, busy_s = 0.0, time.monotonic()
     until_s = busy_s + PATIENCE_S
     while time.monotonic() < until_s:
         if service.poll() is not None:
             raise RuntimeError(f"the service ended with {service.returncode}")
-        children = _family(service.pid)[LASTING:]
+        children = family(service.pid)[LASTING:]
         if children:
             busy_s = time.monotonic()
-            peak_kb = max(peak_kb, *map(_peak_kb, children))
+            peak_gb = max(peak_gb, *map(peak_of, children))
         elif time.monotonic() > busy_s + QUIET_S and _stored(site) >= stored:
-            return busy_s, peak_kb * 1024 / 1e9
+            return busy_s, peak_gb
         time.sleep(LOOKS_S)
     raise RuntimeError(f"the service took more than {PATIENCE_S:g} s for a scan")
 
@@ -216,36 +215,6 @@ def _stored(site: Site) -> int:
             return journal.counts()[State.STORED]
     except StoreError:  # it has not begun
         return 0
-
-
-def _family(pid: int) -> list[int]:
-    """Return a process and all below it, nearest first."""
-    found = [pid]
-    for one in found:
-        for task in Path(f"/proc/{one}/task").glob("*/children"):
-            found += [int(child) for child in _told(task).split()]
-    return found
-
-
-def _cpu_s(family: list[int]) -> float:
-    """User and system time of processes and of all children they have waited for [s]."""
-    ticks = 0
-    for one in family:
-        fields = _told(Path(f"/proc/{one}/stat")).rpartition(")")[2].split()
-        ticks += sum(map(int, fields[11:15]))
-    return ticks / os.sysconf("SC_CLK_TCK")
-
-
-def _peak_kb(pid: int) -> int:
-    lines = _told(Path(f"/proc/{pid}/status")).splitlines()
-    return next((int(line.split()[1]) for line in lines if line.startswith("VmHWM")), 0)
-
-
-def _told(path: Path) -> str:
-    try:
-        return path.read_text()
-    except OSError:  # it has just ended
-        return ""
 
 
 def _quiet() -> None:
