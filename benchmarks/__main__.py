@@ -8,6 +8,7 @@ from __future__ import annotations
 import argparse
 import sys
 import tempfile
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -94,16 +95,22 @@ def measured(run: Run) -> list[tuple[str, list[Row]]]:
     ]  # fmt: skip
     told = [run.own("work", site=made["site"], scan=scan, before=of_reference[0])[1] for scan in coming]
     peers = [_peer(run, peer, [Work(**one) for one in told], floor) for peer in PEERS]
+    site = alone["site"]
     return [
         (f"{run.points / 1e6:g} million points: ratios to decoding them", station + peers),
-        (
-            "growth over points: epoch written; ratios to decoding them",
-            _over_points(run, alone["site"], epoch),
-        ),
-        ("growth over cells: epoch written; ratios to the smallest grid", _over_cells(run, alone["site"])),
-        ("growth over epochs: what follows an epoch; ratios to the fewest", _over_epochs(run)),
-        ("start-up", _startup(run)),
+        ("growth over points: epoch written; ratios to decoding them", _kept(_over_points, run, site, epoch)),
+        ("growth over cells: epoch written; ratios to the smallest grid", _kept(_over_cells, run, site)),
+        ("growth over epochs: what follows an epoch; ratios to the fewest", _kept(_over_epochs, run)),
+        ("start-up", _kept(_startup, run)),
     ]
+
+
+def _kept(section: Callable[..., list[Row]], *told: object) -> list[Row]:
+    """Return the rows of a section; where one fails that, so that the others are not lost."""
+    try:
+        return section(*told)
+    except FailedError as error:
+        return [Row("failed", None, note=str(error))]
 
 
 def _own(run: Run, job: str, site: str, scans: list[str]) -> Cost:
