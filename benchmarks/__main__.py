@@ -8,7 +8,6 @@ from __future__ import annotations
 import argparse
 import sys
 import tempfile
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -18,16 +17,13 @@ from benchmarks.peers import M3C2, PEERS, Peer, Work, take
 from benchmarks.ratios import Row, show
 
 ROUNDS = 3  # and scans, of each the median
-MUST_EPOCH, AIM_EPOCH = {"cpu": 1.25}, {"cpu": 1.1}
-MUST_SERVED = {"cpu": 2.0, "wall": 1.6}
 MUST_PEAK_GB = 0.9
 MUST_PEAK_GROWTH = 1.1
 MUST_EPOCHS = 1.2
-MUST_HELP_S, MUST_READY_S = 0.3, 5.0
+OVER_EPOCHS = "growth over epochs: what follows an epoch; ratios to the fewest"
 FEW_SHARE, MANY_TIMES = 0.1, 4  # of the points: 1.44, 14.4 and 57.6 million
 SIZES = (0.25, 0.5, 1.0)  # of the grid: 1,000 x 1,250 to 4,000 x 5,000
 QUICK_SIZE, QUICK_POINTS = 0.05, 40_000
-YEAR = Path("epochs/year/site.toml")  # that `own.epochs` leaves
 ARCHIVED, QUICK_ARCHIVED = (10, 8760), (10, 100)
 
 
@@ -63,59 +59,73 @@ def main() -> None:
         show(measured(Run(folder, points, asked.quick)))
 
 
+@dataclass(frozen=True)
+class Data:
+    """A station with its reference: site files, a scan of the reference, and the scans that come."""
+
+    site: str
+    alone: str  # without adjustment, in a store of its own
+    served: str  # with an empty inbox, in another
+    before: str
+    coming: list[str]
+
+
 def measured(run: Run) -> list[tuple[str, list[Row]]]:
     """Return the sections of the table."""
-    rounds = 1 if run.quick else ROUNDS
-    _say("data")
-    _, made = run.own("make", points=run.points, scans=rounds, size=run.size, folder=str(run.folder))
-    scans = made["scans"]
-    of_reference, coming = scans[:-rounds], scans[-rounds:]
-    floor = middle([run.decode(scan) for scan in coming])
-    _say("the reference")
-    _, alone = run.own("referenced", site=made["site"], scans=of_reference)
-    _, served = run.own("served", site=made["site"], alone=alone["site"])
-    _say("the service")
-    _, told = run.own("serve", site=served["site"], scans=coming)
-    service = middle([Cost(**one) for one in told["took"]])
+    data = _data(run)
+    _say("decoding")
+    floor = middle([run.decode(scan) for scan in data.coming])
     epoch = Row(
         "station, epoch written",
-        _own(run, "epoch", alone["site"], coming),
+        _own(run, "epoch", data),
         floor,
-        MUST_EPOCH | {"peak_gb": MUST_PEAK_GB},
-        AIM_EPOCH,
+        {"cpu": 1.25, "peak_gb": MUST_PEAK_GB},
+        {"cpu": 1.1},
         "adjustment, pictures",
     )
-    station = [
-        Row("laspy + lazrs, one thread", floor, floor),
-        Row("station, on the grid", _own(run, "hot", alone["site"], coming), floor, note="epoch, adjustment"),
-        epoch,
-        Row("station, running service", service, floor, MUST_SERVED | {"peak_gb": MUST_PEAK_GB}),
-        Row("its functions, a million points at once", _own(run, "chunks", alone["site"], coming), floor,
-            note="epoch, adjustment"),
-    ]  # fmt: skip
-    told = [run.own("work", site=made["site"], scan=scan, before=of_reference[0])[1] for scan in coming]
-    peers = [_peer(run, peer, [Work(**one) for one in told], floor) for peer in PEERS]
-    site = alone["site"]
     return [
-        (f"{run.points / 1e6:g} million points: ratios to decoding them", station + peers),
-        ("growth over points: epoch written; ratios to decoding them", _kept(_over_points, run, site, epoch)),
-        ("growth over cells: epoch written; ratios to the smallest grid", _kept(_over_cells, run, site)),
-        ("growth over epochs: what follows an epoch; ratios to the fewest", _kept(_over_epochs, run)),
-        ("start-up", _kept(_startup, run)),
+        (f"{run.points / 1e6:g} million points: ratios to decoding them", _ways(run, data, floor, epoch)),
+        ("growth over points: epoch written; ratios to decoding them", _over_points(run, data.alone, epoch)),
+        ("growth over cells: epoch written; ratios to the smallest grid", _over_cells(run, data.alone)),
+        *_store(run),
     ]
 
 
-def _kept(section: Callable[..., list[Row]], *told: object) -> list[Row]:
-    """Return the rows of a section; where one fails that, so that the others are not lost."""
-    try:
-        return section(*told)
-    except FailedError as error:
-        return [Row("failed", None, note=str(error))]
+def _data(run: Run) -> Data:
+    scans = 1 if run.quick else ROUNDS
+    _say("scans")
+    _, made = run.own("make", points=run.points, scans=scans, size=run.size, folder=str(run.folder))
+    site, of_reference, coming = made["site"], made["scans"][:-scans], made["scans"][-scans:]
+    _say("the reference")
+    _, alone = run.own("referenced", site=site, scans=of_reference)
+    _, served = run.own("served", site=site, alone=alone["site"])
+    return Data(site, alone["site"], served["site"], of_reference[0], coming)
 
 
-def _own(run: Run, job: str, site: str, scans: list[str]) -> Cost:
+def _ways(run: Run, data: Data, floor: Cost, epoch: Row) -> list[Row]:
+    """Return what the station takes for a scan, and what others take."""
+    _say("the service")
+    _, served = run.own("serve", site=data.served, scans=data.coming)
+    service = middle([Cost(**one) for one in served["took"]])
+    works = [
+        Work(**run.own("work", site=data.site, scan=scan, before=data.before)[1]) for scan in data.coming
+    ]
+    million = "its functions, a million points at once"
+    return [
+        Row("laspy + lazrs, one thread", floor, floor),
+        Row("station, on the grid", _own(run, "hot", data), floor, note="epoch, adjustment"),
+        epoch,
+        Row(
+            "station, running service", service, floor, {"cpu": 2.0, "wall": 1.6, "peak_gb": MUST_PEAK_GB}
+        ),
+        Row(million, _own(run, "chunks", data), floor, note="epoch, adjustment"),
+        *(_peer(run, peer, works, floor) for peer in PEERS),
+    ]  # fmt: skip
+
+
+def _own(run: Run, job: str, data: Data) -> Cost:
     _say(job)
-    return middle([run.own(job, site=site, scan=scan)[0] for scan in scans])
+    return middle([run.own(job, site=data.alone, scan=scan)[0] for scan in data.coming])
 
 
 def _peer(run: Run, peer: Peer, works: list[Work], floor: Cost) -> Row:
@@ -160,41 +170,44 @@ def _over_cells(run: Run, full: str) -> list[Row]:
     return rows
 
 
-def _over_epochs(run: Run) -> list[Row]:
-    few, many = QUICK_ARCHIVED if run.quick else ARCHIVED
-    rows = []
-    if not run.quick:
-        _say(f"{many:,} epochs")
-        _, found = run.own("epochs")
-        costs = [Cost(found[word]) for word in ("few", "year")]
-        rows = [
-            Row(f"station, epoch {few}", costs[0], costs[0]),
-            Row(f"station, epoch {many:,}", costs[1], costs[0], {"cpu": MUST_EPOCHS}),
-        ]
-    archive = "py4dgeo, appending to {:,} in its archive"
+def _over_epochs(found: dict[str, float]) -> list[Row]:
+    few, year = (
+        Cost(sum(value for name, value in found.items() if name.endswith(f"_s_{word}")))
+        for word in ("few", "year")
+    )
+    return [Row("station, epoch 10", few, few), Row("station, epoch 8,760", year, few, {"cpu": MUST_EPOCHS})]
+
+
+def _archive(run: Run) -> list[Row]:
+    """Return what py4dgeo's archive of epochs takes for one more."""
+    title = "py4dgeo's archive, epoch {:,}"
     if not M3C2.is_there:
-        return [*rows, Row(archive.format(many), None, note="not installed")]
-    appended = []
-    for epochs in (few, many):
-        _say(archive.format(epochs))
+        return [Row(title.format(ARCHIVED[-1]), None, note="not installed")]
+    taken = {}
+    for epochs in QUICK_ARCHIVED if run.quick else ARCHIVED:
+        _say(title.format(epochs))
         _, told = job_cost("benchmarks.peerwork", "append", run.folder, epochs=epochs)
-        appended.append(Cost(told["cpu_s"], told["wall_s"]))
-    note = "500 places; rewrites what it holds"
-    return rows + [
-        Row(archive.format(epochs), cost, appended[0], note=note)
-        for epochs, cost in zip((few, many), appended, strict=True)
-    ]
+        taken[epochs] = Cost(told["cpu_s"], told["wall_s"])
+    first = next(iter(taken.values()))
+    return [Row(title.format(epochs), cost, first, note="500 places") for epochs, cost in taken.items()]
 
 
-def _startup(run: Run) -> list[Row]:
-    _say("start-up")
+def _store(run: Run) -> list[tuple[str, list[Row]]]:
+    """Return the sections of what the store takes."""
+    _say("a year of epochs")
     told = [cost_of([sys.executable, "-m", "station.cli", "--help"], run.folder)[0] for _ in range(ROUNDS)]
-    rows = [Row("station --help", middle(told), must={"cpu_s": MUST_HELP_S})]
-    year = run.folder / YEAR
-    if year.exists():
-        _, started = run.own("start", site=str(year))
-        rows.append(Row("station run, a year stored", Cost(**started), must={"wall_s": MUST_READY_S}))
-    return rows
+    starting = [Row("station --help", middle(told), must={"cpu_s": 0.3})]
+    if run.quick:
+        return [(OVER_EPOCHS, _archive(run)), ("start-up", starting)]
+    _, found = run.own("epochs")
+    starting.append(Row("station run", Cost(found["run_cpu_s"], found["ready_s"]), must={"wall_s": 5.0}))
+    joined = Cost(found["join_day_cpu_s"], found["join_day_s"], found["join_day_gb"])
+    reading = [
+        Row("a map opened", Cost(0.0, found["map_s"]), must={"wall_s": 1.0}),
+        Row("a 100 m box, all year", Cost(0.0, found["box_year_s"]), must={"wall_s": 5.0}),
+        Row("a day joined", joined, must={"peak_gb": 1.5}),
+    ]
+    return [(OVER_EPOCHS, _over_epochs(found) + _archive(run)), ("a year stored", reading + starting)]
 
 
 def _say(what: str) -> None:

@@ -7,23 +7,32 @@ from __future__ import annotations
 
 import argparse
 import json
+import multiprocessing
+import os
 import shutil
+import signal
+import subprocess
+import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from datetime import UTC, datetime, timedelta
 from itertools import groupby
+from multiprocessing.connection import Connection
 from pathlib import Path
 
+import netCDF4
 import numpy as np
 from rich.console import Console
 from rich.table import Table
+from scipy import ndimage
 
 from station.archive import join, store
 from station.archive.aggregate import AreaChange
 from station.archive.areas import update_areas
 from station.archive.layout import Series
+from station.archive.layout import text as letters_of
 from station.archive.reference import write_reference
 from station.archive.series import build_series
 from station.archive.sources import Source, read_source
@@ -43,6 +52,8 @@ FULL = Grid(west_m=632_000.0, north_m=5_186_000.0, cell_m=1.0, nx=4000, ny=5000)
 DISTINCT = 3  # rasters that the epochs of a store take turns with
 ROUNDS = 3
 SHOWN = 20
+READ = ("elevation", "elevation_change")  # variables of the year on the full grid
+SEEN_OF_A_YEAR = 0.02  # of its cells: the rest is neither stored nor read
 SITE = """
 [station]
 id = "hef"
@@ -100,17 +111,14 @@ def _box(grid: Grid, name: str, share: float) -> dict[str, object]:
     }
 
 
-def epoch_of(grid: Grid, start: datetime, seen: float = 0.9) -> store.Epoch:
-    """An epoch of noise that sees so large a share of the grid, in one piece about its middle."""
+def epoch_of(grid: Grid, start: datetime, seen: float = 0.31) -> store.Epoch:
+    """An epoch that sees so large a share of the grid, in patches, where half of the ground moved."""
     random = np.random.default_rng(int(start.timestamp()) // 3600)
-    ny, nx = grid.shape
-    high, wide = (round(size * np.sqrt(seen)) for size in (ny, nx))
-    where = slice((ny - high) // 2, (ny + high) // 2), slice((nx - wide) // 2, (nx + wide) // 2)
-    there = np.zeros(grid.shape, bool)
-    there[where] = True
+    there = _patchy(np.random.default_rng(1), grid, seen)
     random_m = np.where(there, random.uniform(0.01, 0.03, grid.shape), np.nan).astype(np.float32)
     change_m = random_m * random.normal(size=grid.shape).astype(np.float32)
-    count = np.where(there, 3, 0).astype(np.int32)
+    change_m -= np.where(_patchy(np.random.default_rng(2), grid, 0.5), np.float32(0.2), np.float32(0.0))
+    count = np.where(there, random.poisson(3, grid.shape) + 1, 0).astype(np.int32)
     surface = Surface(grid, 2800.0 + change_m, change_m, count, random_m, random_m**2)
     of = basis(grid, (grid.west_m, grid.north_m, 3200.0))
     size = len(of.names)
@@ -119,7 +127,9 @@ def epoch_of(grid: Grid, start: datetime, seen: float = 0.9) -> store.Epoch:
         end_s=start.timestamp() + 900,
         scan_id=f"{start:%y%m%d_%H%M%S}",
         measurement=Measurement(surface, np.hypot(random_m, 0.01), random_m, there.astype(np.uint8), {}),
-        shared=Shared(of.names, of.units, random.normal(size=size) * 1e-5, np.eye(size) * 1e-10, np.zeros(size)),
+        shared=Shared(
+            of.names, of.units, random.normal(size=size) * 1e-5, np.eye(size) * 1e-10, np.zeros(size)
+        ),
         verdict="good",
         verdict_reason="",
         numbers={
@@ -136,7 +146,16 @@ def epoch_of(grid: Grid, start: datetime, seen: float = 0.9) -> store.Epoch:
     )  # fmt: skip
 
 
-def fill(site: Site, epochs: int, seen: float = 0.9, *, until: datetime | None = None) -> datetime:
+def _patchy(random: np.random.Generator, grid: Grid, share: float) -> Bools:
+    """Cells in patches of a fiftieth of the grid, so large a share of all."""
+    side = max(grid.nx // 50, 1)
+    shape = grid.ny // side + 1, grid.nx // side + 1
+    coarse = ndimage.gaussian_filter(random.normal(size=shape), 1.5)
+    fine = np.repeat(np.repeat(coarse, side, axis=0), side, axis=1)[: grid.ny, : grid.nx]
+    return np.asarray(fine >= np.quantile(coarse, 1 - share))
+
+
+def fill(site: Site, epochs: int, seen: float = 0.31, *, until: datetime | None = None) -> datetime:
     """Store so many hourly epochs, the older ones joined as the service does; return the next one's start.
 
     Joined files take their rasters from a few epochs.
@@ -205,9 +224,7 @@ def _turns(series: Series, starts: list[datetime], seen: float) -> Iterator[Sour
             ("scan_id", f"{start:%y%m%d_%H%M%S}"),
             ("scan_sha256", np.random.default_rng(at).bytes(32).hex()),
         ):
-            letters = np.zeros_like(words[name])
-            letters[0, : len(value)] = np.frombuffer(value.encode(), "S1")
-            words[name] = letters
+            words[name] = letters_of([value], "text")
         yield replace(template, at=at, words=words)
 
 
@@ -222,7 +239,7 @@ def _entry(series: Series, start: datetime) -> Entry:
     )  # fmt: skip
 
 
-def cost(site: Site, start: datetime, seen: float = 0.9) -> dict[str, float]:
+def cost(site: Site, start: datetime, seen: float = 0.31) -> dict[str, float]:
     """Return CPU seconds of what follows the measuring of a scan, the best of a few scans."""
     series = series_of(site)
     taken: dict[str, list[float]] = {}
@@ -238,6 +255,96 @@ def cost(site: Site, start: datetime, seen: float = 0.9) -> dict[str, float]:
             step()
             taken.setdefault(name, []).append(time.process_time() - began_s)
     return {name: min(found[1:]) for name, found in taken.items()}
+
+
+def reading(folder: Path) -> dict[str, float]:
+    """Return how long a map and a year of a 100 m box take on the full grid, where few cells are seen."""
+    series = Series(folder / "data", "hef", FULL, "EPSG:32632")
+    end = datetime(2026, 7, 1, tzinfo=UTC)
+    starts = [end - timedelta(hours=back) for back in range(YEAR, 0, -1)]
+    for kind, stamp, group in _closed(starts):
+        name = group[0].strftime(stamp)
+        path = series.folder / kind / f"{series.station_id}_{name}_r1.nc"
+        held = [replace(one, shapes=_only(one, READ)) for one in _turns(series, group, SEEN_OF_A_YEAR)]
+        join.write_joined(series, held, path, name, lambda: None)
+    build_series(series)
+    seen = np.isfinite(epoch_of(FULL, starts[0], SEEN_OF_A_YEAR).measurement.surface.change_m)
+    row, column = (int(np.median(place)) for place in np.nonzero(seen))
+    box = slice(row - 50, row + 50), slice(column - 50, column + 50)
+
+    def open_map() -> object:
+        with store.open_series(series.folder) as told:
+            return told.elevation_change[YEAR // 2].load()
+
+    def open_box() -> object:
+        with store.open_series(series.folder) as told:
+            return told.elevation_change[:, box[0], box[1]].load()
+
+    return {"map_s": _wall(open_map), "box_year_s": _wall(open_box)}
+
+
+def _only(source: Source, names: tuple[str, ...]) -> dict[str, tuple[int, ...]]:
+    return {name: shape for name, shape in source.shapes.items() if name in names}
+
+
+def _wall(work: Callable[[], object]) -> float:
+    began_s = time.monotonic()
+    work()
+    return time.monotonic() - began_s
+
+
+def joining(folder: Path, seen: float = 0.31) -> dict[str, float]:
+    """Return how long the joining of a day takes on the full grid, and the most memory it needs."""
+    series = Series(folder / "data", "hef", FULL, "EPSG:32632")
+    templates = replace(series, folder=folder / "templates")
+    day = datetime(2026, 7, 1, tzinfo=UTC)
+    for hour in range(DISTINCT):
+        store.write_epoch(templates, epoch_of(FULL, day + timedelta(hours=hour), seen))
+    for hour in range(24):
+        start = day + timedelta(hours=hour)
+        given = store.epochs(templates)[hour % DISTINCT].path
+        path = store.epoch_folder(series, start) / f"{series.station_id}_{start:{store.STAMP}}.nc"
+        path.parent.mkdir(parents=True, exist_ok=True)
+        shutil.copyfile(given, path)
+        with netCDF4.Dataset(path, "a") as file:
+            file["time"][:] = start.timestamp() + 450
+            file["time_bnds"][:] = (start.timestamp(), start.timestamp() + 900)
+            file["epoch_file"][0] = letters_of([path.name], "text")[0]
+    build_series(series)
+    here, there = multiprocessing.get_context("spawn").Pipe()
+    child = multiprocessing.get_context("spawn").Process(target=_join_once, args=(series, there))
+    child.start()
+    taken = here.recv()
+    child.join()
+    return dict(zip(("join_day_s", "join_day_cpu_s", "join_day_gb"), taken, strict=True))
+
+
+def _join_once(series: Series, there: Connection) -> None:
+    began_s, before_s = time.monotonic(), time.process_time()
+    join.join_closed(series, datetime(2026, 7, 3, tzinfo=UTC), lambda: None)
+    taken = time.monotonic() - began_s, time.process_time() - before_s
+    told = (
+        Path("/proc/self/status").read_text().split("VmHWM:")[1].split()[0]
+    )  # kB; rusage tells the parent's
+    there.send((*taken, int(told) / 2**20))
+
+
+def starting(site_file: Path) -> dict[str, float]:
+    """Return how long the service takes until it says that it runs, wall and CPU [s]."""
+    before_s = os.times()
+    began_s = time.monotonic()
+    command = [sys.executable, "-m", "station.cli", "run", str(site_file)]
+    with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as service:
+        assert service.stderr is not None  # noqa: S101 - asked for
+        for line in service.stderr:
+            if "service=running" in line:
+                break
+        ready_s = time.monotonic() - began_s
+        service.send_signal(signal.SIGTERM)
+        service.communicate()
+    after_s = os.times()
+    cpu_s = after_s.children_user + after_s.children_system
+    return {"ready_s": ready_s, "run_cpu_s": cpu_s - before_s.children_user - before_s.children_system}
 
 
 def main() -> None:
@@ -264,6 +371,16 @@ def growth(folder: Path) -> dict[str, float]:
         shutil.rmtree(place, ignore_errors=True)
         site = station_of(place, SMALL)
         found |= {f"{name}_{word}": value for name, value in cost(site, fill(site, epochs)).items()}
+    found |= {
+        name.replace("_s_few", "_ratio"): found[name.replace("_few", "_year")] / value
+        for name, value in found.items()
+        if name.endswith("_few")
+    }
+    found |= starting(folder / "year" / "site.toml")
+    for work in (joining, reading):
+        place = folder / work.__name__
+        shutil.rmtree(place, ignore_errors=True)
+        found |= work(place)
     return found
 
 

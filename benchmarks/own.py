@@ -140,13 +140,6 @@ def serve(site: str, scans: list[str]) -> dict[str, Any]:
     return {"took": took}
 
 
-def start(site: str) -> dict[str, float]:
-    """Start the service over a store; return what it took until it was ready for scans."""
-    began_s = time.monotonic()
-    with _service(site) as service:
-        return {"cpu_s": cpu_of(family(service.pid)), "wall_s": time.monotonic() - began_s}
-
-
 @contextmanager
 def _service(site: str) -> Iterator[subprocess.Popen[bytes]]:
     """Run the service, from when it is ready for scans."""
@@ -176,12 +169,8 @@ def _with(site: Path, name: str, says: str, instead: str) -> Path:
 
 
 def epochs() -> dict[str, float]:
-    """Return the CPU seconds of what follows an epoch, where few are stored and where a year is."""
-    found = growth(Path("epochs"))
-    return {
-        word: sum(value for name, value in found.items() if name.endswith(f"_s_{word}"))
-        for word in ("few", "year")
-    }
+    """Return what the store takes, where few epochs are stored and where a year is."""
+    return growth(Path("epochs"))
 
 
 @contextmanager
@@ -229,5 +218,5 @@ def _quiet() -> None:
 
 
 if __name__ == "__main__":
-    jobs = make, work, hot, chunks, epoch, referenced, served, serve, epochs, start
+    jobs = make, work, hot, chunks, epoch, referenced, served, serve, epochs
     run_job({job.__name__: job for job in jobs})
