@@ -125,7 +125,9 @@ def _ways(run: Run, data: Data, floor: Cost, epoch: Row) -> list[Row]:
 
 def _own(run: Run, job: str, data: Data) -> Cost:
     _say(job)
-    return middle([run.own(job, site=data.alone, scan=scan)[0] for scan in data.coming])
+    cost = middle([run.own(job, site=data.alone, scan=scan)[0] for scan in data.coming])
+    _say(f"  {cost.cpu_s:.2f} CPU-s")
+    return cost
 
 
 def _peer(run: Run, peer: Peer, works: list[Work], floor: Cost) -> Row:
