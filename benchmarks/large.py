@@ -7,10 +7,12 @@ simulation's: log, weather, SOP, site file. Made from the same numbers it is the
 from __future__ import annotations
 
 import os
+import re
 import shutil
 import subprocess
 import sys
-from collections.abc import Iterator
+import time
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
@@ -42,8 +44,8 @@ STABLE_M = 125.0  # half a side of a square of rock, one in each 500 m
 
 
 @dataclass(frozen=True)
-class Decoded:
-    """What reading a scan to its end takes."""
+class Taken:
+    """What a piece of work with a scan takes."""
 
     points: int
     cpu_s: float
@@ -76,24 +78,83 @@ def large_station(folder: Path, points: int, *, scans: int = 1, size: float = 1.
     return home / "site.toml"
 
 
-def decoded(scan: Path) -> Decoded:
+def prepared(folder: Path, points: int, *, size: float = 1.0) -> Path:
+    """Return the site file of such a station whose reference is made, with one scan still to be measured."""
+    site = large_station(folder, points, size=size)
+    made = folder / f"data-{size:g}"
+    if not made.exists():
+        first = sorted((site.parent / "inbox").glob("*.laz"))[:REFERENCE_SCANS]
+        shutil.rmtree(site.parent / "data", ignore_errors=True)
+        subprocess.run(
+            [sys.executable, "-m", "station.cli", "process", str(site), *map(str, first)],
+            check=True,
+            stdout=subprocess.DEVNULL,
+        )
+        (site.parent / "data").rename(made)
+    shutil.rmtree(site.parent / "data", ignore_errors=True)
+    shutil.copytree(made, site.parent / "data")
+    return site
+
+
+def decoded(scan: Path) -> Taken:
     """Decode all of a scan on one thread with laspy and lazrs, in a process of its own: the floor."""
+    return _told("decode", scan)
+
+
+def measured(site: Path, *, adjusted: bool = True) -> Taken:
+    """Measure and store the last scan of a prepared station, in a process of its own that has the modules."""
+    return _told("measure" if adjusted else "measure_bare", site)
+
+
+def _told(what: str, path: Path) -> Taken:
+    one_thread = dict.fromkeys(("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "RAYON_NUM_THREADS"), "1")
     told = subprocess.run(
-        [sys.executable, "-c", _DECODE, str(scan)], capture_output=True, text=True, check=True
+        [sys.executable, "-m", "benchmarks.large", what, str(path)],
+        capture_output=True,
+        text=True,
+        check=True,
+        env=os.environ | one_thread,
     ).stdout.split()
-    return Decoded(int(told[0]), *map(float, told[1:]))
+    return Taken(int(told[0]), *map(float, told[1:]))
 
 
-_DECODE = """
-import pathlib, re, resource, sys, time, laspy
-began_s, points = time.monotonic(), 0
-with laspy.open(sys.argv[1], laz_backend=laspy.LazBackend.Lazrs) as scan:
-    for block in scan.chunk_iterator(50_000):
-        points += len(block)
-used = resource.getrusage(resource.RUSAGE_SELF)
-peak_kb = re.search(r"VmHWM:\\s+(\\d+)", pathlib.Path("/proc/self/status").read_text())[1]
-print(points, used.ru_utime + used.ru_stime, time.monotonic() - began_s, int(peak_kb) / 1e6)
-"""
+def main() -> None:
+    """Do what is asked for and print points, CPU seconds, seconds and the most memory [GB]."""
+    what, path = sys.argv[1], Path(sys.argv[2])
+    work = _decode if what == "decode" else _measure(path, adjusted=what == "measure")
+    used_s, began_s = time.process_time(), time.monotonic()
+    points = work(path)
+    used_s, began_s = time.process_time() - used_s, time.monotonic() - began_s
+    peak_kb = re.search(r"VmHWM:\s+(\d+)", Path("/proc/self/status").read_text())
+    print(points, used_s, began_s, int(peak_kb[1]) / 1e6)
+
+
+def _decode(scan: Path) -> int:
+    with laspy.open(scan, laz_backend=laspy.LazBackend.Lazrs) as reader:
+        return sum(len(block) for block in reader.chunk_iterator(50_000))
+
+
+def _measure(site_file: Path, *, adjusted: bool) -> Callable[[Path], int]:
+    """Return the work, once all it needs is imported, as in the children of a running service."""
+    from station.config import read_site  # noqa: PLC0415 - not of the floor
+    from station.service import tasks  # noqa: PLC0415
+    from station.service.inbox import Arrival  # noqa: PLC0415
+
+    site = read_site(site_file)
+    if not adjusted:
+        site = site.model_copy(update={"adjustment": site.adjustment.model_copy(update={"method": "none"})})
+    scan = max(site.scans.inbox.glob("*.laz"))
+    log = scan.with_name(f"{scan.stem}-incl.txt")
+    status = scan.stat()
+    arrival = Arrival(scan.name, scan, log, status.st_size, status.st_mtime_ns)
+
+    def work(_: Path) -> int:
+        outcome = tasks.process(site, arrival, lambda: None)
+        if outcome.verdict != "good":
+            raise RuntimeError(f"{scan}: {outcome.verdict}: {outcome.reason}")
+        return int(outcome.figures["points"])
+
+    return work
 
 
 def _scenario(scans: int, size: float) -> Scenario:
@@ -287,7 +348,5 @@ def _echoes(
     return _Shot(x_m, y_m, z_m, into_s, np.clip(brightness, 0.01, 1.0), deviation)
 
 
-def emptied(site: Path) -> Path:
-    """Return the same site without anything that was written of it."""
-    shutil.rmtree(site.with_name("data"), ignore_errors=True)
-    return site
+if __name__ == "__main__":
+    main()

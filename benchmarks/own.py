@@ -218,5 +218,6 @@ def _quiet() -> None:
 
 
 if __name__ == "__main__":
+    os.environ["RAYON_NUM_THREADS"] = "1"  # one scan is one core's work, as in the service's children
     jobs = make, work, hot, chunks, epoch, referenced, served, serve, epochs
     run_job({job.__name__: job for job in jobs})
