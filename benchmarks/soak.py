@@ -22,6 +22,7 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
+from benchmarks.cost import LASTING, cpu_of, family
 from station.config import Site, read_site
 from station.errors import StoreError
 from station.service.journal import Journal, State
@@ -122,21 +123,13 @@ def _counts(site: Site) -> dict[str, int]:
 
 def _sample(pid: int, stored: int) -> Sample:
     """Look at the service and the server its children are forked from."""
-    found = [pid]
-    for one in found:
-        for task in Path(f"/proc/{one}/task").glob("*/children"):
-            found += [int(child) for child in task.read_text().split()]
-    lasting = found[:3]  # the service, the tracker of its resources, the fork server; then come children
+    lasting = family(pid)[:LASTING]  # then come children
     pages = sum(int(Path(f"/proc/{one}/statm").read_text().split()[1]) for one in lasting)
-    ticks = 0
-    for one in lasting:
-        fields = Path(f"/proc/{one}/stat").read_text().rpartition(")")[2].split()
-        ticks += sum(map(int, fields[11:15]))
     return Sample(
         time.monotonic(),
         stored,
         pages * os.sysconf("SC_PAGE_SIZE") / 1e6,
-        ticks / os.sysconf("SC_CLK_TCK"),
+        cpu_of(lasting),
     )
 
 
