@@ -119,7 +119,7 @@ def epoch_of(grid: Grid, start: datetime, seen: float = 0.31) -> store.Epoch:
     change_m = random_m * random.normal(size=grid.shape).astype(np.float32)
     change_m -= np.where(_patchy(np.random.default_rng(2), grid, 0.5), np.float32(0.2), np.float32(0.0))
     count = np.where(there, random.poisson(3, grid.shape) + 1, 0).astype(np.int32)
-    surface = Surface(grid, 2800.0 + change_m, change_m, count, random_m, random_m**2)
+    surface = Surface(grid, 2800.0 + change_m, change_m, count, random_m)
     of = basis(grid, (grid.west_m, grid.north_m, 3200.0))
     size = len(of.names)
     return store.Epoch(

@@ -4,7 +4,7 @@ import pytest
 
 from benchmarks.large import decoded, large_station, measured, prepared
 
-MOST_GB = 0.9
+MOST_GB = 1.0  # of which the adjustment has 0.1
 POINTS = (1_440_000, 14_400_000)
 
 
@@ -18,7 +18,7 @@ def test_memory_is_bounded_by_the_grid_not_by_the_points(tmp_path):
 
 def test_a_small_one_of_its_kind_is_adjusted_and_good(tmp_path):
     site = prepared(tmp_path, 90_000, size=0.08)
-    taken = measured(site)  # raises where the verdict is not good
+    taken = measured(site)  # raises where it is of no use
     assert taken.points == pytest.approx(90_000, rel=0.02)
     scan = max((site.parent / "inbox").glob("*.laz"))
     assert decoded(scan).points == taken.points
