@@ -167,7 +167,7 @@ def test_what_else_a_series_says_is_brought_up_too(grown, epoch):
 
 @pytest.mark.slow
 def test_what_follows_a_scan_costs_little_more_after_a_year(tmp_path, monkeypatch):
-    """Fifteen times as many epochs, less than twice the CPU; measuring a scan, which does not grow, is apart."""
+    """Fifteen times as many epochs, less than twice the CPU; measuring, which does not grow, is apart."""
     from benchmarks import growth
 
     monkeypatch.undo()
