@@ -79,7 +79,7 @@ class Aggregator(Protocol):
 def update_areas(
     series: Series, areas: dict[str, Bools], aggregator: Aggregator, progress: Callable[[], None]
 ) -> Path | None:
-    """Make `areas.nc` agree with the epochs stored; `areas` are cells (ny, nx) by name.
+    """Make `areas.nc` agree with `series.nc`; `areas` are cells (ny, nx) by name.
 
     Epochs it already holds are not computed again unless an area has changed. Returns None, and writes
     nothing, where there is no area or no epoch. `progress` is called after each epoch computed. Raises

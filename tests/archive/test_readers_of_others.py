@@ -144,6 +144,7 @@ class Told:
 def of_areas(series, epoch):
     for hour in range(4):
         store.write_epoch(series, epoch(hour))
+    build_series(series)
     everywhere = np.ones(series.grid.shape, bool)
     areas = {"Süd": everywhere, "unseen": np.tri(*series.grid.shape, dtype=bool)}
     return update_areas(series, areas, Told(), lambda: None)
