@@ -216,12 +216,12 @@ def test_a_part_of_much_stable_ground_says_nearly_what_all_of_it_says(monkeypatc
     told = Told(of, lines_of(of, np.eye(3), None), np.zeros((3, of.line_count)), None, weather_known=True)
     known = replace(truth(), habits=Habits(translation_m=0.1))
     stable = np.ones(GRID.shape, bool)
-    seen = gridder.count.reshape(GRID.shape) > 0
+    seen = gridder.seen()
     found = {}
     for step in (1, 2, 3, 13):
         monkeypatch.setattr(pipeline, "STABLE_MOST", seen.sum() // step + 1)
         found[step] = level(gridder, setup, told, known, stable)
-        correction_m = pipeline.corrections(gridder, setup, told, known, found[step])
+        _, correction_m = on_reference(gridder, setup, known, (told, found[step]))
         assert np.median(correction_m[seen]) == pytest.approx(0.030, abs=0.003)
         sigma_m = np.sqrt(np.diag(found[step].covariance))
         apart = np.abs(found[step].estimate - found[1].estimate) / sigma_m

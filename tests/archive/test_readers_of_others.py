@@ -183,9 +183,12 @@ def test_nco_averages_areas_over_time(of_areas, tmp_path):
 def replaced_again_and_again(series):
     """Build the series in another process, as in life: HDF5 is one lock within a process."""
     program = (
-        "import sys, pickle; from station.archive.series import build_series\n"
+        "import sys, pickle; from station.archive.made import NOTE\n"
+        "from station.archive.series import build_series\n"
         "series = pickle.loads(bytes.fromhex(sys.argv[1]))\n"
-        "while True: build_series(series)\n"
+        "while True:\n"
+        "    (series.folder / NOTE).unlink(missing_ok=True)\n"  # else there is nothing to do
+        "    build_series(series)\n"
     )
     writer = subprocess.Popen([sys.executable, "-c", program, pickle.dumps(series).hex()])
     before = series.path.stat().st_ino
