@@ -128,11 +128,11 @@ class Raster:
             return np.asarray(self[first : last + 1][rows - first])
         if self._whole is not None:
             return self._made(self._whole[rows])
-        first, stop, _ = rows.indices(self.shape[0])
+        first, stop, step = rows.indices(self.shape[0])
         height = self._size[0]
         bands = range(first - first % height, stop, height)
         held = [self._band(top)[max(first - top, 0) : stop - top] for top in bands]
-        return held[0] if len(held) == 1 else np.concatenate(held)
+        return (held[0] if len(held) == 1 else np.concatenate(held))[::step]
 
     def __array__(self, dtype: Any = None, copy: bool | None = None) -> Array:  # noqa: ANN401, FBT001 - numpy's
         """Return all of it."""
