@@ -21,6 +21,7 @@ FEWEST = 20  # scans of a series before steps are looked for
 HABITS_WORTH = 4  # scans of drift that the habits weigh against those of the series
 SUDDEN = 1 / 3  # of the habits, which hold what drifts over days, between two scans
 SIGMAS = 6.5  # of a step, before it is one
+AS_CLEAR = 0.9  # of the most significant place of a step, where another may fit better
 QUIET = 1.5  # sigmas of one scan's noise; less between medians of scans is not worth a closer look
 BEYOND = 0.5  # of its size, where a scan is taken to lie on its far side
 ROUNDS = 5
@@ -73,7 +74,7 @@ def _step_at(
     `drifts` are those found before, by the last scan that each was learned from.
     """
     newest = len(level) - 1
-    best: Step | None = None
+    found: list[tuple[Step, float]] = []
     for after in range(AFTER[0], AFTER[1] + 1):
         first = max(newest - after - BEFORE + 1, 0)
         if newest - after < since:
@@ -89,9 +90,22 @@ def _step_at(
         later = np.arange(first, newest + 1) > newest - after
         size, sigma, lasts = _fit(time_s[window], level[window], later, drift)
         sigmas = float(np.max(np.where(lasts, np.abs(size) / sigma, 0.0)))
-        if sigmas > SIGMAS and (best is None or sigmas > best.sigmas):
-            best = Step(newest - after, newest, size, sigma, sigmas)
-    return best
+        here = _misfit(level[newest + 1 - AFTER[1] - LATELY :], after, drift)
+        if sigmas > SIGMAS:
+            found.append((Step(newest - after, newest, size, sigma, sigmas), here))
+    clear = max((step.sigmas for step, _ in found), default=0.0) * AS_CLEAR
+    alike = [one for one in found if one[0].sigmas >= clear]  # with a scan on the wrong side it may be so
+    return min(alike, key=lambda one: one[1])[0] if alike else None
+
+
+def _misfit(level: Floats, after: int, drift: _Drift) -> float:
+    """How badly a step that many scans from the end fits poses (n, p), outliers counting little."""
+    middle = np.where(
+        (np.arange(len(level)) < len(level) - after)[:, None],
+        _median(level[:-after][-LATELY:]),
+        _median(level[-after:]),
+    )
+    return float(np.minimum((level - middle) ** 2 / drift.noise, SIGMAS**2).sum())
 
 
 @dataclass(frozen=True)
