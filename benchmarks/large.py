@@ -21,6 +21,7 @@ import laspy
 import numpy as np
 
 from station.quantities import Floats, WeatherLog
+from station.service import child
 from station.simulation import files, motion
 from station.simulation.air import SCANNER_SETTING
 from station.simulation.randomness import stream
@@ -107,13 +108,12 @@ def measured(site: Path, *, adjusted: bool = True) -> Taken:
 
 
 def _told(what: str, path: Path) -> Taken:
-    one_thread = dict.fromkeys(("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "RAYON_NUM_THREADS"), "1")
     told = subprocess.run(
         [sys.executable, "-m", "benchmarks.large", what, str(path)],
         capture_output=True,
         text=True,
         check=True,
-        env=os.environ | one_thread,
+        env=os.environ | child.SURROUNDINGS,
     ).stdout.split()
     return Taken(int(told[0]), *map(float, told[1:]))
 

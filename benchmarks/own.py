@@ -24,7 +24,7 @@ from station.errors import StoreError
 from station.quantities import Shots
 from station.readers.las import LasScan
 from station.readers.scan import ScanReader, utc_interval
-from station.service import tasks
+from station.service import child, tasks
 from station.service.gather import Gathered, gather
 from station.service.journal import Journal, State
 from station.service.places import arrival_of
@@ -85,7 +85,7 @@ class _LaidError(Exception):
 
 def chunks(site: str, scan: str) -> dict[str, float]:
     """Do the same as `hot` by the same functions, a million points at once and all of each decoded."""
-    with mock.patch.object(LasScan, "blocks", lambda self, *_: _millions(self.path)):
+    with mock.patch.object(LasScan, "blocks", lambda self, **_: _millions(self.path)):
         return hot(site, scan)
 
 
@@ -118,8 +118,8 @@ def served(site: str, alone: str) -> dict[str, str]:
     path.with_name("arrivals").mkdir()
     held, data = (read_site(Path(one)).station.data for one in (alone, path))
     data.mkdir()
-    for one in held.glob("reference*"):
-        shutil.copy(one, data)
+    for one in (*held.glob("reference*"), *held.glob(".outlook*")):
+        shutil.copy2(one, data)
     shutil.copytree(held / "lean_zero", data / "lean_zero")
     return {"site": str(path)}
 
@@ -219,6 +219,6 @@ def _quiet() -> None:
 
 
 if __name__ == "__main__":
-    os.environ["RAYON_NUM_THREADS"] = "1"  # one scan is one core's work, as in the service's children
+    os.environ |= child.SURROUNDINGS
     jobs = make, work, hot, chunks, epoch, referenced, served, serve, epochs
     run_job({job.__name__: job for job in jobs})

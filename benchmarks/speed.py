@@ -10,8 +10,8 @@ from dataclasses import replace
 import numpy as np
 from scipy import ndimage
 
-from station.pipeline import Setup, Told, gridder_for, level, measure
-from station.quantities import Bools, Floats, Grid, Reference
+from station.pipeline import Told, gridder_for, level, measure, outlook_on
+from station.quantities import Bools, Floats, Grid, Reference, Setup
 from station.science import prior, shared
 from station.science.grid import Gridder
 from station.science.normals import LineLog
@@ -36,13 +36,14 @@ def adjustment_seconds(
     seen, stable = _patchy(random, grid, VALID), _patchy(random, grid, STABLE)
     reference = _reference(grid, seen)
     setup = Setup(SCANNER, grid, position_m)
-    gridder = _filled(random, gridder_for(setup, reference), seen)
+    outlook = outlook_on(reference, setup, stable)
+    gridder = _filled(random, gridder_for(setup, outlook), seen)
     told = _told(random, grid, position_m)
-    found = level(gridder, setup, told, reference, stable)
-    levelled_s = _best(lambda held: level(held, setup, told, reference, stable), gridder)
+    found = level(gridder, setup, told, outlook)
+    levelled_s = _best(lambda held: level(held, setup, told, outlook), gridder)
     unknown = found.shared()
-    without_s = _best(lambda held: measure(held, setup, unknown, reference), gridder)
-    with_s = _best(lambda held: measure(held, setup, unknown, reference, (told, found, stable)), gridder)
+    without_s = _best(lambda held: measure(held, setup, unknown, outlook), gridder)
+    with_s = _best(lambda held: measure(held, setup, unknown, outlook, (told, found)), gridder)
     total_s = levelled_s + max(with_s - without_s, 0.0)
     return {
         "valid_share": float(seen.mean()),

@@ -9,14 +9,19 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from enum import IntFlag
 from math import radians
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 Floats = NDArray[np.float64]
 Floats32 = NDArray[np.float32]
+Reals = NDArray[np.floating[Any]]  # of either precision
 Ints = NDArray[np.int64]
 Bools = NDArray[np.bool_]
+
+
+UPRIGHT = (0.0, 0.0, 1.0)
 
 
 @dataclass(frozen=True)
@@ -128,6 +133,24 @@ class Grid:
 
 
 @dataclass(frozen=True)
+class Setup:
+    """What stays the same from scan to scan.
+
+    `position_m` is the scanner's place on the map, None where a map-frame scan does not tell it; `axis` the
+    direction (east, north, up) its head turns about.
+    """
+
+    scanner: Scanner
+    grid: Grid
+    position_m: tuple[float, float, float] | None
+    axis: tuple[float, float, float] = UPRIGHT
+    min_points: int = 1
+    published_budget: bool = False  # Voordendag et al. (2023) instead of the corrected form
+    registration_sigma_m: float = 0.0  # of the published budget
+    store_terms: bool = False
+
+
+@dataclass(frozen=True)
 class Shared:
     """What all points of a scan have in common and nobody knows exactly (EQUATIONS 6.1).
 
@@ -232,7 +255,6 @@ class Reference:
     stable: Bools  # (ny, nx) found steep and without change
     habits: Habits  # of the station, as its scans show them
     seen: Floats32  # (ny, nx) share of its scans that saw the cell; NaN where unknown
-    nodes_m: Floats32 | None = None  # (ny, nx) elevation with the ring around it that `terrain.extend` adds
 
     @classmethod
     def given(cls, grid: Grid, version: str, elevation_m: Floats, stable: Bools | None = None) -> Reference:

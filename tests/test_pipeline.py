@@ -7,10 +7,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from station import pipeline
-from station.pipeline import Pose, Setup, Told, gridder_for, level, measure, on_reference, survey
-from station.quantities import Air, Grid, Habits, Quality, Reference, Scanner, Shots, Tilt
-from station.science import budget
+from station.pipeline import Pose, Told, gridder_for, level, measure, on_reference, outlook_on, survey
+from station.quantities import Air, Grid, Habits, Quality, Reference, Scanner, Setup, Shots, Tilt
+from station.science import budget, outlook
 from station.science.air import air_correction
 from station.science.grid import Stack
 from station.science.inclination import LEVEL
@@ -62,9 +61,10 @@ def scanned(shots, reference, unknown=None, **settings):
     sop = np.eye(4)
     sop[:3, 3] = SCANNER
     setup = Setup(VZ6000, GRID, SCANNER, **settings)
-    gridder = gridder_for(setup, reference)
+    seen_from = reference and outlook_on(reference, setup, np.zeros(GRID.shape, bool))
+    gridder = gridder_for(setup, seen_from)
     survey(gridder, [shots], Pose(frame_in_local_map(sop), None, None), lambda: None)
-    return measure(deepcopy(gridder), setup, unknown, reference), gridder, setup
+    return measure(deepcopy(gridder), setup, unknown, seen_from), gridder, setup, seen_from
 
 
 def test_without_errors_the_surface_is_the_truth():
@@ -99,8 +99,8 @@ def test_a_master_from_scans_finds_the_truth_and_its_own_error():
     for _ in range(3):
         stack = Stack(GRID)
         for shots in scans:
-            _, gridder, setup = scanned(shots, made)
-            stack.add(gridder, made and on_reference(gridder, setup, made, None))
+            _, gridder, setup, seen_from = scanned(shots, made)
+            stack.add(gridder, made and on_reference(gridder, seen_from, None))
         made = master(stack, made, [None], setup.position_m, "1", ("a",), Habits())
     error = made.elevation_m - height(x_m, y_m)
     assert np.nanmedian(error) == pytest.approx(0.0, abs=1e-3)
@@ -118,8 +118,8 @@ def test_roughness_within_cells_is_found():
     for seed in range(3):
         shots = shots_at(*spots(300_000, seed), seed=seed)
         rough = Shots(shots.x_m, shots.y_m, shots.z_m + rng.normal(0, 0.2, len(shots)), None)
-        _, gridder, setup = scanned(rough, made)
-        stack.add(gridder, on_reference(gridder, setup, made, None))
+        _, gridder, _, seen_from = scanned(rough, made)
+        stack.add(gridder, on_reference(gridder, seen_from, None))
     several = stack.count > 10
     assert np.sqrt(stack.roughness()[several].mean()) == pytest.approx(0.2, rel=0.05)
 
@@ -211,7 +211,7 @@ def test_a_part_of_much_stable_ground_says_nearly_what_all_of_it_says(monkeypatc
     """Shots 30 mm too high, seen by every, every second, third and thirteenth row of rock."""
     shots = shots_at(*spots(150_000, 7))
     sunk = Shots(shots.x_m, shots.y_m, shots.z_m + 0.030, None)
-    _, gridder, setup = scanned(sunk, truth())
+    _, gridder, setup, _ = scanned(sunk, truth())
     of = basis(GRID, SCANNER)
     told = Told(of, lines_of(of, np.eye(3), None), np.zeros((3, of.line_count)), None, weather_known=True)
     known = replace(truth(), habits=Habits(translation_m=0.1))
@@ -219,9 +219,10 @@ def test_a_part_of_much_stable_ground_says_nearly_what_all_of_it_says(monkeypatc
     seen = gridder.seen()
     found = {}
     for step in (1, 2, 3, 13):
-        monkeypatch.setattr(pipeline, "STABLE_MOST", seen.sum() // step + 1)
-        found[step] = level(gridder, setup, told, known, stable)
-        _, correction_m = on_reference(gridder, setup, known, (told, found[step]))
+        monkeypatch.setattr(outlook, "STABLE_MOST", stable.size // step + 1)
+        seen_from = outlook_on(known, setup, stable)
+        found[step] = level(gridder, setup, told, seen_from)
+        _, correction_m = on_reference(gridder, seen_from, (told, found[step]))
         assert np.median(correction_m[seen]) == pytest.approx(0.030, abs=0.003)
         sigma_m = np.sqrt(np.diag(found[step].covariance))
         apart = np.abs(found[step].estimate - found[1].estimate) / sigma_m

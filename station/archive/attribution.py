@@ -19,7 +19,7 @@ from station.quantities import Bools, Floats, Ints, Reference, Shared
 from station.science import terrain
 from station.science.calibration import range_bands
 from station.science.moved import Moved
-from station.science.sensitivity import INPUTS, apart, cell_shares, interactions, sobol, some, sum_shares
+from station.science.sensitivity import INPUTS, apart, cell_shares, interactions, sobol, sum_shares
 from station.science.shared import Sensitivities, against
 
 LOOKED_AT = 100_000  # cells at once
@@ -51,7 +51,7 @@ class Attribution:
 
     def shares(self, of: Ints | slice) -> dict[str, Floats]:
         """Share of each input in the variance of the chosen of the cells."""
-        return cell_shares(some(self.felt, of), self.random_m2[of], self.unknown)
+        return cell_shares(self.felt.some(of), self.random_m2[of], self.unknown)
 
     @cached_property
     def range_m(self) -> Floats:
@@ -68,7 +68,7 @@ class Attribution:
             inside = inside[:: 1 + len(inside) // LOOKED_AT]
             if len(inside):
                 shares = {name: float(values.mean()) for name, values in self.shares(inside).items()}
-                shared_m2 = some(self.felt, inside).variance(self.unknown)
+                shared_m2 = self.felt.some(inside).variance(self.unknown)
                 sigma = float(np.median(np.sqrt(shared_m2 + self.random_m2[inside])))
                 told.append({"cells": f"{low_m:g}-{high_m:g} m", "sigma_m": sigma, "part": shares})
         return told
@@ -98,7 +98,7 @@ class Attribution:
         row, column = (place[chosen] for place in np.nonzero(self.cells))
         ground = terrain.ground(self.reference)
         height_m = ground.under(column + 0.5, row + 0.5)[0]
-        felt, random_m2 = some(self.felt, chosen), self.random_m2[chosen]
+        felt, random_m2 = self.felt.some(chosen), self.random_m2[chosen]
         weights = np.full(len(chosen), 1 / len(chosen))
         points = grid.x_m[column], grid.y_m[row], height_m
         moved = Moved(ground, self.position_m, points, weights, felt, self.unknown, random_m2)

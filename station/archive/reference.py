@@ -16,18 +16,13 @@ from station.archive.layout import Series, define, lay_out, strings, written_who
 from station.archive.rasters import Raster, write_rasters
 from station.archive.variables import FILL, Variable
 from station.errors import StoreError
-from station.quantities import Floats, Floats32, Habits, Reference, Shared
-from station.science.terrain import extend
+from station.quantities import Floats32, Habits, Reference, Shared
 
 HABIT = "habit_"  # of the station, one sigma each, attributes of the file
 _ROWS = (
     Variable(
         "reference_elevation", ("y", "x"), "f4", "elevation of the reference surface at the cell centre", "m",
         "surface_altitude", 3, None, "bilinear between cell centres",
-    ),
-    Variable(
-        "reference_node", ("y", "x"), "f4", "elevation of the reference surface and of a ring around it", "m",
-        None, 3, None, "beyond the known cells it goes on as they do: for heights at their rim",
     ),
     Variable(
         "reference_random_uncertainty", ("y", "x"), "f4", "random uncertainty of the reference surface", "m",
@@ -86,6 +81,12 @@ class Lineage:
 def path_of(series: Series, version: str) -> Path:
     """Return the file of a version of the reference."""
     return series.folder / f"reference_{version}.nc"
+
+
+def held_at(series: Series, version: str) -> Path:
+    """Return where a version of the reference is to be read: by its own name, where it has one."""
+    own = path_of(series, version)
+    return own if own.is_file() else series.folder / "reference.nc"
 
 
 def versions(series: Series) -> list[str]:
@@ -163,7 +164,6 @@ def _rasters(reference: Reference) -> Iterator[tuple[Variable, np.ndarray[Any, A
     """Give what lies on the grid, by variable."""
     for name, values in (
         ("reference_elevation", reference.elevation_m),
-        ("reference_node", _nodes(reference)),
         ("reference_random_uncertainty", np.sqrt(reference.random_variance_m2)),
         ("reference_roughness", np.sqrt(reference.roughness_m2)),
         ("reference_variance_factor", reference.variance_factor),
@@ -172,13 +172,6 @@ def _rasters(reference: Reference) -> Iterator[tuple[Variable, np.ndarray[Any, A
         ("reference_seen", reference.seen),
     ):
         yield _BY_NAME[name], values
-
-
-def _nodes(reference: Reference) -> Floats:
-    """Return the elevation with a ring of cells around what is known (ny, nx)."""
-    known = np.isfinite(reference.elevation_m)
-    datum_m = float(np.round(np.mean(reference.elevation_m, where=known))) if known.any() else 0.0
-    return np.asarray(extend((reference.elevation_m - datum_m).astype(np.float32)) + np.float64(datum_m))
 
 
 def settle_reference(series: Series) -> None:
@@ -206,10 +199,8 @@ def read_reference(series: Series, version: str | None = None) -> Reference | No
     held = open_reference(series, version)
     if held is None:
         return None
-    whole: dict[str, Any] = {
-        name: np.asarray(getattr(held, name)) for name, _, _ in _HELD if name != "nodes_m"
-    }
-    return replace(held, **whole, nodes_m=None)
+    whole: dict[str, Any] = {name: np.asarray(getattr(held, name)) for name, _, _ in _HELD}
+    return replace(held, **whole)
 
 
 def open_reference(series: Series, version: str | None = None) -> Reference | None:
@@ -219,8 +210,7 @@ def open_reference(series: Series, version: str | None = None) -> Reference | No
         return None
     try:
         with netCDF4.Dataset(path) as file:
-            kept = path_of(series, str(file.reference_version))  # its name for good
-            return _opened(file, kept if kept.is_file() else path, series)
+            return _opened(file, held_at(series, str(file.reference_version)), series)
     except (OSError, RuntimeError, KeyError, IndexError, AttributeError) as error:
         raise StoreError(f"{path}: cannot be read: {error}") from error
 
@@ -277,7 +267,6 @@ def _filled(values: np.ndarray[Any, Any], fill: float = np.nan) -> Floats32:
 
 _HELD: tuple[tuple[str, str, Callable[[np.ndarray[Any, Any]], np.ndarray[Any, Any]]], ...] = (
     ("elevation_m", "reference_elevation", lambda values: _filled(values).astype(np.float64)),
-    ("nodes_m", "reference_node", _filled),
     ("random_variance_m2", "reference_random_uncertainty", lambda values: _filled(values) ** 2),
     ("roughness_m2", "reference_roughness", lambda values: _filled(values) ** 2),
     ("variance_factor", "reference_variance_factor", lambda values: _filled(values, 1.0)),

@@ -3,20 +3,17 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
-import h5py
 import numpy as np
 
 from station.archive.layout import Series
+from station.archive.rasters import Raster
 from station.archive.store import Row
 from station.archive.variables import FILL
-from station.errors import StoreError
 from station.quantities import Bools, Floats32, Grid
 from station.science.change import significant
 
 BAND_ROWS = 128  # that a file holds together
-CACHE_BYTES = 32_000_000  # a band of its chunks
 SUN = (-0.55, 0.55, 0.63)  # east, north, up: from the north-west, as maps have it
 STEEPER = 1.5  # that the terrain is shown
 CHANGE, SIGMA, RANDOM = (
@@ -65,12 +62,12 @@ def base_of(series: Series, version: str, pixels: int) -> Base:
     """
     path = series.folder / f"reference_{version}.nc"
     grid = series.grid
-    with _opened(path) as file:
-        rows, columns = _known(file["reference_elevation"], grid)
-        longer = max(rows.stop - rows.start, columns.stop - columns.start)
-        factor = max(1, longer // pixels)
-        rows, columns = (_whole(part, factor, n) for part, n in ((rows, grid.ny), (columns, grid.nx)))
-        (total,), count = _sums([file["reference_elevation"]], None, rows, columns, factor)
+    surface = Raster(path, "reference_elevation")
+    rows, columns = _known(surface, grid)
+    longer = max(rows.stop - rows.start, columns.stop - columns.start)
+    factor = max(1, longer // pixels)
+    rows, columns = (_whole(part, factor, n) for part, n in ((rows, grid.ny), (columns, grid.nx)))
+    (total,), count = _sums([surface], rows, columns, factor)
     with np.errstate(invalid="ignore"):
         elevation_m = total / count
     part = Grid(
@@ -90,15 +87,14 @@ def look_at(row: Row, base: Base, *, points: bool = False) -> Look:
     file cannot be read.
     """
     where = base.rows, base.columns
-    with _opened(row.path) as file:
-        if base.factor == 1:
-            change_m, sigma_m = (_cells(file[name], row.index, *where) for name in (CHANGE, SIGMA))
-        else:
-            change_m, sigma_m = _means(file, row.index, (*where, base.factor))
-        mean_points = None
-        if points:
-            (total,), _ = _sums([file["point_count"]], row.index, *where, base.factor)
-            mean_points = np.where(total > 0, total / base.factor**2, np.nan).astype(np.float32)
+    if base.factor == 1:
+        change_m, sigma_m = (_cells(raster, *where) for raster in _rasters(row, CHANGE, SIGMA))
+    else:
+        change_m, sigma_m = _means(row, (*where, base.factor))
+    mean_points = None
+    if points:
+        (total,), _ = _sums(_rasters(row, "point_count"), *where, base.factor)
+        mean_points = np.where(total > 0, total / base.factor**2, np.nan).astype(np.float32)
     return Look(base, change_m, sigma_m, mean_points)
 
 
@@ -109,14 +105,12 @@ def look_between(row: Row, other: Row, base: Base, series: Series) -> Look:
     Raises StoreError where a file cannot be read.
     """
     where = base.rows, base.columns, base.factor
-    with _opened(series.folder / f"reference_{base.version}.nc") as file:
-        surface = file["reference_random_uncertainty"]
-        (_, before_m2), known = _sums([surface, surface], None, *where)
+    surface = Raster(series.folder / f"reference_{base.version}.nc", "reference_random_uncertainty")
+    (_, before_m2), known = _sums([surface, surface], *where)
     total_m2 = np.zeros(base.shade.shape, np.float32)
     change_m = []
     for one in (row, other):
-        with _opened(one.path) as file:
-            sums, count = _sums([file[name] for name in (CHANGE, SIGMA, RANDOM)], one.index, *where)
+        sums, count = _sums(_rasters(one, CHANGE, SIGMA, RANDOM), *where)
         with np.errstate(invalid="ignore", divide="ignore"):
             change_m.append(sums[0] / count)
             own_m2 = np.maximum(sums[2] / count - before_m2 / known, 0) / count
@@ -125,18 +119,20 @@ def look_between(row: Row, other: Row, base: Base, series: Series) -> Look:
     return Look(base, difference_m, np.where(np.isfinite(difference_m), np.sqrt(total_m2), np.nan), None)
 
 
-def _means(file: Any, index: int, base: tuple[slice, slice, int]) -> tuple[Floats32, Floats32]:  # noqa: ANN401 - h5py has no types
+def _rasters(row: Row, *names: str) -> list[Raster]:
+    return [Raster(row.path, name, index=row.index) for name in names]
+
+
+def _means(row: Row, base: tuple[slice, slice, int]) -> tuple[Floats32, Floats32]:
     """Mean change of blocks of cells and its sigma: what they share is taken as one within a block."""
-    (total, sigma_m2, random_m2), count = _sums(
-        [file[name] for name in (CHANGE, SIGMA, RANDOM)], index, *base
-    )
+    (total, sigma_m2, random_m2), count = _sums(_rasters(row, CHANGE, SIGMA, RANDOM), *base)
     with np.errstate(invalid="ignore", divide="ignore"):
         shared_m2 = np.maximum(sigma_m2 - random_m2, 0) / count
         return total / count, np.sqrt(random_m2 / count**2 + shared_m2)
 
 
 def _sums(
-    variables: list[Any], index: int | None, rows: slice, columns: slice, factor: int
+    variables: list[Raster], rows: slice, columns: slice, factor: int
 ) -> tuple[list[Floats32], Floats32]:
     """Sums over blocks of cells, band by band: of the first variable's values, of the others' squares.
 
@@ -149,7 +145,7 @@ def _sums(
         bottom = min(top + max(1, BAND_ROWS // factor), ny)
         band = slice(rows.start + top * factor, rows.start + bottom * factor)
         for place, (variable, total) in enumerate(zip(variables, sums, strict=True)):
-            values = _read(variable, index, band, columns)
+            values = _read(variable, band, columns)
             if place == 0:
                 seen = values < FILL / 2
                 if not seen.any():
@@ -173,31 +169,23 @@ def _blocks(values: Floats32, factor: int) -> Floats32:
     return np.asarray(total)
 
 
-def _read(variable: Any, index: int | None, rows: slice, columns: slice) -> Floats32:  # noqa: ANN401
+def _read(variable: Raster, rows: slice, columns: slice) -> Floats32:
     """Read a part of a raster as it stands in the file, with its fill."""
-    part = variable[rows, columns] if index is None else variable[index, rows, columns]
-    return np.asarray(part, np.float32)
+    return variable[rows][:, columns].astype(np.float32)
 
 
-def _cells(variable: Any, index: int, rows: slice, columns: slice) -> Floats32:  # noqa: ANN401
+def _cells(variable: Raster, rows: slice, columns: slice) -> Floats32:
     """Read a part of a raster, NaN where it has no value."""
-    values = _read(variable, index, rows, columns)
+    values = _read(variable, rows, columns)
     values[values > FILL / 2] = np.nan
     return values
 
 
-def _opened(path: Any) -> Any:  # noqa: ANN401 - h5py has no types
-    try:
-        return h5py.File(path, "r", rdcc_nbytes=CACHE_BYTES)
-    except OSError as error:
-        raise StoreError(f"{path}: cannot be read: {error}") from error
-
-
-def _known(variable: Any, grid: Grid) -> tuple[slice, slice]:  # noqa: ANN401
+def _known(variable: Raster, grid: Grid) -> tuple[slice, slice]:
     """Rows and columns of the grid between which the surface is known somewhere."""
     rows, columns = np.zeros(grid.ny, bool), np.zeros(grid.nx, bool)
     for top in range(0, grid.ny, BAND_ROWS):
-        known = _read(variable, None, slice(top, min(top + BAND_ROWS, grid.ny)), slice(None)) < FILL / 2
+        known = _read(variable, slice(top, min(top + BAND_ROWS, grid.ny)), slice(None)) < FILL / 2
         rows[top : top + BAND_ROWS] = known.any(axis=1)
         columns |= known.any(axis=0)
     if not rows.any():

@@ -75,8 +75,8 @@ class ScanReader(Protocol):
     def __init__(self, path: Path, *, range_max_m: float | None = None) -> None:
         """Open; `range_max_m` is given for a scan in the scanner's frame, where no echo can be farther."""
 
-    def blocks(self, size: int = 50_000) -> Iterator[Shots]:
-        """Give all echoes in the order of the file, `size` at a time."""
+    def blocks(self, size: int = 50_000, *, brightness: bool = True) -> Iterator[Shots]:
+        """Give all echoes in the order of the file, `size` at a time; `brightness` only if asked for."""
 
     def time_range_s(self) -> tuple[float, float] | None:
         """Give the earliest and latest time stamp [s], from samples; None where there are none."""

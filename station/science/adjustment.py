@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import linalg, sparse
 
-from station.quantities import Bools, Floats, Shared
+from station.quantities import Bools, Floats, Reals, Shared
 from station.science.normals import (
     Beforehand,
     Factored,
@@ -62,14 +62,15 @@ class Adjustment:
     change_step_m: float
     stable_weight: Floats
 
-    def effect(self, felt: Sensitivities) -> Floats:
+    def effect(self, felt: Sensitivities) -> Reals:
         """Effect of the estimated state on heights (n,) [m], to be taken off."""
         first, last = len(GLOBAL), len(GLOBAL) + self.of.line_count
         before, after, share = felt.refraction_knot()
-        bend, across_rad = np.split(self.estimate[last:], 2)
+        estimate = self.estimate.astype(felt.lean.dtype)
+        bend, across_rad = np.split(estimate[last:], 2)
         return np.asarray(
-            self.estimate[:first] @ felt.globals_
-            + self.estimate[first:last][felt.line] * felt.lean
+            estimate[:first] @ felt.globals_
+            + estimate[first:last][felt.line] * felt.lean
             + (bend[before] * (1 - share) + bend[after] * share) * felt.refraction
             + (across_rad[before] * (1 - share) + across_rad[after] * share) * felt.across
         )
@@ -89,9 +90,9 @@ class Adjustment:
         return self.unknown.by_knots(self.estimate)
 
 
-def turned(felt: Sensitivities, assumed_rad: Floats) -> Floats:
+def turned(felt: Sensitivities, assumed_rad: Floats) -> Reals:
     """Effect on heights (n,) [m] of lines turned about east, north and up by (3, lines)."""
-    east, north, up = assumed_rad[:, felt.line]
+    east, north, up = assumed_rad.astype(felt.lean.dtype)[:, felt.line]
     return np.asarray(felt.globals_[0] * east + felt.globals_[1] * north - felt.globals_[2] * up)
 
 

@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from station.science.terrain import Ground, ground, means_below
-
 if TYPE_CHECKING:
-    from station.quantities import Bools, Floats, Floats32, Grid, Ints, Reference
+    from station.quantities import Bools, Floats, Floats32, Grid, Ints
+    from station.science.terrain import Ground
 
 # Sums are whole numbers, of 2^-20 m (and m²), so that the order in which points come cannot matter.
 QUANTUM = 2.0**20
@@ -22,6 +21,7 @@ ONE = 1 << BITS
 STEP_MOST = 6.0  # sigmas: beyond, something happened
 CLASS_STEPS = 10.0  # what the class of a cell weighs against the steps from scan to scan of its own
 ALL = slice(None)
+Cell = NDArray[np.int64] | NDArray[np.int32]  # numbers of cells in the flattened grid
 ROUGHNESS_CELLS = 1.0  # one sigma of the neighbourhood that tells how rough a cell is
 
 
@@ -33,10 +33,19 @@ class Sums:
     residual: Ints
     square: Ints
 
+    @classmethod
+    def of(cls, parts: list[Sums]) -> Sums:
+        """Take those of some cells (n,) together."""
+        return cls(*(np.concatenate([getattr(part, one.name) for part in parts]) for one in fields(cls)))
+
     @property
     def count(self) -> NDArray[np.int32]:
         """Points in each cell (ny, nx)."""
         return (self.tally >> BITS).astype(np.int32)
+
+    def some(self, chosen: Bools) -> Sums:
+        """Return those of the chosen cells (n,)."""
+        return Sums(self.tally[chosen], self.residual[chosen], self.square[chosen])
 
     def mean_residual(self) -> Floats:
         """Mean height above reference or datum (ny, nx) [m], NaN in empty cells.
@@ -73,12 +82,10 @@ class Gridder:
     two points in a 1 m cell at 25° (EQUATIONS 4.10), and the loss of change that goes with it (6.5).
     """
 
-    def __init__(self, grid: Grid, reference: Reference | None, datum_m: float) -> None:
+    def __init__(self, grid: Grid, ground: Ground | None, datum_m: float) -> None:
         """Heights in cells without reference are taken from `datum_m`, to keep their sums small."""
         self.grid = grid
-        self._reference = reference
-        self.ground: Ground | None = ground(reference) if reference else None
-        self._ground_datum_m = 0.0
+        self._ground = ground
         self.datum_m = float(np.round(datum_m))
         # Of a cell side by side, for it is they that a shot has to wait for: number of points and brightness
         # in one, heights, and their squares.
@@ -100,26 +107,14 @@ class Gridder:
 
     def below(self, cell: Ints, column: Floats, row: Floats) -> Floats:
         """Height (n,) that the residual of each point is taken from [m]: of the reference, or the datum."""
-        if self.ground is None:
+        if self._ground is None:
             return np.full(len(cell), self.datum_m)
-        known = self.ground.known.ravel()[cell]
-        return np.where(known, self.ground.height(column, row), self.datum_m)
-
-    def below_cells(self, rows: slice) -> tuple[Bools, Floats]:
-        """Whether the reference is known (r, nx) in some rows, and the mean height [m] residuals are from."""
-        if self._reference is None:
-            shape = self._sums[rows].shape[:2]
-            return np.zeros(shape, bool), np.full(shape, self.datum_m)
-        if self.ground is not None:
-            known, means_m = self.ground.known[rows], self.ground.cell_means(rows)
-        else:
-            known, means_m = means_below(self._reference, self._ground_datum_m, rows)
-        return known, np.where(known, means_m, self.datum_m)
+        known = self._ground.known.reshape(-1)[cell]
+        return np.where(known, self._ground.height(column, row), self.datum_m)
 
     def complete(self) -> None:
-        """No more points come: let the ground go that only they need, where it can be had by rows."""
-        if self.ground is not None and self._reference is not None and self._reference.nodes_m is not None:
-            self._ground_datum_m, self.ground = self.ground.datum_m, None
+        """No more points come: let the ground go that only they need."""
+        self._ground = None
 
     def add(self, cell: Ints, residual_m: Floats, intensity: Floats | None) -> None:
         """Add points (n,): their cell, height above reference or datum, and brightness, 0-1."""
@@ -135,9 +130,13 @@ class Gridder:
         """Take a copy of some rows, or all."""
         return Sums(*np.ascontiguousarray(np.moveaxis(self._sums[rows], -1, 0)))
 
-    def seen(self) -> Bools:
-        """Return which cells (ny, nx) have points."""
-        return np.asarray(self._sums[..., 0] > 0)
+    def at(self, cell: Cell) -> Sums:
+        """Take a copy of some cells (n,), by their number in the flattened grid."""
+        return Sums(*np.ascontiguousarray(self._sums.reshape(-1, 3).take(cell, axis=0).T))
+
+    def seen(self, rows: slice = ALL) -> Bools:
+        """Return which cells (r, nx) of some rows, or all, have points."""
+        return np.asarray(self._sums[rows, :, 0] > 0)
 
     def memory(self) -> NDArray[np.float32]:
         """Give the sums away: (ny, nx, 6), to be overwritten row by row once read."""

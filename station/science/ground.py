@@ -29,9 +29,12 @@ def withheld(x_m: Floats, y_m: Floats) -> Bools:
     return np.asarray((mixed ^ (mixed >> 13)) % WITHHELD_EVERY == 0)
 
 
-def kinds(stable: Bools, kept_out: Bools, tan_slope: Floats, unlike: Bools) -> Ints:
-    """Kind of cells (n,): `stable` by polygon or by its past, `unlike` those that look otherwise now."""
-    may_move = np.where(tan_slope < MOVING_STEEPEST, Kind.MOVING, Kind.UNUSED)
+def kinds(stable: Bools, kept_out: Bools, smooth: Bools, unlike: Bools) -> Ints:
+    """Kind of cells (n,): `stable` by polygon or by its past, `unlike` those that look otherwise now.
+
+    `smooth` are those less steep than `MOVING_STEEPEST`.
+    """
+    may_move = np.where(smooth, Kind.MOVING, Kind.UNUSED)
     known = np.where(kept_out, Kind.WITHHELD, Kind.STABLE)
     return np.where(stable & ~unlike, known, may_move)
 

@@ -54,15 +54,8 @@ class Patches:
 
     def some(self, chosen: Bools) -> Patches:
         """Return the chosen (m,)."""
-        felt = self.felt
         return Patches(
-            Sensitivities(
-                felt.of,
-                felt.globals_[:, chosen],
-                felt.lean[chosen],
-                felt.refraction[chosen],
-                felt.passed[chosen],
-            ),
+            self.felt.some(chosen),
             self.stretch[chosen],
             self.kind[chosen],
             self.residual_m[chosen],

@@ -12,7 +12,7 @@ from itertools import combinations
 
 import numpy as np
 
-from station.quantities import Bools, Floats, Ints, Shared
+from station.quantities import Bools, Floats, Shared
 from station.science.shared import Sensitivities, aggregate_variance
 
 Model = Callable[[Floats], Floats]  # inputs (variables, draws) → result (draws,)
@@ -76,17 +76,6 @@ def apart(unknown: Shared) -> Shared:
     """Return what is unknown as if the groups of inputs were independent of each other."""
     held = sum(np.outer(of, of) for of in (members(unknown.names, group) for group in GROUPS))
     return replace(unknown, covariance=np.where(held, unknown.covariance, 0.0))
-
-
-def some(felt: Sensitivities, chosen: Ints | slice) -> Sensitivities:
-    """Return what the chosen of the cells feel."""
-    return Sensitivities(
-        felt.of,
-        felt.globals_[:, chosen],
-        felt.lean[chosen],
-        felt.refraction[chosen],
-        felt.passed[chosen],
-    )
 
 
 def cell_shares(felt: Sensitivities, random_m2: Floats, unknown: Shared) -> dict[str, Floats]:

@@ -14,7 +14,7 @@ from functools import lru_cache
 
 import numpy as np
 
-from station.quantities import Bools, Floats, Floats32, Grid, Ints, Shared
+from station.quantities import UPRIGHT, Bools, Floats, Floats32, Grid, Ints, Reals, Shared
 from station.science.air import EARTH_RADIUS_M
 
 GLOBAL = (
@@ -31,7 +31,6 @@ GLOBAL = (
 LEAN_KNOT_RAD = math.radians(1.0)
 LEAN_PER_REFRACTION = 5  # knots of the lean for one of the refraction
 LINES_A_KNOT = 5  # groups of scan lines between two knots of the lean, of 0.2° each: a second or so
-UPRIGHT = (0.0, 0.0, 1.0)
 MOST_LEANING_COS = math.cos(math.radians(10.0))  # beyond, a sector on the map says little of the head's
 
 
@@ -102,13 +101,11 @@ class Basis:
             *["rad"] * self.refraction_count,
         )  # fmt: skip
 
-    def knots_before(self, offset_m: tuple[Floats, Floats, Floats]) -> Floats:
+    def knots_before(self, offset_m: tuple[Reals, Reals, Reals]) -> Reals:
         """How many knots of the lean the head has passed when it looks there (n,), in fractions of knots."""
         clockwise = _clockwise(self.axis)
         east, north = (sum(e * p for e, p in zip(axis, offset_m, strict=True)) for axis in clockwise)
-        passed: Floats = (
-            np.asarray((np.arctan2(east, north) - self.start_rad) % (2 * math.pi)) / LEAN_KNOT_RAD
-        )
+        passed: Reals = np.asarray((np.arctan2(east, north) - self.start_rad) % (2 * math.pi)) / LEAN_KNOT_RAD
         if self.closed:
             return np.minimum(passed, np.nextafter(self.intervals, 0))
         beyond = (self.intervals + 2 * math.pi / LEAN_KNOT_RAD) / 2  # nearer the first knot than the last
@@ -121,6 +118,7 @@ def _degrees(azimuth_rad: float) -> str:
     return f"{math.degrees(azimuth_rad) % 360:05.1f}"
 
 
+@lru_cache(maxsize=4)
 def _clockwise(axis: tuple[float, float, float]) -> tuple[Floats, Floats]:
     """Directions of the head at azimuth 90° and 0°, across the axis."""
     up = np.array(axis)
@@ -156,10 +154,10 @@ class Sensitivities:
     """
 
     of: Basis
-    globals_: Floats  # (9, n)
-    lean: Floats  # (n,) per rad
-    refraction: Floats  # (n,) per unit of k
-    passed: Floats  # (n,) knots of the lean before it, in fractions
+    globals_: Reals  # (9, n)
+    lean: Reals  # (n,) per rad
+    refraction: Reals  # (n,) per unit of k
+    passed: Reals  # (n,) knots of the lean before it, in fractions
 
     def __len__(self) -> int:
         """Return how many cells there are."""
@@ -171,7 +169,7 @@ class Sensitivities:
         return (self.passed * LINES_A_KNOT).astype(np.int64)
 
     @property
-    def across(self) -> Floats:
+    def across(self) -> Reals:
         """Effect of a turn about the direction in which the head looks (n,), per rad.
 
         It shifts points sideways by their height under the scanner: steep ground close by shows it.
@@ -184,12 +182,12 @@ class Sensitivities:
             self.globals_[0] * turn[0] + self.globals_[1] * turn[1] - self.globals_[2] * turn[2]
         )
 
-    def lean_knot(self) -> tuple[Ints, Ints, Floats]:
+    def lean_knot(self) -> tuple[Ints, Ints, Reals]:
         """Knots of the lean before and after each cell (n,), and the share of the one after."""
         before = self.passed.astype(np.int64)
         return before, (before + 1) % self.of.lean_count, self.passed - before
 
-    def refraction_knot(self) -> tuple[Ints, Ints, Floats]:
+    def refraction_knot(self) -> tuple[Ints, Ints, Reals]:
         """Knots of the refraction before and after each cell (n,), and the share of the one after.
 
         The lean across the line of sight has the same.
@@ -220,31 +218,52 @@ class Sensitivities:
         np.add.at(felt, self.line, self.lean * weights)
         return felt
 
-    def variance(self, unknown: Shared) -> Floats:
-        """Variance of each cell's height (n,) [m²]: the diagonal of J C Jᵀ, and what its line adds."""
-        of, first, across = self.of, len(GLOBAL), self.across
+    def some(self, chosen: Bools | Ints | slice) -> Sensitivities:
+        """Return those of the chosen cells."""
+        return Sensitivities(
+            self.of, self.globals_[:, chosen], self.lean[chosen], self.refraction[chosen], self.passed[chosen]
+        )
+
+    def variance(self, unknown: Shared) -> Reals:
+        """Variance of each cell's height (n,) [m²]: the diagonal of J C Jᵀ, and what its line adds.
+
+        Fastest where all cells lie between the same knots of the lean.
+        """
         before = self.passed.astype(np.int16)
+        if len(before) and before.min() == before.max():
+            return self._variance_between(int(before[0]), unknown)
         order = np.argsort(before, kind="stable")
-        bounds = np.searchsorted(before[order], np.arange(of.intervals + 1))
-        own = leans_between(of).left ** 2 @ line_variances(of, unknown)
-        variance_m2 = self.lean**2 * own[self.line]
-        last, beyond = first + of.lean_count, first + of.lean_count + of.refraction_count
-        for knot in np.flatnonzero(np.diff(bounds)):
+        bounds = np.searchsorted(before[order], np.arange(self.of.intervals + 1))
+        variance_m2 = np.zeros_like(self.lean)
+        for knot in np.flatnonzero(np.diff(bounds)).tolist():
             cells = order[bounds[knot] : bounds[knot + 1]]
-            bend = knot // LEAN_PER_REFRACTION
-            bend_after = (bend + 1) % of.refraction_count
-            leans = first + knot, first + (knot + 1) % of.lean_count
-            felt = [*range(first), *leans, last + bend, last + bend_after, beyond + bend, beyond + bend_after]
-            passed, along, bent, aside = (
-                values[cells] for values in (self.passed, self.lean, self.refraction, across)
-            )
-            share, bent_share = passed - knot, passed / LEAN_PER_REFRACTION - bend
-            after, bent_after, aside_after = along * share, bent * bent_share, aside * bent_share
-            beside = [along - after, after, bent - bent_after, bent_after, aside - aside_after, aside_after]
-            columns = np.concatenate([self.globals_[:, cells], np.stack(beside)])
-            told_m2 = np.einsum("ij,ij->j", columns, unknown.covariance[np.ix_(felt, felt)] @ columns)
-            variance_m2[cells] += np.maximum(told_m2, 0.0)  # rounding, where the covariance is singular
+            variance_m2[cells] = self.some(cells).variance(unknown)
         return variance_m2
+
+    def _variance_between(self, knot: int, unknown: Shared) -> Reals:
+        """Return the variance of cells that all lie between a knot of the lean and the next."""
+        of, first, across = self.of, len(GLOBAL), self.across
+        bend = knot // LEAN_PER_REFRACTION
+        bend_after = (bend + 1) % of.refraction_count
+        leans = first + knot, first + (knot + 1) % of.lean_count
+        last, beyond = first + of.lean_count, first + of.lean_count + of.refraction_count
+        felt = [*range(first), *leans, last + bend, last + bend_after, beyond + bend, beyond + bend_after]
+        share = self.passed - knot
+        bent_share = self.passed / LEAN_PER_REFRACTION - bend
+        columns = np.empty((len(felt), len(self)), self.lean.dtype)
+        columns[:first] = self.globals_
+        for at, (effect, after) in enumerate(
+            ((self.lean, share), (self.refraction, bent_share), (across, bent_share))
+        ):
+            np.multiply(effect, after, out=columns[first + 2 * at + 1])
+            np.subtract(effect, columns[first + 2 * at + 1], out=columns[first + 2 * at])
+        told_m2 = np.einsum(
+            "ij,ij->j", columns, unknown.covariance[np.ix_(felt, felt)].astype(columns.dtype) @ columns
+        )
+        lines = slice(knot * LINES_A_KNOT, (knot + 1) * LINES_A_KNOT)
+        own = (leans_between(of).left[lines] ** 2 @ line_variances(of, unknown)).astype(columns.dtype)
+        # Rounding may take it below nought where the covariance is singular.
+        return np.asarray(self.lean**2 * own[self.line - lines.start] + np.maximum(told_m2, 0.0))
 
 
 def line_variances(of: Basis, unknown: Shared) -> Floats:
@@ -254,11 +273,16 @@ def line_variances(of: Basis, unknown: Shared) -> Floats:
 
 
 def sensitivities(
-    of: Basis, offset_m: tuple[Floats, Floats, Floats], east_gradient: Floats, north_gradient: Floats
+    of: Basis,
+    offset_m: tuple[Reals, Reals, Reals],
+    east_gradient: Reals,
+    north_gradient: Reals,
+    passed: Reals | None = None,
 ) -> Sensitivities:
     """Effect of unit errors on the heights of cells at `offset_m` (each (n,)) from the scanner.
 
-    Signs: scanner's state less the assumed one. Source: EQUATIONS 6.1.
+    `passed` are the knots of the lean before each, where they are known. Signs: scanner's state less the
+    assumed one. Source: EQUATIONS 6.1.
     """
     x_m, y_m, z_m = offset_m
     horizontal_m = np.maximum(np.hypot(x_m, y_m), 1e-6)
@@ -283,7 +307,7 @@ def sensitivities(
         ),
         lean=-rise_m,
         refraction=horizontal_m * rise_m / (2 * EARTH_RADIUS_M),
-        passed=of.knots_before(offset_m),
+        passed=of.knots_before(offset_m) if passed is None else passed,
     )
 
 

@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
 from scipy import ndimage
 
-from station.quantities import Bools, Floats, Floats32, Grid, Reference
+from station.quantities import Bools, Floats, Floats32, Grid, Ints, Reference
 
 ALL = slice(None)
 BAND_ROWS = 128  # looked at together: what a store chunk is high
+TOGETHER = 200_000  # cells
 
 
 def normal(slope_rad: Floats, aspect_rad: Floats) -> Floats:
@@ -130,18 +132,6 @@ def cell_means(nodes: Floats | Floats32) -> Floats:
     return np.asarray((rows[:, :-2] + 6 * rows[:, 1:-1] + rows[:, 2:]) / 8)
 
 
-def means_below(reference: Reference, datum_m: float, rows: slice) -> tuple[Bools, Floats]:
-    """Which cells (r, nx) of some rows a master surface knows, and its mean height over each [m].
-
-    As `Ground.cell_means`, of a reference that has its nodes, without the whole of them in memory.
-    """
-    assert reference.nodes_m is not None  # noqa: S101 - the caller's case
-    around = _around(rows)
-    rise_m = np.nan_to_num(reference.nodes_m[around] - datum_m).astype(np.float32)
-    means_m = datum_m + cell_means(rise_m)[rows.start - around.start :][: _height(rows)]
-    return np.isfinite(reference.elevation_m[rows]), means_m
-
-
 def _around(rows: slice) -> slice:
     return slice(max(rows.start - 1, 0), rows.stop + 1)
 
@@ -162,21 +152,25 @@ def nodes_for(means: Floats) -> Floats:
 
 def ground(reference: Reference) -> Ground:
     """Prepare a master surface for looking up."""
-    known = np.zeros(reference.grid.shape, bool)
-    total_m = 0.0
-    bands = [slice(top, top + BAND_ROWS) for top in range(0, reference.grid.ny, BAND_ROWS)]
-    for rows in bands:
-        elevation_m = reference.elevation_m[rows]
-        known[rows] = np.isfinite(elevation_m)
-        total_m += float(np.sum(elevation_m, where=known[rows]))
-    datum_m = float(np.round(total_m / max(int(np.count_nonzero(known)), 1)))
-    if reference.nodes_m is None:
-        rise_m = extend((reference.elevation_m[:] - datum_m).astype(np.float32))
-        return Ground(reference.grid, datum_m, np.nan_to_num(rise_m, copy=False), known)
-    rise_m = np.zeros(reference.grid.shape, np.float32)
-    for rows in bands:
-        rise_m[rows] = np.nan_to_num(reference.nodes_m[rows] - datum_m)
-    return Ground(reference.grid, datum_m, rise_m, known)
+    rise_m = np.empty(reference.grid.shape, np.float32)
+    known = np.empty(reference.grid.shape, bool)
+    datum_m = _datum(reference)
+    for rows in _bands(reference):
+        rise_m[rows] = reference.elevation_m[rows] - datum_m
+        known[rows] = np.isfinite(rise_m[rows])
+    return Ground(reference.grid, datum_m, np.nan_to_num(extend(rise_m), copy=False), known)
+
+
+def _datum(reference: Reference) -> float:
+    """Return a height that all of a surface is near."""
+    heights = (reference.elevation_m[rows] for rows in _bands(reference))
+    total_m, count = np.sum([(np.nansum(one), np.isfinite(one).sum()) for one in heights], axis=0)
+    return float(np.round(total_m / max(count, 1)))
+
+
+def _bands(reference: Reference) -> Iterator[slice]:
+    ny = reference.grid.ny
+    return (slice(top, min(top + BAND_ROWS, ny)) for top in range(0, ny, BAND_ROWS))
 
 
 def extend(values: Floats32) -> Floats32:
@@ -185,27 +179,34 @@ def extend(values: Floats32) -> Floats32:
     Each is the mean of what its neighbours' slopes lead to, or of the neighbours where they have no slope:
     between the centres of a known cell and its unknown neighbour a shot still needs a height.
     """
-    ny, nx = values.shape
     known = np.isfinite(values)
-    row, column = np.nonzero(ndimage.binary_dilation(known, np.ones((3, 3), bool)) & ~known)
+    beside = np.flatnonzero(ndimage.binary_dilation(known, np.ones((3, 3), bool)) & ~known)
+    extended = values.copy()
+    for part in np.array_split(beside, len(beside) // TOGETHER + 1):
+        row, column = np.divmod(part, values.shape[1])
+        extended[row, column] = _continued(values, row, column)
+    return extended
+
+
+def _continued(values: Floats32, row: Ints, column: Ints) -> Floats:
+    """Return what the cells around lead to in others (n,)."""
     total, sloped, flat, near = (np.zeros(len(row)) for _ in range(4))
     for down in (-1, 0, 1):
         for right in (-1, 0, 1):
             if down == right == 0:
                 continue
-            first = _at(values, row + down, column + right, ny, nx)
-            second = _at(values, row + 2 * down, column + 2 * right, ny, nx)
+            first = _at(values, row + down, column + right)
+            second = _at(values, row + 2 * down, column + 2 * right)
             has_slope, has_one = np.isfinite(first + second), np.isfinite(first)
             total += np.where(has_slope, 2 * first - second, 0)
             sloped += has_slope
             flat += np.where(has_one, first, 0)
             near += has_one
-    extended = values.copy()
-    extended[row, column] = np.where(sloped > 0, total / np.maximum(sloped, 1), flat / np.maximum(near, 1))
-    return extended
+    return np.where(sloped > 0, total / np.maximum(sloped, 1), flat / np.maximum(near, 1))
 
 
-def _at(values: Floats32, row: np.ndarray, column: np.ndarray, ny: int, nx: int) -> Floats:
+def _at(values: Floats32, row: Ints, column: Ints) -> Floats:
+    ny, nx = values.shape
     inside = (row >= 0) & (row < ny) & (column >= 0) & (column < nx)
     found = values[np.clip(row, 0, ny - 1), np.clip(column, 0, nx - 1)].astype(np.float64)
     return np.where(inside, found, np.nan)

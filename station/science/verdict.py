@@ -9,10 +9,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
-from station.quantities import Bools, Floats, Habits, Measurement, Reference
+from station.quantities import Bools, Floats, Habits, Ints, Measurement
 from station.science.adjustment import Adjustment
-from station.science.shared import LEAN_KNOT_RAD, LEAN_PER_REFRACTION, UPRIGHT, basis
+from station.science.outlook import Outlook, Trait
+from station.science.shared import LEAN_KNOT_RAD, LEAN_PER_REFRACTION
 
 MOST_REFUSED = 0.3  # of the stable ground, before an adjustment is doubted
 MOVED_SIGMAS = 4.0  # of what the station does from scan to scan
@@ -22,13 +24,10 @@ THROUGH = 0.9  # of the best range; there the air is clear enough to miss a sect
 GONE = 0.05  # of what is usually seen in a sector or at a range; less is nothing
 FEWEST_CELLS = 30  # that scans usually see, to miss them
 STRETCH_M = 200.0  # of range that are counted together
-BAND_ROWS = 128
 CELLS_MOST = 2_000_000  # that are counted; of more a part
 SCATTERED = 3.0  # sigmas by which stable ground that no fit has seen may scatter
 OFF = 5.0  # the same of a scan that is not adjusted; more, and its sigma holds nothing
 FEWEST_STABLE = 20
-
-Position = tuple[float, float, float]
 
 
 @dataclass(frozen=True)
@@ -49,30 +48,26 @@ class View:
         return float(self.seen.sum()) / usual if usual >= FEWEST_CELLS else 1.0
 
 
-def view(seen: Bools, reference: Reference, position_m: Position, axis: Position = UPRIGHT) -> View:
-    """Count what a scan saw (ny, nx) against what the scans of the reference saw."""
-    grid = reference.grid
-    of = basis(grid, position_m, axis)
+def view(count: NDArray[np.int32], outlook: Outlook) -> View:
+    """Count the cells that a scan saw, of `count` (ny, nx) points, against what the reference's saw."""
+    of, grid, position_m = outlook.of, outlook.grid, outlook.position_m
+    if of is None or position_m is None:
+        raise ValueError("without a place nothing is looked at")
     sectors = of.intervals // LEAN_PER_REFRACTION
     reach_m = max(
         np.hypot(x - position_m[0], y - position_m[1]) for x in grid.x_m[[0, -1]] for y in grid.y_m[[0, -1]]
     )
     stretches = int(reach_m / STRETCH_M) + 1
-    usual, found = np.zeros(sectors * stretches), np.zeros(sectors * stretches)
-    every = 1 + grid.nx * grid.ny // CELLS_MOST
-    rows = np.arange(0, grid.ny, every)
-    for band in np.array_split(rows, len(rows) // BAND_ROWS + 1):
-        expected = reference.seen[band]
-        row, column = np.nonzero((expected > 0) & np.isfinite(reference.elevation_m[band]))
-        offset_m = (
-            grid.x_m[column] - position_m[0],
-            grid.y_m[band][row] - position_m[1],
-            reference.elevation_m[band][row, column] - position_m[2],
-        )
-        sector = of.knots_before(offset_m).astype(np.int64) // LEAN_PER_REFRACTION
-        key = sector * stretches + (np.hypot(*offset_m[:2]) / STRETCH_M).astype(np.int64)
-        usual += np.bincount(key, expected[row, column], usual.size)
-        found += np.bincount(key, seen[band][row, column], usual.size)
+    every = 1 + int(outlook.bounds[-1]) // CELLS_MOST
+    cell, height_m, passed, share = (
+        outlook.cells[name][::every] for name in ("cell", "height_m", "passed", "usual")
+    )
+    east_m, north_m, _ = outlook.offset_m(cell, height_m)
+    stretch = (np.hypot(east_m, north_m) / np.float32(STRETCH_M)).astype(np.int64)
+    key = (passed / LEAN_PER_REFRACTION).astype(np.int64) * stretches + stretch
+    usual = np.bincount(key, np.nan_to_num(share), sectors * stretches).astype(np.float64)
+    there = (share > 0) & (count.reshape(-1)[cell] > 0)
+    found = np.bincount(key, there, sectors * stretches).astype(np.float64)
     shape = (sectors, stretches)
     edges = of.start_rad + LEAN_KNOT_RAD * LEAN_PER_REFRACTION * np.arange(sectors + 1)
     return View(usual.reshape(shape) * every, found.reshape(shape) * every, np.degrees(edges))
@@ -132,16 +127,20 @@ def distrust(found: Adjustment, habits: Habits) -> list[str]:
     return reasons
 
 
-def misfit(measured: Measurement, stable: Bools) -> list[str]:
-    """Say by how much stable ground (ny, nx) is off in a scan that is not adjusted, unless sigma holds it.
+def misfit(measured: Measurement, stable: Ints) -> list[str]:
+    """Say by how much stable ground is off in a scan that is not adjusted, unless sigma holds it.
 
-    Half of the cells are off by more than the figure told, either way.
+    `stable` (n,) are its cells in the flattened grid. Half of them are off by more than the figure told,
+    either way.
     """
-    chosen = stable & np.isfinite(measured.surface.change_m)
-    if np.count_nonzero(chosen) < FEWEST_STABLE:
+    change_m, sigma_m = (
+        raster.reshape(-1)[stable] for raster in (measured.surface.change_m, measured.uncertainty_m)
+    )
+    seen = np.isfinite(change_m)
+    if np.count_nonzero(seen) < FEWEST_STABLE:
         return []
-    off_m = np.abs(measured.surface.change_m[chosen])
-    sigmas = 1.4826 * float(np.median(off_m / measured.uncertainty_m[chosen]))  # of a normal distribution
+    off_m = np.abs(change_m[seen])
+    sigmas = 1.4826 * float(np.median(off_m / sigma_m[seen]))  # of a normal distribution
     if sigmas <= OFF:
         return []
     return [f"stable ground is {np.median(off_m):.2g} m off, {sigmas:.0f} sigma: moved, or another SOP?"]
@@ -151,30 +150,27 @@ def judge(
     flag: str,
     lacking: Sequence[str],
     measured: Measurement,
-    reference: Reference | None,
-    place: tuple[Position, Position] | None,
+    outlook: Outlook | None,
     found: Adjustment | None,
     stable_z_std: float | None,
-    stable: Bools | None,
 ) -> tuple[str, str]:
     """Return the verdict of an epoch and its reasons, the gravest first.
 
     Unusable: a person's `flag` says so, nothing to work with was seen, or its sigma does not hold the error.
-    Degraded: anything else that is lacking. `place`: of the scanner, and its axis. `found`: how the scan was
-    adjusted, even if that was not used in the end, and `stable_z_std` only where it was, else `stable`
-    (ny, nx).
+    Degraded: anything else that is lacking. `found`: how the scan was adjusted, even if that was not used in
+    the end, and `stable_z_std` only where it was.
     """
     fatal = [f"flagged: {flag}"] if flag else []
     reasons = list(lacking)
-    if place is not None and reference is not None:
-        told = view(measured.surface.count > 0, reference, *place)
+    if outlook is not None and outlook.of is not None:
+        told = view(measured.surface.count, outlook)
         (fatal if told.share < BLIND else reasons).extend(hidden(told))
-    if found is not None and reference is not None:
-        reasons += distrust(found, reference.habits)
+    if found is not None and outlook is not None:
+        reasons += distrust(found, outlook.reference.habits)
     if stable_z_std is not None:
         if stable_z_std > SCATTERED:
             reasons.append(f"stable ground that no fit has seen scatters by {stable_z_std:.1f} sigma")
-    elif stable is not None and reference is not None and reference.shared is not None:
-        fatal += misfit(measured, stable)
+    elif outlook is not None and outlook.reference.shared is not None:
+        fatal += misfit(measured, outlook.having(Trait.STABLE))
     word = "unusable" if fatal else "degraded" if reasons else "good"
     return word, "; ".join([*fatal, *reasons])

@@ -38,8 +38,15 @@ PRELOAD = (
     "lazrs",
     "netCDF4",
 )
-# One scan is one core's work; and every further thread of a BLAS reserves address space against RLIMIT_AS.
-_ONE_THREAD = dict.fromkeys(("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "RAYON_NUM_THREADS"), "1")
+# Two cores decode, all else of a scan is one core's work; and every further thread of a BLAS reserves address
+# space against RLIMIT_AS. Memory that is let go is kept for the next array: to clear it each time takes long.
+SURROUNDINGS = {
+    "OPENBLAS_NUM_THREADS": "1",
+    "OMP_NUM_THREADS": "1",
+    "RAYON_NUM_THREADS": "2",
+    "MALLOC_TRIM_THRESHOLD_": str(2**28),
+    "MALLOC_MMAP_THRESHOLD_": str(2**25),
+}
 _TICK_S = 0.2
 _GONE_WITH_ITS_SERVER = 255  # what multiprocessing reports where the fork server died
 _NOT_STARTED = ("not started", None)
@@ -60,8 +67,8 @@ class _KilledError(NotReadyError):
 def prepare(preload: Sequence[str] = PRELOAD) -> None:
     """Start the server that children are forked from; the first call decides what it loads."""
     with _starting:
-        before = {name: os.environ.get(name) for name in _ONE_THREAD}
-        os.environ.update(_ONE_THREAD)
+        before = {name: os.environ.get(name) for name in SURROUNDINGS}
+        os.environ.update(SURROUNDINGS)
         try:
             _forks.set_forkserver_preload(list(preload))
             forkserver.ensure_running()

@@ -17,8 +17,8 @@ from pyproj import CRS, Transformer
 from station.archive.layout import written_whole
 from station.config import Site
 from station.errors import ConfigError, NotReadyError, ScanError
-from station.pipeline import Pose, Setup, Told
-from station.quantities import Air, Habits, HeadTrack, InclinationLog, Shared
+from station.pipeline import Pose, Told
+from station.quantities import UPRIGHT, Air, Habits, HeadTrack, InclinationLog, Setup, Shared
 from station.readers.inclination import in_week_of, read_inclination
 from station.readers.scan import ScanReader, open_scan
 from station.readers.sop import read_matrix, sop_for
@@ -138,7 +138,7 @@ def gather(
 def setup_of(
     site: Site,
     position_m: tuple[float, float, float] | None,
-    axis: tuple[float, float, float] = shared.UPRIGHT,
+    axis: tuple[float, float, float] = UPRIGHT,
 ) -> Setup:
     """Return what stays the same from scan to scan."""
     return Setup(

@@ -7,15 +7,23 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from station.archive.layout import Series, kept_of
-from station.archive.reference import Lineage, read_lineage, read_reference, versions, write_reference
+from station.archive.reference import (
+    Lineage,
+    open_reference,
+    read_lineage,
+    read_reference,
+    versions,
+    write_reference,
+)
 from station.config import Site
 from station.errors import StoreError
-from station.pipeline import gridder_for, on_reference, survey
-from station.quantities import Habits, Reference
+from station.pipeline import gridder_for, on_reference, outlook_on, survey
+from station.quantities import Habits, Reference, Setup
 from station.readers.scan import utc_interval
 from station.science.adjustment import Adjustment
 from station.science.grid import Stack
 from station.science.master import improved, master
+from station.science.outlook import Outlook
 from station.science.prior import learned
 from station.service.content import sha256_of
 from station.service.gather import Gathered, gather
@@ -28,8 +36,10 @@ from station.service.tasks import (
     levelled_to,
     numbers_of_air,
     opened,
+    outlook_of,
     series_of,
     sha256_of_log,
+    stable_ground,
 )
 
 IMPROVED_EVERY = 4  # a version is due at four times the scans of the one before
@@ -75,8 +85,8 @@ def build_reference(site: Site, arrivals: list[Arrival], version: str, progress:
     scan_ids = tuple(arrival.path.stem for arrival in arrivals)
     surface: Reference | None = None
     for _ in range(REFERENCE_PASSES):
-        stack = Stack(series.grid)
-        laid = [_lay_on(stack, site, arrival, surface, progress) for arrival in arrivals]
+        stack, seen_from = Stack(series.grid), _SeenFrom(site, surface)
+        laid = [_lay_on(stack, site, arrival, seen_from, progress) for arrival in arrivals]
         habits = _learned(surface.habits if surface else Habits(), laid)
         unknown = [one.gathered.unknown for one in laid]
         position_m = laid[0].gathered.setup.position_m
@@ -84,6 +94,7 @@ def build_reference(site: Site, arrivals: list[Arrival], version: str, progress:
         made_from = tuple(one.made.told() for one in laid)
     if surface is not None:
         write_reference(series, surface, Lineage(version, site.science_hash, made_from=made_from))
+        _look_at(site, version, laid)
     return version
 
 
@@ -98,8 +109,8 @@ def improve_reference(
     base = read_reference(series, on)
     if base is None:
         raise StoreError(f"{series.folder}: no reference to improve")
-    stack = Stack(series.grid)
-    laid = [_lay_on(stack, site, arrival, base, progress) for arrival in arrivals]
+    stack, seen_from = Stack(series.grid), _SeenFrom(site, base)
+    laid = [_lay_on(stack, site, arrival, seen_from, progress) for arrival in arrivals]
     habits = _learned(base.habits, laid)
     position_m = laid[0].gathered.setup.position_m
     if position_m is None:
@@ -111,6 +122,7 @@ def improve_reference(
         made_from=tuple(one.made.told() for one in laid),
     )
     write_reference(series, improved(base, stack, position_m, version, habits), lineage)
+    _look_at(site, version, laid)
     return version
 
 
@@ -121,6 +133,13 @@ class _Laid:
     gathered: Gathered
     adjustment: Adjustment | None
     made: Made
+
+
+def _look_at(site: Site, version: str, laid: list[_Laid]) -> None:
+    """Have the outlook ready for the next scan."""
+    reference = open_reference(series_of(site), version)
+    if reference is not None:
+        outlook_of(site, laid[-1].gathered.setup, reference)
 
 
 def _learned(habits: Habits, laid: list[_Laid]) -> Habits:
@@ -134,21 +153,37 @@ def _learned(habits: Habits, laid: list[_Laid]) -> Habits:
     return habits if told is None else learned(habits, told.of, found)
 
 
-def _lay_on(
-    stack: Stack, site: Site, arrival: Arrival, surface: Reference | None, progress: Progress
-) -> _Laid:
+class _SeenFrom:
+    """A surface as the scans see it: looked at anew only where the scanner stands elsewhere."""
+
+    def __init__(self, site: Site, surface: Reference | None) -> None:
+        self._site = site
+        self._surface = surface
+        self._last: tuple[Setup, Outlook] | None = None
+
+    def __call__(self, setup: Setup) -> Outlook | None:
+        """Return the outlook of scans of a setup, None where there is no surface yet."""
+        if self._surface is None:
+            return None
+        if self._last is None or self._last[0] != setup:
+            stable = stable_ground(self._site, self._surface)
+            self._last = setup, outlook_on(self._surface, setup, stable)
+        return self._last[1]
+
+
+def _lay_on(stack: Stack, site: Site, arrival: Arrival, seen_from: _SeenFrom, progress: Progress) -> _Laid:
     """Add a scan to a stack, adjusted to the surface there is. Its own grid goes at once."""
     with opened(site, arrival.path) as reader:
         start, end, _ = utc_interval(reader, site.scans.name)
         gathered = gather(site, reader, arrival.log, start, end)
-        gridder = gridder_for(gathered.setup, surface)
+        outlook = seen_from(gathered.setup)
+        gridder = gridder_for(gathered.setup, outlook)
         survey(gridder, reader.blocks(), gathered.pose, progress)
-    levelled = levelled_to(site, gridder, gathered, surface)
-    if surface is None:
+    levelled = levelled_to(site, gridder, gathered, outlook)
+    if outlook is None:
         stack.add(gridder)
     else:
-        state = levelled[:2] if levelled is not None else None
-        stack.add(gridder, on_reference(gridder, gathered.setup, surface, state), surface.roughness_m2)
+        stack.add(gridder, on_reference(gridder, outlook, levelled), outlook.reference.roughness_m2)
     progress()
     made = Made(
         scan_id=arrival.path.stem,

@@ -18,6 +18,7 @@ import numpy as np
 from station import __version__
 from station.archive import store
 from station.archive.layout import Series, kept_of
+from station.archive.outlooks import kept_outlook
 from station.archive.reference import current, open_reference, write_reference
 from station.config import Site
 from station.errors import ScanError
@@ -26,10 +27,11 @@ from station.pipeline import (
     gridder_for,
     level,
     measure,
+    outlook_on,
     stable_figures,
     survey,
 )
-from station.quantities import Bools, Measurement, Quality, Reference
+from station.quantities import Bools, Measurement, Quality, Reference, Setup
 from station.readers.flags import flag_on, read_flags
 from station.readers.polygons import mask, read_polygons
 from station.readers.raster import read_geotiff
@@ -37,12 +39,14 @@ from station.readers.scan import ScanReader, open_scan, require_begun, utc_inter
 from station.science import ground, sensor, verdict
 from station.science.adjustment import Adjustment
 from station.science.grid import Gridder
+from station.science.outlook import Outlook
 from station.science.terrain import nodes_for
 from station.service.content import held_still, sha256_of
 from station.service.gather import Gathered, gather
 from station.service.inbox import Arrival
 
 Progress = Callable[[], None]
+CELLS_MOST = 2_000_000  # that the figures of a scan are of; of more, some rows
 MOST_REFUSED = 0.6  # of the stable ground; then the filtered log alone is safer
 
 
@@ -200,30 +204,32 @@ def _measure(
             keep_zero=not rehearsal,
             wait_for_weather=wait_for_weather,
         )
-        gridder = gridder_for(gathered.setup, reference)
-        survey(gridder, reader.blocks(), gathered.pose, progress)
+        outlook = outlook_of(site, gathered.setup, reference) if reference else None
+        progress()
+        gridder = gridder_for(gathered.setup, outlook)
+        survey(gridder, reader.blocks(brightness=site.adjusts), gathered.pose, progress)
     if not gridder.seen().any():
         raise ScanError("no point falls on the grid: wrong scans.frame, SOP, CRS or units?")
     progress()
-    levelled = levelled_to(site, gridder, gathered, reference)
+    levelled = levelled_to(site, gridder, gathered, outlook)
     flag = flag_of(site, start.timestamp(), end.timestamp())
     found = levelled[1] if levelled else None
     if levelled is not None and levelled[1].refused > MOST_REFUSED:
         levelled = None
     unknown = levelled[1].shared() if levelled is not None else gathered.unknown
-    measured = measure(gridder, gathered.setup, unknown, reference, levelled)
+    measured = measure(gridder, gathered.setup, unknown, outlook, levelled)
     progress()
-    numbers = _numbers(measured, gathered, reader.header.point_count, levelled)
+    numbers = _numbers(measured, gathered, reader.header.point_count)
+    if levelled is not None and outlook is not None:
+        numbers |= stable_figures(measured, outlook) | {"change_step": levelled[1].change_step_m}
     doubts, late = _log_against_ground(levelled, reference)
     word, reason = verdict.judge(
         flag,
         [*gathered.lacking, *doubts],
         measured,
-        reference,
-        (gathered.setup.position_m, gathered.setup.axis) if gathered.setup.position_m else None,
+        outlook,
         found,
-        numbers.get("stable_z_std"),
-        None if levelled or reference is None else stable_ground(site, reference),
+        numbers.get("stable_z_std", 0.0) if levelled else None,
     )
     return store.Epoch(
         start_s=start.timestamp(),
@@ -247,18 +253,30 @@ def _measure(
     )
 
 
+def outlook_of(site: Site, setup: Setup, reference: Reference) -> Outlook:
+    """Look at a stored version of the reference as the scans of a setup do."""
+    given = site.adjustment.stable
+    polygons = sha256_of(given) if isinstance(given, Path) and given.is_file() else ""
+    return kept_outlook(
+        series_of(site),
+        reference,
+        (setup.position_m, setup.axis),
+        repr((setup.grid, setup.scanner, setup.published_budget, site.map.crs, polygons)),
+        lambda: outlook_on(reference, setup, stable_ground(site, reference)),
+    )
+
+
 def levelled_to(
-    site: Site, gridder: Gridder, gathered: Gathered, reference: Reference | None
-) -> tuple[Told, Adjustment, Bools] | None:
+    site: Site, gridder: Gridder, gathered: Gathered, outlook: Outlook | None
+) -> tuple[Told, Adjustment] | None:
     """Adjust a scan to the reference, where the site asks for it and there is one to adjust to."""
-    if not site.adjusts or gathered.told is None or reference is None:
+    if not site.adjusts or gathered.told is None or outlook is None:
         return None
-    stable = stable_ground(site, reference)
-    return gathered.told, level(gridder, gathered.setup, gathered.told, reference, stable), stable
+    return gathered.told, level(gridder, gathered.setup, gathered.told, outlook)
 
 
 def _log_against_ground(
-    levelled: tuple[Told, Adjustment, Bools] | None, reference: Reference | None
+    levelled: tuple[Told, Adjustment] | None, reference: Reference | None
 ) -> tuple[list[str], dict[str, float]]:
     """Say what the ground has against a scan's log, and how late that is as the store keeps it."""
     if levelled is None or reference is None or levelled[0].log is None:
@@ -362,9 +380,7 @@ def sha256_of_log(arrival: Arrival) -> str:
     return sha256_of(arrival.log) if arrival.log else ""
 
 
-def _numbers(
-    measured: Measurement, gathered: Gathered, points: int, levelled: tuple[Told, Adjustment, Bools] | None
-) -> dict[str, float]:
+def _numbers(measured: Measurement, gathered: Gathered, points: int) -> dict[str, float]:
     """Return what the store keeps once per scan."""
     lean, setup = gathered.lean, gathered.setup
     told = {
@@ -374,8 +390,6 @@ def _numbers(
     if setup.position_m is not None:
         told |= dict(zip(("scanner_east", "scanner_north", "scanner_height"), setup.position_m, strict=True))
         told |= {"scanner_axis_east": setup.axis[0], "scanner_axis_north": setup.axis[1]}
-    if levelled is not None:
-        told |= stable_figures(measured) | {"change_step": levelled[1].change_step_m}
     if lean is not None:
         told["platform_roll"] = math.degrees(lean.mean_roll_rad)
         told["platform_pitch"] = math.degrees(lean.mean_pitch_rad)
@@ -394,16 +408,21 @@ def numbers_of_air(gathered: Gathered) -> dict[str, float]:
 
 def _figures(epoch: store.Epoch, seconds: float) -> dict[str, float | str]:
     """Return what the log line and the status show of a scan."""
-    measured = epoch.measurement
-    seen = np.isfinite(measured.uncertainty_m)
-    told: dict[str, float | str] = {"points": int(epoch.numbers["point_total"]), "cells": int(seen.sum())}
+    measured, grid = epoch.measurement, epoch.measurement.surface.grid
+    told: dict[str, float | str] = {
+        "points": int(epoch.numbers["point_total"]),
+        "cells": round(epoch.numbers["coverage"] * grid.nx * grid.ny),
+    }
+    part = slice(None, None, 1 + grid.nx * grid.ny // CELLS_MOST)
+    change_m, sigma_m = measured.surface.change_m[part], measured.uncertainty_m[part]
+    seen = np.isfinite(sigma_m)
     if seen.any():
-        told["sigma_median_m"] = round(float(np.median(measured.uncertainty_m[seen])), 4)
-    change_m = measured.surface.change_m[np.isfinite(measured.surface.change_m)]
-    if len(change_m):
-        told["change_median_m"] = round(float(np.median(change_m)), 4)
-        significant = measured.flagged(Quality.CHANGE_SIGNIFICANT)
-        told["significant_pct"] = round(100 * float(significant.sum()) / len(change_m), 1)
+        told["sigma_median_m"] = round(float(np.median(sigma_m[seen])), 4)
+    seen = np.isfinite(change_m)
+    if seen.any():
+        told["change_median_m"] = round(float(np.median(change_m[seen])), 4)
+        significant = measured.quality[part][seen] & np.uint8(Quality.CHANGE_SIGNIFICANT)
+        told["significant_pct"] = round(100 * float(np.mean(significant > 0)), 1)
     for figure in ("stable_nmad", "stable_z_std"):
         if np.isfinite(epoch.numbers.get(figure, np.nan)):
             told[figure] = round(epoch.numbers[figure], 3)

@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 
 from station.quantities import Grid, Reference
 from station.science.grid import Gridder, slope_sampling_variance
+from station.science.terrain import ground
 
 GRID = Grid(west_m=100.0, north_m=250.0, cell_m=2.5, nx=8, ny=6)
 
@@ -67,10 +68,11 @@ def test_residuals_to_a_sloping_reference_lose_the_sampling_error():
     z_m = slope * x_m
     truth = slope * np.broadcast_to(grid.x_m, grid.shape)
     flat = Gridder(grid, None, 0.0)
-    with_reference = Gridder(grid, Reference.given(grid, "1", truth), 0.0)
+    known = ground(Reference.given(grid, "1", truth))
+    with_reference = Gridder(grid, known, 0.0)
     for gridder in (flat, with_reference):
         _, column, row = gridder.cells(x_m, y_m)
-        below = gridder.ground.under(column, row)[0] if gridder.ground else 0.0
+        below = 0.0 if gridder is flat else known.under(column, row)[0]
         gridder.add(gridder.flat(column, row), z_m - below, None)
     count = flat.sums().count
     single = count == 2

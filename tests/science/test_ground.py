@@ -51,7 +51,8 @@ def test_the_same_ground_is_withheld_wherever_the_grid_begins(cell_m):
     ],
 )
 def test_kind_of_a_cell(stable, kept_out, slope_deg, unlike, wanted):
-    one = [np.array([value]) for value in (stable, kept_out, np.tan(np.radians(slope_deg)), unlike)]
+    smooth = np.tan(np.radians(slope_deg)) < ground.MOVING_STEEPEST
+    one = [np.array([value]) for value in (stable, kept_out, smooth, unlike)]
     assert ground.kinds(*one).tolist() == [wanted]
 
 

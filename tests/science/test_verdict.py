@@ -5,15 +5,17 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from station.quantities import Grid, Measurement, Reference, Surface
+from station.quantities import Grid, Measurement, Reference, Scanner, Surface
 from station.science import verdict
+from station.science.outlook import look
 
 GRID = Grid(-100.0, 3000.0, 10.0, 300, 300)  # north-east of the scanner, from its south-west corner on
 HERE = (0.0, 0.0, 100.0)
 X, Y = np.meshgrid(GRID.x_m, GRID.y_m)
 AWAY = np.hypot(X, Y)
 AZIMUTH = np.degrees(np.arctan2(X, Y))
-PLACE = (HERE, (0.0, 0.0, 1.0))
+SCANNER = Scanner("vz", 1.064, 0.12e-3, 0.0, 0.010, *np.radians((0.0005, 0.008, 10.0)), 6000.0)
+NOWHERE = np.zeros(GRID.shape, bool)
 
 
 def reference(seen=0.9):
@@ -21,8 +23,12 @@ def reference(seen=0.9):
     return replace(flat, seen=np.full(GRID.shape, seen, np.float32))
 
 
+def view(seen, known):
+    return verdict.view(seen.astype(np.int32), look(known, NOWHERE, SCANNER, HERE))
+
+
 def told(seen):
-    return verdict.hidden(verdict.view(seen, reference(), HERE))
+    return verdict.hidden(view(seen, reference()))
 
 
 def chance(share, seed=1):
@@ -30,7 +36,7 @@ def chance(share, seed=1):
 
 
 def test_the_usual_view_hides_nothing():
-    found = verdict.view(chance(0.9), reference(), HERE)
+    found = view(chance(0.9), reference())
     assert found.share == pytest.approx(1.0, abs=0.01)
     assert verdict.hidden(found) == []
     assert told(chance(0.9) & chance(0.9, 2)) == []  # a tenth fewer is weather
@@ -61,10 +67,10 @@ def test_fog_hides_sectors_that_begin_far_away_without_a_partial_sweep():
     """Nothing nearer than 2 km in a sector, and fog at 1 km: no sweep is to blame."""
     far_only = (AZIMUTH > 20) & (AZIMUTH < 40) & (AWAY < 2000)
     known = replace(reference(), seen=np.where(far_only, 0, 0.9).astype(np.float32))
-    found = verdict.view(chance(0.9) & ~far_only & (AWAY < 1000), known, HERE)
+    found = view(chance(0.9) & ~far_only & (AWAY < 1000), known)
     (reason,) = verdict.hidden(found)
     assert "nothing beyond 1000 m" in reason
-    clear = verdict.view(chance(0.9) & ~((AZIMUTH > 20) & (AZIMUTH < 40)), known, HERE)
+    clear = view(chance(0.9) & ~((AZIMUTH > 20) & (AZIMUTH < 40)), known)
     assert verdict.hidden(clear) == ["partial sweep: nothing seen at azimuth 20-40 degree"]
 
 
@@ -76,9 +82,9 @@ def test_fog_and_a_partial_sweep_together():
 
 def test_a_part_of_a_vast_grid_tells_the_same(monkeypatch):
     seen = chance(0.9) & (AWAY < 1400)
-    whole = verdict.view(seen, reference(), HERE)
+    whole = view(seen, reference())
     monkeypatch.setattr(verdict, "CELLS_MOST", GRID.nx * GRID.ny // 3)
-    part = verdict.view(seen, reference(), HERE)
+    part = view(seen, reference())
     assert part.share == pytest.approx(whole.share, rel=0.02)
     assert part.usual.sum() == pytest.approx(whole.usual.sum(), rel=0.02)
 
@@ -86,7 +92,7 @@ def test_a_part_of_a_vast_grid_tells_the_same(monkeypatch):
 def test_cells_that_later_scans_saw_but_the_surface_lacks_do_not_count():
     known = reference()
     known.elevation_m[AWAY > 2000] = np.nan
-    found = verdict.view(chance(0.9) & (AWAY < 2000), known, HERE)
+    found = view(chance(0.9) & (AWAY < 2000), known)
     assert found.usual.sum() == pytest.approx(0.9 * np.count_nonzero(AWAY <= 2000))
     assert verdict.hidden(found) == []
 
@@ -114,7 +120,8 @@ STABLE = (AWAY < 500) & (X > 0)
 def judged(change_m=0.0, sigma_m=0.1, seen=None, lacking=(), z=None, stable=STABLE, known=None):
     noise = np.random.default_rng(5).normal(0, 0.1, GRID.shape)
     told = measured(noise + change_m, sigma_m, seen)
-    return verdict.judge("", lacking, told, of_scans() if known is None else known, PLACE, None, z, stable)
+    outlook = look(of_scans() if known is None else known, stable, SCANNER, HERE)
+    return verdict.judge("", lacking, told, outlook, None, z)
 
 
 def test_good_degraded_and_unusable():
@@ -134,25 +141,25 @@ def test_what_sigma_holds_is_not_unusable():
     assert word == "unusable"
     assert "stable ground is 1 m off, 15 sigma" in reason
     assert judged(1.0, known=reference())[0] == "good"  # an outside surface: nobody knows how good
-    assert judged(1.0, stable=None)[0] == "good"
-    assert judged(1.0, stable=np.zeros(GRID.shape, bool))[0] == "good"
+    assert judged(1.0, stable=NOWHERE)[0] == "good"
+    assert judged(1.0, z=1.0)[0] == "good"  # told by what no fit has seen
 
 
 def test_ground_no_fit_has_seen_may_scatter_by_three_sigma():
-    assert judged(z=2.9, stable=None)[0] == "good"
-    word, reason = judged(z=3.1, stable=None)
+    assert judged(z=2.9)[0] == "good"
+    word, reason = judged(z=3.1)
     assert word == "degraded"
     assert "scatters by 3.1 sigma" in reason
 
 
 def test_without_a_reference_only_what_was_lacking_counts():
     told = measured(0.0, 0.1, AWAY < 100)
-    assert verdict.judge("", (), told, None, PLACE, None, None, None) == ("good", "")
-    assert verdict.judge("", ("a",), told, None, PLACE, None, None, None) == ("degraded", "a")
-    flagged = verdict.judge("spring cleaning", ("a",), told, None, PLACE, None, None, None)
+    assert verdict.judge("", (), told, None, None, None) == ("good", "")
+    assert verdict.judge("", ("a",), told, None, None, None) == ("degraded", "a")
+    flagged = verdict.judge("spring cleaning", ("a",), told, None, None, None)
     assert flagged == ("unusable", "flagged: spring cleaning; a")
 
 
 def test_a_reference_that_does_not_know_the_usual_view_misses_nothing():
     known = Reference.given(GRID, "1", np.zeros(GRID.shape))
-    assert judged(seen=AWAY < 100, known=known, stable=None) == ("good", "")
+    assert judged(seen=AWAY < 100, known=known) == ("good", "")

@@ -1,0 +1,144 @@
+"""What the scanner looks at, kept beside the store as plain arrays: inflating it took as long as measuring.
+
+Only a memory: named after all that it was made from, and where it is gone or damaged it is made anew.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from contextlib import suppress
+from hashlib import sha256
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+from isal import isal_zlib
+
+from station import __version__
+from station.archive.layout import Series
+from station.archive.reference import held_at
+from station.errors import StoreError
+from station.quantities import Ints, Reference
+from station.science import shared
+from station.science.outlook import Outlook, Position
+
+ROWS = 128  # of the grid, that a checksum covers
+KEPT = 2  # at a time, of one station: a scanner that was moved may still have old scans to be done again
+DENSE = ("rise_m", "known")
+
+Array = np.ndarray[Any, Any]
+
+
+def kept_outlook(
+    series: Series,
+    reference: Reference,
+    place: tuple[Position | None, Position],
+    made_with: str,
+    look: Callable[[], Outlook],
+) -> Outlook:
+    """Return what `look` gives, from its file beside the store if there is one; else it is made.
+
+    `place` of the scanner and its axis; `made_with` tells everything else that it depends on.
+    """
+    status = held_at(series, reference.version).stat()
+    told = __version__, reference.version, status.st_size, status.st_mtime_ns, place, made_with
+    path = series.folder / f".outlook-{sha256(repr(told).encode()).hexdigest()[:16]}.h5"
+    if not path.is_file():
+        made = look()
+        if not _write(path, made):
+            return made
+    return _open(path, reference, *place)
+
+
+def _write(path: Path, made: Outlook) -> bool:
+    """Keep what was made; tell whether there was room. No fsync: checksums tell what the power took."""
+    beside = path.with_name(f".{path.name}.{os.getpid()}.part")
+    dense: dict[str, Array] = {name: getattr(made, name) for name in DENSE}
+    try:
+        with h5py.File(beside, "w") as file:
+            for name, values in (dense | dict(made.cells)).items():
+                edges = _edges(len(values)) if name in DENSE else made.bounds
+                held = file.create_dataset(name, data=values)
+                held.attrs["crc"] = [_crc(values[a:b]) for a, b in pairwise(edges)]
+            file["bounds"] = frame = np.append(made.bounds, np.float64(made.datum_m).view(np.int64))
+            file["bounds"].attrs["crc"] = _crc(frame)
+        beside.replace(path)
+        kept = sorted(path.parent.glob(".outlook-*.h5"), key=lambda one: one.stat().st_mtime_ns)
+        for old in kept[:-KEPT]:
+            old.unlink(missing_ok=True)
+    except OSError:
+        return False
+    finally:
+        with suppress(OSError):
+            beside.unlink(missing_ok=True)
+    return True
+
+
+def _open(path: Path, reference: Reference, position_m: Position | None, axis: Position) -> Outlook:
+    try:
+        with h5py.File(path, "r") as file:
+            frame = file["bounds"][:]
+            if _crc(frame) != file["bounds"].attrs["crc"]:
+                raise _damaged(path)
+            bounds, datum_m = frame[:-1], float(frame[-1:].view(np.float64)[0])
+            held = {
+                name: _Plain(path, file[name], _edges(len(file[name])) if name in DENSE else bounds)
+                for name in file
+                if name != "bounds"
+            }
+    except (OSError, KeyError, RuntimeError, TypeError, ValueError) as error:
+        raise _damaged(path) from error
+    rise_m, known = (held.pop(name) for name in DENSE)
+    of = shared.basis(reference.grid, position_m, axis) if position_m else None
+    return Outlook(reference, of, position_m, datum_m, rise_m, known, bounds, held)  # type: ignore[arg-type] # sliced only
+
+
+class _Plain:
+    """An array of a file, read as it is sliced; parts with a checksum of their own are held against it."""
+
+    def __init__(self, path: Path, dataset: h5py.Dataset, edges: Ints) -> None:
+        self._path = path
+        self._at = dataset.id.get_offset() or 0
+        self._shape = dataset.shape
+        self._dtype = dataset.dtype if dataset.dtype.kind != "b" else np.dtype(bool)
+        self._row_bytes = int(np.prod(self._shape[1:], dtype=np.int64)) * self._dtype.itemsize
+        self._edges = edges
+        self._crc = dataset.attrs["crc"]
+
+    def __getitem__(self, rows: slice) -> Array:
+        """Return some rows."""
+        first, stop, step = rows.indices(self._shape[0])
+        count = (stop - first) * self._row_bytes
+        try:
+            values = np.fromfile(self._path, np.uint8, count, offset=self._at + first * self._row_bytes)
+        except OSError as error:
+            raise StoreError(f"{self._path}: cannot be read: {error}") from error
+        if len(values) != count:
+            raise _damaged(self._path)
+        for number in range(*np.searchsorted(self._edges, (first, stop)).tolist()):
+            begin, end = (int(row - first) * self._row_bytes for row in self._edges[number : number + 2])
+            if end <= len(values) and _crc(values[begin:end]) != self._crc[number]:
+                raise _damaged(self._path)
+        told = values.view(self._dtype).reshape(-1, *self._shape[1:])
+        return told if step == 1 else told[::step].copy()
+
+    def __array__(self, dtype: Any = None, copy: bool | None = None) -> Array:  # noqa: ANN401, FBT001 - numpy's
+        """Return all of it."""
+        return np.asarray(self[:], dtype=dtype)
+
+
+def _edges(rows: int) -> Ints:
+    return np.append(np.arange(0, rows, ROWS), rows)
+
+
+def _crc(values: Array) -> int:
+    return isal_zlib.crc32(np.ascontiguousarray(values).reshape(-1).view(np.uint8))
+
+
+def _damaged(path: Path) -> StoreError:
+    with suppress(OSError):
+        path.unlink(missing_ok=True)
+    return StoreError(f"{path}: damaged; it has been deleted and is made anew with the next scan")

@@ -1,0 +1,263 @@
+"""The cells of a scan, measured: height, change, how sure they are, and what to know of them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from station.quantities import (
+    Floats,
+    Floats32,
+    Grid,
+    Ints,
+    Measurement,
+    Quality,
+    Reals,
+    Setup,
+    Shared,
+    Surface,
+)
+from station.science import budget, change, ground, shared, uncertainty
+from station.science.grid import Cell, Gridder, Sums, slope_sampling_variance
+from station.science.outlook import HIGH_INCIDENCE_COS, MARGIN_ROWS, Outlook, Sector, Trait, gradients
+from station.science.shared import Sensitivities
+from station.science.view import View
+
+BAND_ROWS = 64  # looked at together for the cells beyond the reference
+TOGETHER = 100_000  # of these that are judged together
+FEW_POINTS = 3
+KEPT_M = 2.0**-10  # of an elevation, which a float32 holds exactly up to 16 km; the store keeps as much
+
+
+def measured(gridder: Gridder, outlook: Outlook | None, judge: Judge) -> Measurement:
+    """Measure the cells of a scan, in the memory of its sums."""
+    setup = judge.setup
+    names = budget.TERMS if setup.published_budget else (*budget.TERMS, *budget.PUBLISHED)
+    made = _Made(
+        gridder.memory(),
+        np.zeros(setup.grid.shape, np.uint8),
+        {
+            name: np.full(setup.grid.shape, np.nan, np.float32)
+            for name in names
+            if setup.store_terms and setup.position_m is not None
+        },
+        setup.min_points,
+    )
+    if outlook is not None:
+        for whole in outlook.sectors():
+            sums = gridder.at(whole.cell)
+            seen = sums.count > 0
+            made.clear(whole.cell[~seen])
+            sector, sums = whole.some(seen), sums.some(seen)
+            made.put(sector.cell, sums, judge.known(sector, sums, outlook))
+    for fringe in _fringes(gridder, setup, outlook, made):
+        made.put(fringe.cell, fringe.sums, judge.beyond(fringe, gridder.datum_m))
+    return made.measurement(setup.grid)
+
+
+@dataclass(frozen=True)
+class _Fringe:
+    """Cells (n,) beyond what a reference knows, each with the height and the slope that the scan gives it."""
+
+    cell: Ints
+    sums: Sums
+    east_gradient: Floats
+    north_gradient: Floats
+
+    @classmethod
+    def of(cls, parts: list[_Fringe]) -> _Fringe:
+        """Take some together."""
+        cell, east, north = (
+            np.concatenate([getattr(part, name) for part in parts])
+            for name in ("cell", "east_gradient", "north_gradient")
+        )
+        return cls(cell, Sums.of([part.sums for part in parts]), east, north)
+
+
+def _fringes(gridder: Gridder, setup: Setup, outlook: Outlook | None, made: _Made) -> Iterator[_Fringe]:
+    """Give the cells beyond the reference, many at a time; all others beyond it are cleared."""
+    above_m = np.empty((0, setup.grid.nx), np.float32)
+    parts: list[_Fringe] = []
+    for top in range(0, setup.grid.ny, BAND_ROWS):
+        rows = slice(top, min(top + BAND_ROWS, setup.grid.ny))
+        part, above_m = _fringe(gridder, setup, outlook, made, rows, above_m)
+        parts.append(part)
+        if sum(len(part.cell) for part in parts) > TOGETHER or rows.stop == setup.grid.ny:
+            yield _Fringe.of(parts)
+            parts = []
+
+
+def _fringe(
+    gridder: Gridder, setup: Setup, outlook: Outlook | None, made: _Made, rows: slice, above_m: Floats32
+) -> tuple[_Fringe, Floats32]:
+    """Return the cells of some rows that no reference knows, and the heights of the last of these rows.
+
+    `above_m` (r, nx) are those of the rows above, whose sums have given way. Heights are above the datum.
+    """
+    ahead, height = slice(rows.start, min(rows.stop + MARGIN_ROWS, setup.grid.ny)), rows.stop - rows.start
+    beyond = np.ones((ahead.stop - ahead.start, setup.grid.nx), bool)
+    if outlook is not None:
+        beyond = ~outlook.known[ahead]
+    row, column = np.nonzero(beyond & gridder.seen(ahead))
+    cell = (rows.start + row) * setup.grid.nx + column
+    sums = gridder.at(cell)
+    found_m = np.full(beyond.shape, np.nan, np.float32)
+    found_m[row, column] = np.where(sums.count >= setup.min_points, sums.mean_residual(), np.nan)
+    made.clear(np.flatnonzero(beyond[:height]) + rows.start * setup.grid.nx)
+    here = row < height
+    row, column, cell, sums = row[here], column[here], cell[here], sums.some(here)
+    east, north = np.zeros((2, len(row)))
+    if setup.position_m is not None and len(row):
+        around_m = np.concatenate([above_m, found_m])
+        if outlook is not None:  # what it knows of the cells beside is better
+            there = slice(rows.start - len(above_m), ahead.stop)
+            better_m = outlook.rise_m[there] + np.float32(outlook.datum_m - gridder.datum_m)
+            np.copyto(around_m, better_m, where=outlook.known[there])
+        inner = slice(len(above_m), len(above_m) + height)
+        east, north = gradients(around_m, setup.grid.cell_m, inner, (row, column))
+    return _Fringe(cell, sums, east, north), found_m[:height][-MARGIN_ROWS:]
+
+
+@dataclass(frozen=True)
+class _Judged:
+    """Cells of a scan, (n,) each."""
+
+    elevation_m: Reals
+    change_m: Reals
+    sigma_m: Reals
+    random_m: Reals
+    flags: NDArray[np.uint8]
+    terms: dict[str, Floats]
+
+
+def _as_one(values: Floats32) -> NDArray[np.void]:
+    """View the six values (..., 6) of a cell as one, which moves twice as fast."""
+    return np.asarray(values.view("V24")[..., 0])
+
+
+@dataclass(frozen=True)
+class _Made:
+    """Where the rasters of a scan come to be; the first in the memory of its sums (ny, nx, 6)."""
+
+    memory: Floats32
+    quality: NDArray[np.uint8]
+    terms: dict[str, Floats32]
+    min_points: int
+
+    def clear(self, cell: Cell) -> None:
+        """Say that cells (n,) hold nothing, until something is put there."""
+        nothing = np.array([np.nan] * 5 + [0], np.float32)  # nought has the same bits in both
+        _as_one(self.memory).reshape(-1)[cell] = _as_one(nothing)
+
+    def put(self, cell: Cell, sums: Sums, told: _Judged) -> None:
+        """Lay down cells (n,); of those with too few points no more than number and spread."""
+        whole = np.empty((len(cell), 6), np.float32)
+        np.rint(told.elevation_m / KEPT_M, out=whole[:, 0], casting="same_kind")
+        whole[:, 0] *= KEPT_M
+        whole[:, 1], whole[:, 2], whole[:, 3] = told.change_m, told.sigma_m, told.random_m
+        whole[:, 4] = sums.spread()
+        whole.view(np.int32)[:, 5] = sums.count
+        enough = sums.count >= self.min_points
+        whole[~enough, :4] = np.nan
+        _as_one(self.memory).reshape(-1)[cell] = _as_one(whole)
+        self.quality.reshape(-1)[cell[enough]] = told.flags[enough]
+        for name, values in told.terms.items():
+            self.terms[name].reshape(-1)[cell[enough]] = values[enough]
+
+    def measurement(self, grid: Grid) -> Measurement:
+        """Return all that was laid down."""
+        elevation_m, change_m, uncertainty_m, random_m, spread_m, _ = np.moveaxis(self.memory, -1, 0)
+        surface = Surface(grid, elevation_m, change_m, self.memory.view(np.int32)[..., 5], spread_m)
+        return Measurement(surface, uncertainty_m, random_m, self.quality, self.terms)
+
+
+@dataclass(frozen=True)
+class Judge:
+    """Takes the adjustment off the cells of a scan and says how sure they are.
+
+    `unknown` is what all points share of their difference from the reference, `own` the same of the scan
+    alone, None where nothing tells; `correction` gives what to take off heights, None without an adjustment.
+    """
+
+    setup: Setup
+    unknown: Shared | None
+    own: Shared | None
+    correction: Callable[[Sensitivities], Reals] | None
+
+    def known(self, sector: Sector, sums: Sums, outlook: Outlook) -> _Judged:
+        """Judge cells (n,) that the reference knows."""
+        count = sums.count.astype(np.float32)
+        random_m2 = sector.scatter_m2 / count + sector.before_m2
+        shared_m2, correction_m, terms = np.zeros_like(count), np.zeros_like(count), dict[str, Floats]()
+        if outlook.of is not None:
+            felt = outlook.felt(sector)
+            shared_m2, correction_m = self._shared(felt)
+            if self.setup.store_terms:
+                view = outlook.view(sector)
+                terms = self._terms(felt, view, sums.count.astype(np.float64), np.zeros(len(sector)))
+        sigma_m = self._total(random_m2 + shared_m2)
+        change_m = sums.mean_residual().astype(np.float32) - correction_m
+        flags = Quality.FEW_POINTS * (sums.count < FEW_POINTS).view(np.uint8)
+        flags |= Quality.HIGH_INCIDENCE * sector.having(Trait.GRAZED).view(np.uint8)
+        flags |= Quality.CHANGE_SIGNIFICANT * change.significant(change_m, sigma_m).view(np.uint8)
+        if self.correction is not None:
+            unlike = ground.looks_unlike(sums.intensity(), sector.intensity)
+            flags |= Quality.STABLE_GROUND * (sector.having(Trait.STABLE) & ~unlike).view(np.uint8)
+        elevation_m = outlook.datum_m + (sector.height_m.astype(np.float64) + change_m)
+        return _Judged(elevation_m, change_m, sigma_m, np.sqrt(random_m2), flags, terms)
+
+    def beyond(self, fringe: _Fringe, datum_m: float) -> _Judged:
+        """Judge cells (n,) beyond the reference, whose heights are above a datum."""
+        setup, sums = self.setup, fringe.sums
+        count, height_m = sums.count.astype(np.float64), sums.mean_residual() + datum_m
+        flags = Quality.FEW_POINTS * (sums.count < FEW_POINTS).view(np.uint8)
+        flags |= np.uint8(Quality.OUTSIDE_REFERENCE)
+        nothing_m = np.full(len(count), np.nan)
+        if setup.position_m is None:
+            spread_m2 = np.nan_to_num(sums.spread().astype(np.float64)) ** 2
+            random_m2 = np.maximum(spread_m2, setup.scanner.range_sigma_m**2) / count
+            sigma_m = self._total(random_m2)
+            return _Judged(height_m, nothing_m, sigma_m, np.sqrt(random_m2), flags, {})
+        row, column = np.divmod(fringe.cell, setup.grid.nx)
+        points = setup.grid.x_m[column], setup.grid.y_m[row], height_m
+        view = View.of(points, setup.position_m, fringe.east_gradient, fringe.north_gradient)
+        flags |= Quality.HIGH_INCIDENCE * (view.cos_incidence < HIGH_INCIDENCE_COS).view(np.uint8)
+        sampling_m2 = slope_sampling_variance(setup.grid.cell_m, view.tan_slope, count)
+        random_m2 = view.shot_variance(setup.scanner, published=setup.published_budget) / count + sampling_m2
+        of = shared.basis(setup.grid, setup.position_m, setup.axis)
+        felt = shared.sensitivities(of, view.offset_m, view.east_gradient, view.north_gradient)
+        shared_m2, correction_m = self._shared(felt)
+        terms = self._terms(felt, view, count, sampling_m2) if setup.store_terms else {}
+        sigma_m = self._total(random_m2 + shared_m2)
+        return _Judged(height_m - correction_m, nothing_m, sigma_m, np.sqrt(random_m2), flags, terms)
+
+    def _total(self, variance_m2: Reals) -> Reals:
+        """Sigma of cells [m]."""
+        if self.setup.published_budget:
+            return uncertainty.sigma_total_voordendag(np.sqrt(variance_m2), self.setup.registration_sigma_m)
+        return np.sqrt(variance_m2)
+
+    def _shared(self, felt: Sensitivities) -> tuple[Reals, Reals]:
+        """Return what cells share with others [m²], and what is to be taken off their heights [m]."""
+        nothing = np.zeros_like(felt.lean)
+        if self.unknown is None:
+            return nothing, nothing
+        correction_m = nothing if self.correction is None else self.correction(felt)
+        if self.setup.published_budget:
+            return nothing, correction_m
+        return felt.variance(self.unknown), correction_m
+
+    def _terms(
+        self, felt: Sensitivities, view: View, count: Floats, sampling_m2: Floats
+    ) -> dict[str, Floats]:
+        """Split the budget, as the site asks [m]."""
+        setup = self.setup
+        if setup.published_budget:
+            return budget.terms_voordendag(view, count, setup.scanner, setup.registration_sigma_m)
+        if self.own is None:
+            return {}
+        terms = budget.terms(view, count, sampling_m2, felt, self.own, setup.scanner)
+        return terms | budget.published(view, count, setup.scanner)
