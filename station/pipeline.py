@@ -160,6 +160,7 @@ def _cells(gridder: Gridder, setup: Setup, of: Basis, reference: Reference, stab
                 view.shot_variance(setup.scanner, published=False), sums.count[seen], reference, band, seen
             )
             + reference.random_variance_m2[band][seen],
+            (step * every, step),
         )
 
 

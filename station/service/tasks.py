@@ -17,6 +17,7 @@ import numpy as np
 
 from station import __version__
 from station.archive import store
+from station.archive.aggregate import SLACK
 from station.archive.layout import Series, kept_of
 from station.archive.reference import current, open_reference, write_reference
 from station.config import Site
@@ -376,6 +377,7 @@ def _numbers(
         told |= {"scanner_axis_east": setup.axis[0], "scanner_axis_north": setup.axis[1]}
     if levelled is not None:
         told |= stable_figures(measured) | {"change_step": levelled[1].change_step_m}
+        told |= dict(zip(SLACK, levelled[1].slack_m2, strict=True))
     if lean is not None:
         told["platform_roll"] = math.degrees(lean.mean_roll_rad)
         told["platform_pitch"] = math.degrees(lean.mean_pitch_rad)
