@@ -13,11 +13,12 @@ from scipy import sparse
 from scipy.stats import median_abs_deviation
 
 from benchmarks.stations import Method, site_of
+from station.archive.aggregate import SLACK
 from station.archive.reference import read_reference
 from station.archive.store import open_series
 from station.config import Site
 from station.quantities import Bools, Floats, Grid, Quality, Reference
-from station.science import ground, shared, terrain
+from station.science import ground, held, shared, terrain
 from station.science.view import View
 
 BOX_M = 100.0
@@ -193,6 +194,14 @@ class Calibration:
         self.range_m = result.geometry.range_m[self.known]
         self.covariance = told.shared_parameter_covariance.values.astype(np.float64)
         self.noise = told.shared_parameter_noise_variance.values.astype(np.float64)
+        self.slack_m2 = np.stack([told[name].values for name in SLACK], axis=1)
+        row, column = np.nonzero(self.known)
+        kept_out = ground.withheld(grid.x_m[column], grid.y_m[row])
+        tan_slope = np.hypot(*felt.globals_[3:5])
+        self.kind = [
+            ground.kinds((one[self.known] & Quality.STABLE_GROUND) > 0, kept_out, tan_slope, kept_out & False)
+            for one in result.quality
+        ]
         if not result.joint and result.reference.shared is not None:
             self.base = result.reference.shared.covariance, result.reference.shared.noise_variance
         else:
@@ -209,15 +218,22 @@ class Calibration:
         g, lines = (weights @ self.design).toarray(), (weights @ self.lines).toarray()
         squares, variance_m2 = weights.power(2), np.zeros(len(share))
         for one in epochs:
-            random_m2 = np.where(seen, self.random_m2[one], 0.0)
+            random_m2, free = np.where(seen, self.random_m2[one], 0.0), np.ones(len(seen))
             covariance, noise = self.covariance[one], self.noise[one]
+            g_rest, lines_rest = g, lines
             if other is not None:
-                random_m2 = np.maximum(random_m2 - np.where(seen, self.before_m2, 0.0), 0.0)
+                whole_m2, random_m2 = random_m2, np.where(seen, random_m2 - self.before_m2, 0.0).clip(0.0)
+                if np.isfinite(self.slack_m2[one]).all():
+                    free = 1 - held.share(random_m2, whole_m2, self.kind[one], tuple(self.slack_m2[one]))
+                    rest = weights @ sparse.diags_array(2 * free - 1)
+                    g_rest, lines_rest = (rest @ self.design).toarray(), (rest @ self.lines).toarray()
             elif self.base is not None:
                 covariance, noise = covariance + self.base[0], noise + self.base[1]
             first = len(shared.GLOBAL)
             own = np.repeat(noise[first : first + self.of.intervals], shared.LINES_A_KNOT)
-            variance_m2 += squares @ random_m2 + np.sum((g @ covariance) * g, axis=1) + lines**2 @ own
+            told_m2 = squares @ random_m2 + np.sum((g @ covariance) * g_rest, axis=1)
+            told_m2 += (lines * lines_rest) @ own
+            variance_m2 += np.maximum(told_m2, squares @ (random_m2 * free))
         z = weights @ np.where(seen, error_m, 0.0) / np.sqrt(np.maximum(variance_m2, 1e-12))
         return np.where(share > 0, z, np.nan), share
 

@@ -136,6 +136,7 @@ def _cells(gridder: Gridder, outlook: Outlook) -> Iterator[Cells]:
             ),
             sums.mean_residual(),
             sector.scatter_m2 / sums.count + sector.before_m2,
+            outlook.one_in,
         )
 
 

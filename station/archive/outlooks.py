@@ -63,7 +63,8 @@ def _write(path: Path, made: Outlook) -> bool:
                 edges = _edges(len(values)) if name in DENSE else made.bounds
                 held = file.create_dataset(name, data=values)
                 held.attrs["crc"] = [_crc(values[a:b]) for a, b in pairwise(edges)]
-            file["bounds"] = frame = np.append(made.bounds, np.float64(made.datum_m).view(np.int64))
+            datum = np.float64(made.datum_m).view(np.int64)
+            file["bounds"] = frame = np.concatenate([made.bounds, made.one_in, [datum]])
             file["bounds"].attrs["crc"] = _crc(frame)
         beside.replace(path)
         kept = sorted(path.parent.glob(".outlook-*.h5"), key=lambda one: one.stat().st_mtime_ns)
@@ -83,7 +84,7 @@ def _open(path: Path, reference: Reference, position_m: Position | None, axis: P
             frame = file["bounds"][:]
             if _crc(frame) != file["bounds"].attrs["crc"]:
                 raise _damaged(path)
-            bounds, datum_m = frame[:-1], float(frame[-1:].view(np.float64)[0])
+            bounds, datum_m = frame[:-3], float(frame[-1:].view(np.float64)[0])
             held = {
                 name: _Plain(path, file[name], _edges(len(file[name])) if name in DENSE else bounds)
                 for name in file
@@ -93,7 +94,8 @@ def _open(path: Path, reference: Reference, position_m: Position | None, axis: P
         raise _damaged(path) from error
     rise_m, known = (held.pop(name) for name in DENSE)
     of = shared.basis(reference.grid, position_m, axis) if position_m else None
-    return Outlook(reference, of, position_m, datum_m, rise_m, known, bounds, held)  # type: ignore[arg-type] # sliced only
+    one_in = int(frame[-3]), int(frame[-2])
+    return Outlook(reference, of, position_m, datum_m, rise_m, known, bounds, one_in, held)  # type: ignore[arg-type] # sliced only
 
 
 class _Plain:

@@ -211,6 +211,22 @@ VARIABLES: tuple[Variable, ...] = (
     Variable(
         "change_step", ("time",), "f8", "change of the moving ground that the adjustment allowed for", "m"
     ),
+    Variable(
+        "adjustment_slack_moving",
+        ("time",),
+        "f8",
+        "variance given to a cell of moving ground beyond its random one",
+        "m2",
+        comment="with the share v / (v + slack) of its noise it held the scan, v being its random variance:"
+        " noise that is in the estimate too does not add to it",
+    ),
+    Variable(
+        "adjustment_slack_stable",
+        ("time",),
+        "f8",
+        "variance given to a cell of stable ground beyond its random one",
+        "m2",
+    ),
     Variable("scanner_east", ("time",), "f8", "easting of the scanner", "m"),
     Variable("scanner_north", ("time",), "f8", "northing of the scanner", "m"),
     Variable("scanner_height", ("time",), "f8", "height of the scanner", "m"),

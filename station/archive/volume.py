@@ -90,7 +90,9 @@ class Volumes(Aggregates):
                 continue
             if len(held) == 1 and not one.adjusted:
                 unknown = against(unknown, one.reference.shared)
-            common += shared_contributions(weights, self.felt(one, chosen), unknown)
+            felt = self.felt(one, chosen)
+            noise = self.held_share(one, chosen, felt, own_m2) if len(held) > 1 else None
+            common += shared_contributions(weights, felt, unknown, noise)
         return own, common
 
     def point_covariance(self, points_m: Floats, row: Row, scanner: Scanner) -> Floats:

@@ -9,12 +9,13 @@ Source: EQUATIONS 6.3, ADJUSTMENT.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy import linalg, sparse
 
 from station.quantities import Bools, Floats, Reals, Shared
+from station.science.held import slacks
 from station.science.normals import (
     Beforehand,
     Factored,
@@ -41,11 +42,15 @@ CHANGE_STRETCHES = 3  # of range, between knots of the change
 CHANGE_STEPS_M = tuple(float(step) for step in np.geomspace(0.5 / 2**14, 0.5, 15))
 UNIFORM_CHANGE = 1.0  # one sigma of what all the moving ground changes by, in steps of a knot's
 # The same of what neighbours change by alike, and after how many knots in azimuth and range it no longer is.
-ALIKE_CHANGES = (0.0, 1.0, 3.0, 10.0)
+ALIKE_CHANGES = (0.0, 3.0, 10.0)
 # Log odds against the same: smooth errors of the air look like it too, but speak for it with tens at most, a
 # smooth snowfall with hundreds.
-ALIKE_ODDS = (0.0, 0.0, 12.0, 24.0)
-ALIKE_AZIMUTH_KNOTS, ALIKE_RANGE_KNOTS = 10.0, 6.0
+ALIKE_ODDS = (0.0, 12.0, 24.0)
+ALIKE_AZIMUTH_KNOTS, ALIKE_RANGE_KNOTS = 1.5, 1.0
+# Where other ground rises, stable ground may lie under snow too thin to be told by its brightness.
+THIN_SNOW_M = 0.005  # one sigma, no more than of the change of other ground
+NO_SNOW_M = 1e-6
+SNOW_STEEPEST = tuple(np.tan(np.radians((40.0, 50.0))))  # of ground that holds snow, and that holds some
 
 
 @dataclass(frozen=True)
@@ -53,7 +58,8 @@ class Adjustment:
     """The scanner's state against the SOP: nine globals, the lean of each group of lines, knots of the rest.
 
     `change_step_m` is one sigma of the change between its knots that the moving ground shows;
-    `stable_weight` (patches,) how far each stable patch was trusted.
+    `stable_weight` (patches,) how far each stable patch was trusted; `slack_m2` how loosely moving and stable
+    cells hold it (see `held`).
     """
 
     of: Basis
@@ -61,6 +67,7 @@ class Adjustment:
     unknown: Unknown
     change_step_m: float
     stable_weight: Floats
+    slack_m2: tuple[float, float]
 
     def effect(self, felt: Sensitivities) -> Reals:
         """Effect of the estimated state on heights (n,) [m], to be taken off."""
@@ -114,8 +121,10 @@ def adjust(patches: Patches, assumed_rad: Floats, before: Beforehand, log: LineL
     solved: _Solved | None = None
     for round_ in range(ROUNDS):
         last, last_m = solved, left_m
-        reduced = normals.weighted(trust / (patches.variance_m2 + scatter_m2))
+        weight = trust / (patches.variance_m2 + scatter_m2)
+        reduced = normals.weighted(weight)
         solved = _solve(reduced, normals.size, changes, last.place if last else None)
+        changes = replace(changes, rises=solved.rise_m(field, moving) > 0)
         left_m = wanted_m - normals.effect(solved.estimate, reduced.own_rad(solved.estimate))
         scatter_m2 = _scatter(patches, left_m, moving)
         if round_ >= ROUNDS_TRUSTING:
@@ -128,15 +137,38 @@ def adjust(patches: Patches, assumed_rad: Floats, before: Beforehand, log: LineL
     assert solved is not None  # noqa: S101 - there is a first round
     reduced = solved.reduced
     unknown = Unknown(of, reduced.own, reduced.felt, solved.whole())
-    return Adjustment(of, solved.by_line(of), unknown, solved.step_m, trust[~moving])
+    held_by = slacks(patches, weight, normals, unknown)
+    return Adjustment(of, solved.by_line(of), unknown, solved.step_m, trust[~moving], held_by)
 
 
 @dataclass(frozen=True)
 class _Changes:
-    """Priors of the change at its knots, for a step of one, by how alike neighbours are."""
+    """Priors of the change at its knots, for a step of one, by how alike neighbours are.
+
+    After the knots come thicknesses of thin snow on stable ground, if other ground `rises`.
+    """
 
     precision: list[Floats]  # (knots, knots)
     log_determinant: list[float]  # of the covariance
+    thin: int  # how many thicknesses
+    rises: bool = True
+
+    def at(self, place: tuple[int, int]) -> tuple[Floats, float]:
+        """Precision (knots + thin,) * 2 of all at a place, and the log determinant of its covariance."""
+        alike, step = place
+        step_m, knots = CHANGE_STEPS_M[step], len(self.precision[alike])
+        thin_m = min(_step_m(place), THIN_SNOW_M) if self.rises else NO_SNOW_M
+        precision = np.zeros((knots + self.thin,) * 2)
+        precision[:knots, :knots] = self.precision[alike] / step_m**2
+        precision[range(knots, knots + self.thin), range(knots, knots + self.thin)] = 1 / thin_m**2
+        spread = 2 * (knots * np.log(step_m) + self.thin * np.log(thin_m))
+        return precision, float(self.log_determinant[alike] + spread)
+
+
+def _step_m(place: tuple[int, int]) -> float:
+    """One sigma of the change between its knots at a place among priors."""
+    alike, step = place
+    return CHANGE_STEPS_M[step] * float(np.hypot(1.0, ALIKE_CHANGES[alike]))
 
 
 def _change_field(patches: Patches, moving: Bools) -> tuple[sparse.csr_array, _Changes]:
@@ -157,14 +189,25 @@ def _change_field(patches: Patches, moving: Bools) -> tuple[sparse.csr_array, _C
     held = values > 0
     knots, columns = np.unique(columns[held], return_inverse=True)
     field = sparse.csr_array((values[held], (rows[held], columns)), shape=(len(u), len(knots)))
+    thin = _thin_snow(patches, moving) if len(knots) else sparse.csr_array((len(u), 0))
     across, out = np.divmod(knots, along)
     apart = np.abs(np.subtract.outer(across, across)) / ALIKE_AZIMUTH_KNOTS
     apart += np.abs(np.subtract.outer(out, out)) / ALIKE_RANGE_KNOTS
     own = np.eye(len(knots)) + UNIFORM_CHANGE**2
     covariances = [Factored(own + alike**2 * np.exp(-apart)) for alike in ALIKE_CHANGES]
-    return field, _Changes(
-        [one.inverse() for one in covariances], [one.log_determinant() for one in covariances]
+    changes = _Changes(
+        [one.inverse() for one in covariances],
+        [one.log_determinant() for one in covariances],
+        thin.shape[1],
     )
+    return sparse.hstack([field, thin], format="csr"), changes
+
+
+def _thin_snow(patches: Patches, moving: Bools) -> sparse.csr_array:
+    """Which stable patches (n, 2) may hold snow, and which may hold some."""
+    tan_slope = np.hypot(*patches.felt.globals_[3:5])
+    holds = np.digitize(tan_slope, SNOW_STEEPEST)
+    return sparse.csr_array(np.stack([(holds == kind) & ~moving for kind in range(2)], axis=1) * 1.0)
 
 
 @dataclass(frozen=True)
@@ -174,13 +217,17 @@ class _Solved:
     reduced: Reduced
     estimate: Floats  # (m,)
     place: tuple[int, int]  # of the change's prior
-    precision: Floats  # (knots, knots) of that
+    precision: Floats  # (changes, changes) of that
 
     @property
     def step_m(self) -> float:
         """One sigma of the change between its knots."""
-        alike, step = self.place
-        return CHANGE_STEPS_M[step] * float(np.hypot(1.0, ALIKE_CHANGES[alike]))
+        return _step_m(self.place)
+
+    def rise_m(self, field: sparse.csr_array, moving: Bools) -> float:
+        """Mean change of the moving patches."""
+        change_m = field @ self.estimate[len(self.estimate) - len(self.precision) :]
+        return float(change_m[moving].mean()) if moving.any() else 0.0
 
     def by_line(self, of: Basis) -> Floats:
         """State (u,) with the leans of the lines."""
@@ -219,7 +266,7 @@ def _solve(reduced: Reduced, size: int, changes: _Changes, near: tuple[int, int]
     place = max(tried, key=odds)
     change_m = tried[place][1]
     estimate = np.concatenate([state.solve(right[:size] - normal[:size, size:] @ change_m), change_m])
-    return _Solved(reduced, estimate, place, changes.precision[place[0]] / CHANGE_STEPS_M[place[1]] ** 2)
+    return _Solved(reduced, estimate, place, changes.at(place)[0])
 
 
 def _climbed(odds: Callable[[tuple[int, int]], float], alike: int, step: int) -> int:
@@ -236,14 +283,14 @@ def _likelihood(
     left: Floats, told: Floats, changes: _Changes, place: tuple[int, int]
 ) -> tuple[float, Floats]:
     """Log likelihood of a prior of the change, and the change (knots,) [m] with it."""
-    alike, step = place
-    step_m = CHANGE_STEPS_M[step]
+    against = ALIKE_ODDS[place[0]]
     if not len(told):
-        return -ALIKE_ODDS[alike], told
-    root = root_of(left + changes.precision[alike] / step_m**2)
+        return -against, told
+    precision, determinant = changes.at(place)
+    root = root_of(left + precision)
     change_m = linalg.cho_solve((root, True), told, check_finite=False)
-    spread = (log_determinant(root) + changes.log_determinant[alike]) / 2 + len(told) * np.log(step_m)
-    return float(told @ change_m / 2 - spread) - ALIKE_ODDS[alike], change_m
+    spread = (log_determinant(root) + determinant) / 2
+    return float(told @ change_m / 2 - spread) - against, change_m
 
 
 def _scatter(patches: Patches, left_m: Floats, moving: Bools) -> Floats:

@@ -180,6 +180,16 @@ class Unknown:
         covariance[lines, lines] += self.own.times(np.eye(of.line_count))
         return np.asarray(covariance)
 
+    def going_with(self, at_knots: Floats, by_line: Floats) -> tuple[Floats, Floats]:
+        """Covariance of the unknowns (m,) and of the own leans (lines,) with what feels the state so.
+
+        `at_knots` (p,) and `by_line` (lines,) are the effects of the state by knots and of the lines' leans.
+        """
+        right = -self.felt.T @ self.own.times(by_line[:, None])[:, 0]
+        right[: len(at_knots)] += at_knots
+        unknowns = self.whole.solve(right)
+        return unknowns, self.own.times((by_line - self.felt @ unknowns)[:, None])[:, 0]
+
     def by_knots(self, estimate: Floats) -> Shared:
         """Return what is known of the state (u,), condensed to knots."""
         of, own, between = self.of, self.own, leans_between(self.of)

@@ -98,6 +98,7 @@ class Outlook:
     rise_m: Floats32
     known: Bools
     bounds: Ints  # (2 sectors + 1,)
+    one_in: tuple[int, int]  # of so many cells an adjustment looks at one: of moving ones, of stable ones
     cells: Mapping[str, Array]
 
     @property
@@ -184,13 +185,15 @@ def look(
         for name, values in told.items():
             cells[name][first:end] = values
         first = end
-    looked_at = _looked_at(grid, cells["cell"], (cells["trait"] & np.uint8(Trait.STABLE)) > 0)
+    stable_ones = (cells["trait"] & np.uint8(Trait.STABLE)) > 0
+    looked_at, one_in = _looked_at(grid, cells["cell"], stable_ones)
     place = 2 * cells["passed"].astype(np.int16) + ~looked_at
     order = np.argsort(place, kind="stable")
     bounds = np.searchsorted(place[order], np.arange(2 * (of.intervals if of else 1) + 1))
     for name in cells:  # one after the other: together they are the most that a scan needs
         cells[name] = cells[name][order]
-    return Outlook(reference, of, position_m, below.datum_m, below.rise_m, below.known, bounds, cells)
+    surface = below.datum_m, below.rise_m, below.known
+    return Outlook(reference, of, position_m, *surface, bounds, one_in, cells)
 
 
 def gradients(
@@ -257,9 +260,13 @@ def _cells(
     }
 
 
-def _looked_at(grid: Grid, cell: Array, stable: Bools) -> Bools:
-    """Choose cells (n,) for an adjustment: of too many stable ones whole rows, of the others a pattern."""
+def _looked_at(grid: Grid, cell: Array, stable: Bools) -> tuple[Bools, tuple[int, int]]:
+    """Choose cells (n,) for an adjustment: of too many stable ones whole rows, of the others a pattern.
+
+    And tell one in how many that is, of the others and of the stable ones.
+    """
     row, column = np.divmod(cell, np.int32(grid.nx))
     step = 1 + int(np.count_nonzero(stable)) // STABLE_MOST
     every = 1 + len(row) // (step * MOVING_MOST)
-    return np.asarray((row % step == 0) & (stable | ((row // step + column) % every == 0)))
+    chosen = (row % step == 0) & (stable | ((row // step + column) % every == 0))
+    return chosen, (step * every, step)

@@ -35,6 +35,7 @@ class Cells:
     kind: Ints
     residual_m: Floats
     variance_m2: Floats
+    one_in: tuple[int, int] = (1, 1)  # of so many cells one is looked at: of moving ones, of stable ones
 
 
 @dataclass(frozen=True)
@@ -47,6 +48,7 @@ class Patches:
     residual_m: Floats  # (m,) above the reference surface
     variance_m2: Floats  # (m,) of their random errors
     cells: Floats  # (m,) how many
+    one_in: tuple[int, int] = (1, 1)  # as of its cells
 
     def __len__(self) -> int:
         """Return how many there are."""
@@ -61,6 +63,7 @@ class Patches:
             self.residual_m[chosen],
             self.variance_m2[chosen],
             self.cells[chosen],
+            self.one_in,
         )
 
 
@@ -71,8 +74,9 @@ def collect(of: Basis, bands: Iterable[Cells], reach_m: float) -> Patches:
     size = a_kind * Kind.UNUSED
     sums = np.zeros((len(GLOBAL) + 3, size))
     held: list[tuple[Ints, Floats, Floats]] = []
+    one_in = (1, 1)
     for cells in bands:
-        used = cells.kind != Kind.UNUSED
+        used, one_in = cells.kind != Kind.UNUSED, cells.one_in
         felt = cells.felt
         stretch = np.minimum((cells.range_m[used] / STRETCH_M).astype(np.int64), stretches - 1)
         key = cells.kind[used] * a_kind + felt.line[used] * stretches + stretch
@@ -92,7 +96,7 @@ def collect(of: Basis, bands: Iterable[Cells], reach_m: float) -> Patches:
     place = there % a_kind
     passed = (place // stretches + 0.5) / LINES_A_KNOT
     felt = Sensitivities(of, effects[: len(GLOBAL)], effects[-2], effects[-1], passed)
-    return Patches(felt, place % stretches, there // a_kind, mean_m, variance_m2, count)
+    return Patches(felt, place % stretches, there // a_kind, mean_m, variance_m2, count, one_in)
 
 
 def _robust_means(key: Ints, residual_m: Floats, weight: Floats, size: int) -> tuple[Floats, Floats, Floats]:

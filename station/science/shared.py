@@ -331,16 +331,24 @@ def cell_sensitivities(
 
 
 def aggregate_variance(
-    weights: Floats, random_variance_m2: Floats, felt: Sensitivities, unknown: Shared
+    weights: Floats,
+    random_variance_m2: Floats,
+    felt: Sensitivities,
+    unknown: Shared,
+    held: Floats | None = None,
 ) -> float:
     """Variance of a weighted sum of cell heights: Σ a² σ_r² + gᵀ C g, and what lines add.
 
-    For a difference of two epochs add both; what a reference shares with both cancels.
-    Source: EQUATIONS 6.2; Hartzell et al. (2015), Eq. 14 and 21, lack the second term.
+    `held` (n,) is the share of each cell's noise that is in the estimate too (`held.share`), and goes off
+    twice; what is not in it stays. For a difference of two epochs add both; what a reference shares with both
+    cancels. Source: EQUATIONS 6.2; Hartzell et al. (2015), Eq. 14 and 21, lack the second term.
     """
-    g, lines = felt.total(weights), felt.by_line(weights) @ leans_between(felt.of).left
-    own = lines**2 @ line_variances(felt.of, unknown)
-    return float(np.sum(weights**2 * random_variance_m2) + g @ unknown.covariance @ g + own)
+    left, own_rad2 = leans_between(felt.of).left, line_variances(felt.of, unknown)
+    random_m2, free = weights**2 * random_variance_m2, np.ones(1) if held is None else 1 - held
+    rest = weights * (2 * free - 1)
+    shared_m2 = float(felt.total(weights) @ unknown.covariance @ felt.total(rest))
+    shared_m2 += float(((felt.by_line(weights) @ left) * own_rad2) @ (felt.by_line(rest) @ left))
+    return max(float(np.sum(random_m2)) + shared_m2, float(np.sum(random_m2 * free)))
 
 
 @dataclass(frozen=True)

@@ -220,13 +220,23 @@ def variance(of: Volume, covariance_m2: Floats, offset_m: Floats, basis: Basis, 
     return aggregate_variance(weights, own_m2, felt, unknown)
 
 
-def shared_contributions(weights: Floats, felt: Sensitivities, unknown: Shared) -> Floats:
+def shared_contributions(
+    weights: Floats, felt: Sensitivities, unknown: Shared, held: Floats | None = None
+) -> Floats:
     """What each cell or point (n,) adds to the variance of a weighted sum of heights by what all share.
 
     With a² σ_r², its own, they sum up to `shared.aggregate_variance`. One below nought takes away from what
-    others add, as on the other side of a tilt's axis.
+    others add, as on the other side of a tilt's axis, or as noise does that is in the estimate too (`held`).
     Source: EQUATIONS 6.2, term by term: a J C g.
     """
+    if held is None:
+        return weights * _shared_with(weights, felt, unknown)
+    free_m2 = _shared_with(weights * (1 - held), felt, unknown)
+    return weights * (free_m2 - held * _shared_with(weights, felt, unknown))
+
+
+def _shared_with(weights: Floats, felt: Sensitivities, unknown: Shared) -> Floats:
+    """Covariance (n,) of each height with a weighted sum of them, by what all share."""
     of = felt.of
     back = unknown.covariance @ felt.total(weights)
     lean, bend, aside = np.split(back[len(GLOBAL) :], [of.lean_count, of.lean_count + of.refraction_count])
@@ -234,13 +244,12 @@ def shared_contributions(weights: Floats, felt: Sensitivities, unknown: Shared) 
     bend_before, bend_after, bend_share = felt.refraction_knot()
     left = leans_between(of).left
     own = left @ (line_variances(of, unknown) * (felt.by_line(weights) @ left))
-    height_m2 = (
+    return np.asarray(
         back[: len(GLOBAL)] @ felt.globals_
         + felt.lean * (lean[lean_before] * (1 - lean_share) + lean[lean_after] * lean_share + own[felt.line])
         + felt.refraction * (bend[bend_before] * (1 - bend_share) + bend[bend_after] * bend_share)
         + felt.across * (aside[bend_before] * (1 - bend_share) + aside[bend_after] * bend_share)
     )
-    return np.asarray(weights * height_m2)
 
 
 def net_variance(on_m6: float, off_m6: float) -> float:

@@ -17,6 +17,7 @@ import numpy as np
 
 from station import __version__
 from station.archive import store
+from station.archive.aggregate import SLACK
 from station.archive.layout import Series, kept_of
 from station.archive.outlooks import kept_outlook
 from station.archive.reference import current, open_reference, write_reference
@@ -222,6 +223,7 @@ def _measure(
     numbers = _numbers(measured, gathered, reader.header.point_count)
     if levelled is not None and outlook is not None:
         numbers |= stable_figures(measured, outlook) | {"change_step": levelled[1].change_step_m}
+        numbers |= dict(zip(SLACK, levelled[1].slack_m2, strict=True))
     doubts, late = _log_against_ground(levelled, reference)
     word, reason = verdict.judge(
         flag,

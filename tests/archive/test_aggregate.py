@@ -17,7 +17,7 @@ from station.archive.reference import write_reference
 from station.archive.series import build_series
 from station.errors import StoreError
 from station.quantities import Grid, Habits, Measurement, Reference, Shared, Surface
-from station.science import prior, shared
+from station.science import ground, prior, shared
 from station.science.adjustment import adjust
 from station.science.patches import Patches
 from station.science.voids import area_weights, void_variance
@@ -244,6 +244,48 @@ def test_a_difference_has_both_and_nothing_of_the_reference(filled):
             assert told == pytest.approx(total, rel=1e-4)
             assert told == pytest.approx(found.variance(weights, found.row(JOINT), found.row(NONE)))
             assert station.variance(filled.folder, weights, NONE, JOINT) == told
+
+
+def test_noise_that_is_in_the_estimate_too_goes_off_a_difference(filled):
+    """Σ a² σ² + aᵀ Σ (a - 2 s a), dense, with a share s by kind of cell; against the reference as before."""
+    slack_m2 = {"adjustment_slack_moving": 4e-4, "adjustment_slack_stable": 1e-4}
+    rng = np.random.default_rng(5)
+    for hour in (12, 13):
+        told = epoch(hour, "joint", drawn(hour, 0.02))
+        rock = np.where(rng.uniform(size=GRID.shape) < 0.4, 8, 0).astype(np.uint8)
+        measured = replace(
+            told.measurement, quality=np.where(told.measurement.quality, rock, 0).astype(np.uint8)
+        )
+        store.write_epoch(filled, replace(told, measurement=measured, numbers=SCANNER | slack_m2))
+    build_series(filled)
+    found = Aggregates(filled)
+    kept_out = ground.withheld(*np.meshgrid(GRID.x_m, GRID.y_m))
+    assert 0 < kept_out.sum() < kept_out.size
+    with station.open(filled.folder) as ds, xr.open_dataset(filled.folder / "reference.nc") as master:
+        before_m2 = master.reference_random_uncertainty.values.astype(float) ** 2
+        for weights, counted in boxes(ds, -2, -1):
+            total, apart = 0.0, 0.0
+            for index in (-2, -1):
+                sigma_m = ds.elevation_change_random_uncertainty[index].values.astype(float)
+                own_m2 = np.maximum(sigma_m**2 - before_m2, 0)
+                stable = (ds.quality[index].values.astype(int) & 8) > 0
+                slack = np.where(stable, 1e-4, 4e-4)
+                held = np.where(stable & kept_out, 0.0, own_m2 / (own_m2 + before_m2 + slack))
+                random = np.nansum(counted**2 * own_m2)
+                held = np.where(counted != 0, counted * held, 0.0)
+                both, alone, rest = (
+                    wanted(ds, of, index, random_m2=0 * own_m2) for of in (counted + held, counted, held)
+                )
+                told_m2 = random + alone - (both - alone - rest)
+                assert told_m2 > np.nansum(counted * (counted - held) * own_m2)  # else that is what is told
+                total, apart = total + told_m2, apart + random + alone
+            told = found.variance(weights, found.row(-2), found.row(-1))
+            assert told == pytest.approx(total, rel=1e-4)
+            assert abs(told - apart) > 1e-3 * apart
+            alone = found.variance(counted, found.row(-1))
+            assert alone == pytest.approx(wanted(ds, counted, -1), rel=1e-4)
+            volume = station.volume(filled.folder, weights > 0, -1, -2)
+            assert float(volume.variance_share.sum()) == pytest.approx(1)
 
 
 def test_an_epoch_without_shared_parameters_is_random_alone(filled):

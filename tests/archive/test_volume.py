@@ -50,7 +50,8 @@ def test_volume_and_its_sigmas(site, box, pair):
     assert told.volume_change_uncertainty == pytest.approx(variance**0.5)
     published_m6 = area_m2**2 * sum((one**2).sum() for one in sigma_m)
     assert told.volume_change_uncertainty_hartzell2015 == pytest.approx(published_m6**0.5)
-    assert told.volume_change_uncertainty > told.volume_change_uncertainty_hartzell2015
+    if len(pair) == 1:  # of a difference goes off what held both scans
+        assert told.volume_change_uncertainty > told.volume_change_uncertainty_hartzell2015
     assert told.volume_change_random_uncertainty < told.volume_change_uncertainty_hartzell2015
     assert (told.area_size, told.coverage) == (cells.sum() * area_m2, 1.0)
 

@@ -441,6 +441,34 @@ def test_an_avalanche_stays_where_it_is():
     assert struck.change_step_m <= 0.005
 
 
+def thin_snow(seed, risen_m):
+    """Errors over sigmas, and errors, where glacier and all but steep rock changed by as much."""
+    rng = np.random.default_rng(seed)
+    _, root = prior_of(OF)
+    state = root @ rng.normal(size=len(root))
+    stable, glacier, cells = (
+        ground(seed + 90, 1500, steep=2.0),
+        ground(seed + 95, 1500, steep=0.3),
+        ground(99, 200),
+    )
+    lies = np.hypot(stable.east, stable.north) < np.tan(np.radians(40)) if risen_m > 0 else 0.0
+    seen = together(
+        stable.patches(stable.matrix() @ state + rng.normal(0, 0.003, 1500) + risen_m * lies, 0.003),
+        glacier.patches(glacier.matrix() @ state + rng.normal(0, 0.003, 1500) + risen_m, 0.003, Kind.MOVING),
+    )
+    found = adjust(seen, STILL, known_before(OF), None)
+    error_m = cells.matrix() @ state - found.effect(cells.felt())
+    return error_m / sigmas(found, cells), error_m
+
+
+def test_snow_too_thin_to_be_seen_on_rock_is_not_taken_for_a_rise_of_the_scanner():
+    z, error_m = (np.array(one) for one in zip(*(thin_snow(seed, 0.006) for seed in range(6)), strict=True))
+    assert np.abs(error_m.mean(axis=1)).max() < 0.003  # 6 mm if it were
+    assert np.sqrt(np.mean(z**2)) < 1.3
+    sigma_m, melting_m = (np.median(np.divide(*thin_snow(7, change)[::-1])) for change in (0.006, -0.006))
+    assert melting_m < sigma_m  # where ground falls, rock stays what it is
+
+
 def test_a_reference_that_is_wrong_itself_makes_the_prior_wider():
     p = len(OF.names)
     root = np.random.default_rng(80).normal(size=(p, p)) * 1e-5

@@ -70,7 +70,7 @@ class Scan:
             right += FELT.T @ np.linalg.solve(noise, log.lean_rad)
         covariance = np.linalg.inv(normal)
         unknown = SimpleNamespace(by_line=lambda: covariance)
-        return Adjustment(OF, covariance @ right, unknown, 0.001, np.ones(9))
+        return Adjustment(OF, covariance @ right, unknown, 0.001, np.ones(9), (1.0, 1.0))
 
     def told(self, log):
         return sensor.expected(LINES, log, self.adjusted(log))
@@ -102,7 +102,7 @@ def test_lines_without_a_log_do_not_count():
     )
     covariance = alone.covariance - gain @ np.linalg.solve(spread, gain.T)
     unknown = SimpleNamespace(by_line=lambda: covariance)
-    told = sensor.expected(LINES, with_gap, Adjustment(OF, estimate, unknown, 0.001, np.ones(9)))
+    told = sensor.expected(LINES, with_gap, Adjustment(OF, estimate, unknown, 0.001, np.ones(9), (1.0, 1.0)))
     assert told.ground_rad[::-1] == pytest.approx((FELT @ alone.estimate)[kept], abs=1e-9)
 
 
