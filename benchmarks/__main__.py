@@ -15,6 +15,7 @@ from typing import Any
 from benchmarks.cost import Cost, FailedError, cost_of, job_cost, middle
 from benchmarks.peers import M3C2, PEERS, Peer, Work, take
 from benchmarks.ratios import Row, show
+from station.service.child import SURROUNDINGS
 
 ROUNDS = 3  # and scans, of each the median
 MUST_PEAK_GB = 0.9
@@ -41,8 +42,8 @@ class Run:
         return QUICK_SIZE if self.quick else 1.0
 
     def own(self, job: str, **told: object) -> tuple[Cost, dict[str, Any]]:
-        """Run a job of the station."""
-        return job_cost("benchmarks.own", job, self.folder, **told)
+        """Run a job of the station, as its service runs its children."""
+        return job_cost("benchmarks.own", job, self.folder, SURROUNDINGS, **told)
 
     def decode(self, scan: str) -> Cost:
         """Return the floor of a scan."""

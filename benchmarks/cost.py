@@ -51,12 +51,14 @@ def cost_of(command: Sequence[str], folder: Path, env: dict[str, str] | None = N
     return Cost(used.ru_utime + used.ru_stime, wall_s, used.ru_maxrss * 1024 / 1e9), said
 
 
-def job_cost(module: str, name: str, cwd: Path, /, **told: object) -> tuple[Cost, dict[str, Any]]:
+def job_cost(
+    module: str, name: str, cwd: Path, env: dict[str, str] | None = None, /, **told: object
+) -> tuple[Cost, dict[str, Any]]:
     """Run one job of a module of the benchmark; return what it took without its imports, and its figures."""
     command = [sys.executable, "-m", module, name, json.dumps(told)]
     root = str(Path(__file__).parents[1])
     path = os.pathsep.join([root, *filter(None, [os.environ.get("PYTHONPATH")])])
-    cost, said = cost_of(command, cwd, {"PYTHONPATH": path})
+    cost, said = cost_of(command, cwd, {"PYTHONPATH": path} | (env or {}))
     figures = json.loads(said.strip().splitlines()[-1])
     startup_s = figures.pop("startup_s")
     return Cost(cost.cpu_s - startup_s, cost.wall_s - startup_s, cost.peak_gb, startup_s), figures

@@ -24,7 +24,7 @@ from station.errors import StoreError
 from station.quantities import Shots
 from station.readers.las import LasScan
 from station.readers.scan import ScanReader, utc_interval
-from station.service import child, tasks
+from station.service import tasks
 from station.service.gather import Gathered, gather
 from station.service.journal import Journal, State
 from station.service.places import arrival_of
@@ -219,6 +219,5 @@ def _quiet() -> None:
 
 
 if __name__ == "__main__":
-    os.environ |= child.SURROUNDINGS
     jobs = make, work, hot, chunks, epoch, referenced, served, serve, epochs
     run_job({job.__name__: job for job in jobs})
