@@ -11,7 +11,8 @@ import netCDF4
 import numpy as np
 
 from station.archive.aggregate import Aggregates
-from station.archive.layout import Series, define, lay_out, put_raster, written_whole
+from station.archive.layout import Series, define, lay_out, written_whole
+from station.archive.rasters import write_rasters
 from station.archive.store import Row, said
 from station.archive.variables import Variable
 from station.errors import StoreError
@@ -121,18 +122,22 @@ class Attribution:
 
     def write(self, path: Path) -> None:
         """Write the shares as maps to a NetCDF file; raise StoreError where it cannot."""
-        with written_whole(path) as beside, netCDF4.Dataset(beside, "w", clobber=False) as file:
-            title = f"What makes the elevation change of {self.series.name or self.series.station_id} unsure"
-            lay_out(file, self.series, title, None)
-            file.setncattr("epoch_file", self.row.epoch_file)
-            maps = {row.name: np.full(self.cells.shape, np.nan, np.float32) for row in ROWS}
-            place = np.flatnonzero(self.cells)
-            for first in range(0, len(place), LOOKED_AT):
-                part = slice(first, first + LOOKED_AT)
-                for name, share in self.shares(part).items():
-                    maps[f"share_{name}"].ravel()[place[part]] = share
-            for row in ROWS:
-                put_raster(define(file, row, self.series, 1), None, maps[row.name])
+        maps = {row.name: np.full(self.cells.shape, np.nan, np.float32) for row in ROWS}
+        place = np.flatnonzero(self.cells)
+        for first in range(0, len(place), LOOKED_AT):
+            part = slice(first, first + LOOKED_AT)
+            for name, share in self.shares(part).items():
+                maps[f"share_{name}"].ravel()[place[part]] = share
+        with written_whole(path) as beside:
+            with netCDF4.Dataset(beside, "w", clobber=False) as file:
+                title = (
+                    f"What makes the elevation change of {self.series.name or self.series.station_id} unsure"
+                )
+                lay_out(file, self.series, title, None)
+                file.setncattr("epoch_file", self.row.epoch_file)
+                for row in ROWS:
+                    define(file, row, self.series, 1)
+            write_rasters(beside, ((row, maps[row.name]) for row in ROWS))
 
 
 def attribute(series: Series, epoch: int | str) -> Attribution:

@@ -247,24 +247,6 @@ def attributes(row: Variable, *, mapped: bool) -> dict[str, Any]:
     return told
 
 
-def put_raster(variable: netCDF4.Variable[Any], at: int | None, values: np.ndarray[Any, Any]) -> None:
-    """Write a raster (ny, nx), NaN as fill, chunk by chunk; chunks that are all NaN are left unwritten."""
-    if values.dtype.kind in "iu":  # nought is a value and has no fill
-        variable[... if at is None else at] = values
-        return
-    ny, nx = values.shape
-    if at is not None:  # else a variable without any value would be shorter than time
-        variable[at, 0, 0] = np.ma.masked
-    for top in range(0, ny, CHUNK):
-        for left in range(0, nx, CHUNK):
-            tile = values[top : top + CHUNK, left : left + CHUNK]
-            seen = np.isfinite(tile)
-            if not seen.any():
-                continue
-            place = (slice(top, top + tile.shape[0]), slice(left, left + tile.shape[1]))
-            variable[place if at is None else (at, *place)] = np.ma.masked_array(tile, ~seen)
-
-
 def text(values: Sequence[str], dim: str) -> np.ndarray[Any, Any]:
     """Return strings as characters (n, length), cut and filled with NUL."""
     length = TEXT_LENGTH[dim]

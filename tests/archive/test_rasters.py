@@ -4,7 +4,7 @@ import netCDF4
 import numpy as np
 import pytest
 
-from station.archive.layout import Series, define, lay_out, put_raster
+from station.archive.layout import Series, define, lay_out
 from station.archive.rasters import Raster, write_rasters
 from station.archive.variables import BY_NAME, FILL
 from station.errors import StoreError
@@ -36,7 +36,7 @@ def written(path, way):
         made = {name: define(file, BY_NAME[name], series, 1) for name in NAMES}
         if way == "library":
             for name, raster in values().items():
-                put_raster(made[name], 0, raster)
+                made[name][0] = np.ma.masked_invalid(raster)
     if way == "own":
         write_rasters(path, [(BY_NAME[name], raster) for name, raster in values().items()])
     return path
