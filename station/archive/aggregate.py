@@ -9,7 +9,7 @@ import netCDF4
 import numpy as np
 
 from station.archive.layout import Series, strings
-from station.archive.reference import read_reference
+from station.archive.reference import open_reference
 from station.archive.store import Row, rows
 from station.errors import StoreError
 from station.quantities import Bools, Floats, Grid, Quality, Reference, Shared
@@ -74,7 +74,7 @@ class Aggregates:
         Raises StoreError where it is not there.
         """
         if version not in self._references:
-            found = read_reference(self._series, version)
+            found = open_reference(self._series, version)
             if found is None:
                 raise StoreError(f"{self._series.folder}: no reference {version or 'yet'}: nothing to sum up")
             self._references[version] = found
@@ -184,7 +184,8 @@ class Aggregates:
         grid, (row, column) = self._series.grid, np.nonzero(chosen)
         kept_out = ground.withheld(grid.x_m[column], grid.y_m[row])
         known = (quality & Quality.STABLE_GROUND) > 0
-        kind = ground.kinds(known, kept_out, np.hypot(*felt.globals_[3:5]), np.zeros_like(known))
+        smooth = np.hypot(*felt.globals_[3:5]) < ground.MOVING_STEEPEST
+        kind = ground.kinds(known, kept_out, smooth, np.zeros_like(known))
         random_m2 = own_m2 + one.reference.random_variance_m2[chosen]
         return share(own_m2, random_m2, kind, (moving, stable))
 

@@ -155,7 +155,7 @@ def attribute(series: Series, epoch: int | str) -> Attribution:
     seen = (
         np.isfinite(held.change_m)
         & np.isfinite(held.random_m)
-        & np.isfinite(held.reference.elevation_m.ravel())
+        & np.isfinite(np.asarray(held.reference.elevation_m).ravel())
     )
     cells = seen.reshape(series.grid.shape)
     return Attribution(

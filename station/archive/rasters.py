@@ -152,11 +152,14 @@ class Raster:
         """What the values are."""
         return np.asarray(self[:1]).dtype
 
-    def __getitem__(self, rows: slice | Array) -> Array:
-        """Return some rows (r, nx)."""
+    def __getitem__(self, rows: slice | tuple[slice, slice] | Array) -> Array:
+        """Return some rows (r, nx), of some columns, or the chosen cells (n,) of a mask (ny, nx)."""
+        if isinstance(rows, tuple):
+            return self[rows[0]][:, rows[1]]
         if isinstance(rows, np.ndarray):
-            first, last = int(rows.min()), int(rows.max())
-            return np.asarray(self[first : last + 1][rows - first])
+            there = np.flatnonzero(rows.any(axis=1))
+            box = slice(there[0], there[-1] + 1) if len(there) else slice(0, 1)
+            return np.asarray(self[box][rows[box]])
         first, stop, step = rows.indices(self.shape[0])
         height = self._size[0]
         bands = range(first - first % height, stop, height)

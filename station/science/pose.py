@@ -53,8 +53,8 @@ def lean(xyz_m: tuple[Floats, Floats, Floats], time_s: Floats, tilt: Tilt) -> tu
     Source: Hartzell et al. (2015), Eq. 5, which adds it to the chain of Eq. 4.
     """
     x_m, y_m, z_m = xyz_m
-    sin_r, cos_r = _sin_cos(time_s, tilt.time_s, tilt.roll_rad)
-    sin_p, cos_p = _sin_cos(time_s, tilt.time_s, tilt.pitch_rad)
+    sin_r, sin_p = _sines(time_s, tilt)
+    cos_r, cos_p = np.sqrt(1 - sin_r * sin_r), np.sqrt(1 - sin_p * sin_p)
     rolled_z_m = sin_r * y_m + cos_r * z_m
     return (
         cos_p * x_m + sin_p * rolled_z_m,
@@ -63,19 +63,19 @@ def lean(xyz_m: tuple[Floats, Floats, Floats], time_s: Floats, tilt: Tilt) -> tu
     )
 
 
-def _sin_cos(time_s: Floats, knot_s: Floats, angle_rad: Floats) -> tuple[Floats, Floats]:
-    """Sine and cosine (n,) of a lean below 90° that is linear between knots (k,).
+def _sines(time_s: Floats, tilt: Tilt) -> tuple[Floats, Floats]:
+    """Sines (n,) of roll and pitch, both below 90°, that are linear between the knots of a tilt.
 
     A sine of each shot would be a quarter of the way to the map; between knots `KNOT_RAD` apart it is a line
-    but for 1e-11.
+    but for 1e-11. Both are looked up at once, as one complex number.
     """
-    steps = np.ceil(np.abs(np.diff(angle_rad)) / KNOT_RAD).astype(np.int64)
+    knots = np.stack([tilt.time_s, tilt.roll_rad, tilt.pitch_rad])
+    steps = np.ceil(np.abs(np.diff(knots[1:])).max(axis=0, initial=0.0) / KNOT_RAD).astype(np.int64)
     if steps.max(initial=0) > 1:
         along = np.concatenate([[0.0], np.cumsum(np.maximum(steps, 1))])
-        fine = np.arange(along[-1] + 1)
-        knot_s, angle_rad = np.interp(fine, along, knot_s), np.interp(fine, along, angle_rad)
-    sine = np.interp(time_s, knot_s, np.sin(angle_rad))
-    return sine, np.sqrt(1 - sine * sine)
+        knots = np.stack([np.interp(np.arange(along[-1] + 1), along, one) for one in knots])
+    sines = np.interp(time_s, knots[0], np.sin(knots[1]) + 1j * np.sin(knots[2]))
+    return np.ascontiguousarray(sines.real), np.ascontiguousarray(sines.imag)
 
 
 @dataclass(frozen=True)

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import ndimage
 
-from station.quantities import Bools, Floats, Floats32, Grid, Ints, Reference
+from station.quantities import Bools, Floats, Floats32, Grid, Ints, Reals, Reference
 
 ALL = slice(None)
 BAND_ROWS = 128  # looked at together: what a store chunk is high
@@ -88,9 +88,16 @@ class Ground:
     known: Bools
 
     def height(self, column: Floats, row: Floats) -> Floats:
-        """Height of the surface below points (n,) [m], as `under`."""
+        """Height of the surface below points (n,) [m], as `under`.
+
+        What lies between the nodes is a metre or two, which single precision holds to a micrometre.
+        """
         nw, ne, sw, se, u, v = self._corners(column, row)
-        return self._height(nw + (ne - nw) * u, sw + (se - sw) * u, v)
+        east, south = ne - nw, sw - nw
+        u, v = u.astype(np.float32), v.astype(np.float32)
+        rise_m = self.datum_m + nw.astype(np.float64)
+        rise_m += east * u + (south + (se - sw - east) * u) * v
+        return rise_m
 
     def under(self, column: Floats, row: Floats) -> tuple[Floats, Floats, Floats]:
         """Height [m] and rise per metre eastward and northward below points (n,).
@@ -98,21 +105,19 @@ class Ground:
         Points are in cells from the north-west corner of the grid; the answer means something where the
         point's own cell is known.
         """
-        nw, ne, sw, se, u, v = self._corners(column, row)
+        *rises, u, v = self._corners(column, row)
+        nw, ne, sw, se = (rise.astype(np.float64) for rise in rises)
         north_side, south_side = nw + (ne - nw) * u, sw + (se - sw) * u
         east = ((ne - nw) * (1 - v) + (se - sw) * v) / self.grid.cell_m
         north = (north_side - south_side) / self.grid.cell_m
-        return self._height(north_side, south_side, v), east, north
+        return self.datum_m + north_side + (south_side - north_side) * v, east, north
 
     def cell_means(self, rows: slice) -> Floats:
         """Mean height over each cell (r, nx) of some rows [m]."""
         around = _around(rows)
         return self.datum_m + cell_means(self.rise_m[around])[rows.start - around.start :][: _height(rows)]
 
-    def _height(self, north_side: Floats, south_side: Floats, v: Floats) -> Floats:
-        return self.datum_m + north_side + (south_side - north_side) * v
-
-    def _corners(self, column: Floats, row: Floats) -> tuple[Floats, ...]:
+    def _corners(self, column: Floats, row: Floats) -> tuple[Reals, ...]:
         """Rise of the nodes nw, ne, sw, se of points (n,); how far east and south of nw they are [cells]."""
         nx, ny = self.grid.nx, self.grid.ny
         # Half a cell within the border of the grid the last slope goes on; -0.5 counts as nought.
@@ -121,8 +126,7 @@ class Ground:
         first = top * nx + left
         right, below = min(nx - 1, 1), min(ny - 1, 1) * nx
         rises = [self.rise_m.ravel().take(first + there) for there in (0, right, below, below + right)]
-        nw, ne, sw, se = (rise.astype(np.float64) for rise in rises)
-        return nw, ne, sw, se, column - 0.5 - left, row - 0.5 - top
+        return (*rises, column - 0.5 - left, row - 0.5 - top)
 
 
 def cell_means(nodes: Floats | Floats32) -> Floats:

@@ -71,8 +71,11 @@ def test_rows_are_those_of_the_whole(tmp_path):
     write_rasters(path, [(plane, given)])
     raster = Raster(path, plane.name, lambda found: np.where(found == np.float32(FILL), np.nan, found))
     assert np.array_equal(np.asarray(raster), given, equal_nan=True)
-    for rows in (slice(0, 10), slice(120, 260), slice(290, 400), slice(5, 290, 3), np.array([3, 140, 299])):
-        assert np.array_equal(raster[rows], given[rows], equal_nan=True)
+    chosen = np.zeros(GRID.shape, bool)
+    nothing, chosen[125:140, 7:150:3] = chosen.copy(), True
+    rows = slice(0, 10), slice(120, 260), slice(290, 400), slice(5, 290, 3)
+    for part in (*rows, (slice(120, 130), slice(5, 140)), chosen, nothing):
+        assert np.array_equal(raster[part], given[part], equal_nan=True)
     assert (raster.shape, raster.dtype, len(raster)) == (GRID.shape, np.float32, GRID.ny)
 
 
