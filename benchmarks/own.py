@@ -85,7 +85,7 @@ class _LaidError(Exception):
 
 def chunks(site: str, scan: str) -> dict[str, float]:
     """Do the same as `hot` by the same functions, a million points at once and all of each decoded."""
-    with mock.patch.object(LasScan, "blocks", lambda self, **_: _millions(self.path)):
+    with mock.patch.object(LasScan, "blocks", lambda self, *_, **__: _millions(self.path)):
         return hot(site, scan)
 
 
