@@ -46,7 +46,7 @@ ALIKE_CHANGES = (0.0, 3.0, 10.0)
 # Log odds against the same: smooth errors of the air look like it too, but speak for it with tens at most, a
 # smooth snowfall with hundreds.
 ALIKE_ODDS = (0.0, 12.0, 24.0)
-ALIKE_AZIMUTH_KNOTS, ALIKE_RANGE_KNOTS = 1.5, 1.0
+ALIKE_AZIMUTH_KNOTS, ALIKE_RANGE_KNOTS = 4.0, 2.5
 # Where other ground rises, stable ground may lie under snow too thin to be told by its brightness.
 THIN_SNOW_M = 0.005  # one sigma, no more than of the change of other ground
 NO_SNOW_M = 1e-6
