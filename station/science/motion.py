@@ -21,7 +21,7 @@ FEWEST = 20  # scans of a series before steps are looked for
 HABITS_WORTH = 4  # scans of drift that the habits weigh against those of the series
 SUDDEN = 1 / 3  # of the habits, which hold what drifts over days, between two scans
 SIGMAS = 6.5  # of a step, before it is one
-AS_CLEAR = 0.9  # of the most significant place of a step, where another may fit better
+BESIDE = 3  # scans on either side of a step, that tell how sharp it is: a place beside it is as significant
 QUIET = 1.5  # sigmas of one scan's noise; less between medians of scans is not worth a closer look
 BEYOND = 0.5  # of its size, where a scan is taken to lie on its far side
 ROUNDS = 5
@@ -69,12 +69,12 @@ def steps(time_s: Floats, pose: Floats, habit: Floats) -> list[Step]:
 def _step_at(
     time_s: Floats, level: Floats, habit: Floats, since: int, drifts: dict[int, _Drift]
 ) -> Step | None:
-    """Return the most significant step after which just scans enough have come, if it is significant.
+    """Return the sharpest of the significant steps after which just scans enough have come, if any.
 
     `drifts` are those found before, by the last scan that each was learned from.
     """
     newest = len(level) - 1
-    found: list[tuple[Step, float]] = []
+    found: list[Step] = []
     for after in range(AFTER[0], AFTER[1] + 1):
         first = max(newest - after - BEFORE + 1, 0)
         if newest - after < since:
@@ -90,22 +90,18 @@ def _step_at(
         later = np.arange(first, newest + 1) > newest - after
         size, sigma, lasts = _fit(time_s[window], level[window], later, drift)
         sigmas = float(np.max(np.where(lasts, np.abs(size) / sigma, 0.0)))
-        here = _misfit(level[newest + 1 - AFTER[1] - LATELY :], after, drift)
         if sigmas > SIGMAS:
-            found.append((Step(newest - after, newest, size, sigma, sigmas), here))
-    clear = max((step.sigmas for step, _ in found), default=0.0) * AS_CLEAR
-    alike = [one for one in found if one[0].sigmas >= clear]  # with a scan on the wrong side it may be so
-    return min(alike, key=lambda one: one[1])[0] if alike else None
+            found.append(Step(newest - after, newest, size, sigma, sigmas))
+    if not found:
+        return None
+    noise = drifts[found[-1].last_before].noise  # one for all, of the scans before any of these places
+    return max(found, key=lambda step: _contrast(level, step.last_before, noise))
 
 
-def _misfit(level: Floats, after: int, drift: _Drift) -> float:
-    """How badly a step that many scans from the end fits poses (n, p), outliers counting little."""
-    middle = np.where(
-        (np.arange(len(level)) < len(level) - after)[:, None],
-        _median(level[:-after][-LATELY:]),
-        _median(level[-after:]),
-    )
-    return float(np.minimum((level - middle) ** 2 / drift.noise, SIGMAS**2).sum())
+def _contrast(level: Floats, last_before: int, noise: Floats) -> float:
+    """How much the poses (n, p) right after a scan differ from those up to it; one outlier does not count."""
+    before, after = level[: last_before + 1][-BESIDE:], level[last_before + 1 :][:BESIDE]
+    return float(((_median(after) - _median(before)) ** 2 / noise).sum())
 
 
 @dataclass(frozen=True)

@@ -25,7 +25,7 @@ from station.simulation.station import simulate
 HERE = Path(__file__).parent
 HOOKS = HERE / "hooks"
 RECORD = 96  # bytes a boundary takes, see hooks/boundaries.py
-PATIENCE_S = 60.0
+PATIENCE_S = 120.0  # a child that dies again and again is started anew after 1, 5 and 30 s
 SCANS = 6
 LATER = "later"  # where scans lie before they arrive
 NOT_VALUES = {"epoch_file"}  # a revision more or less is no other value
