@@ -25,6 +25,7 @@ BAND_ROWS = 128  # looked at together: what a store chunk is high
 MARGIN_ROWS = 4  # rows beyond a band that its smoothed gradient looks at
 MOVING_MOST = 400_000  # cells of moving ground that an adjustment looks at
 STABLE_MOST = 800_000  # the same of stable ground, in whole rows; so many tell all there is to tell
+TOGETHER = 50_000  # cells of a sector where nobody knows the head
 HIGH_INCIDENCE_COS = float(np.cos(np.radians(80.0)))
 
 SINGLES = [
@@ -187,9 +188,13 @@ def look(
         first = end
     stable_ones = (cells["trait"] & np.uint8(Trait.STABLE)) > 0
     looked_at, one_in = _looked_at(grid, cells["cell"], stable_ones)
-    place = 2 * cells["passed"].astype(np.int16) + ~looked_at
+    if of is None:  # any parts will do that are small
+        part, parts = np.arange(count, dtype=np.int32) // TOGETHER, count // TOGETHER + 1
+    else:
+        part, parts = cells["passed"].astype(np.int32), of.intervals
+    place = 2 * part + ~looked_at
     order = np.argsort(place, kind="stable")
-    bounds = np.searchsorted(place[order], np.arange(2 * (of.intervals if of else 1) + 1))
+    bounds = np.searchsorted(place[order], np.arange(2 * parts + 1))
     for name in cells:  # one after the other: together they are the most that a scan needs
         cells[name] = cells[name][order]
     surface = below.datum_m, below.rise_m, below.known

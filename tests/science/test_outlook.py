@@ -98,8 +98,11 @@ def test_single_precision_is_enough_for_what_cells_share():
             assert np.sqrt(single.variance(told)) == pytest.approx(np.sqrt(double.variance(told)), rel=1e-3)
 
 
-def test_without_a_place_there_is_one_sector_in_the_order_of_the_grid():
-    seen_from = look(plane(), STABLE, VZ6000, None)
-    (only,) = seen_from.sectors()
+def test_without_a_place_sectors_are_parts_of_the_grid(monkeypatch):
+    (only,) = look(plane(), STABLE, VZ6000, None).sectors()
     assert np.array_equal(only.cell, np.flatnonzero(KNOWN))
     assert only.scatter_m2 == pytest.approx(0.010**2)
+    monkeypatch.setattr(outlook, "TOGETHER", 1000)
+    parts = list(look(plane(), STABLE, VZ6000, None).sectors())
+    assert max(map(len, parts)) == 1000
+    assert np.array_equal(np.concatenate([part.cell for part in parts]), only.cell)
