@@ -6,6 +6,7 @@ Only a memory: named after all that it was made from, and where it is gone or da
 from __future__ import annotations
 
 import os
+import weakref
 from collections.abc import Callable
 from contextlib import suppress
 from hashlib import sha256
@@ -50,7 +51,10 @@ def kept_outlook(
         made = look()
         if not _write(path, made):
             return made
-    return _open(path, reference, *place)
+    try:
+        return _open(path, reference, *place)
+    except FileNotFoundError:  # another process, which needs others, has just let it go
+        return look()
 
 
 def _write(path: Path, made: Outlook) -> bool:
@@ -79,6 +83,7 @@ def _write(path: Path, made: Outlook) -> bool:
 
 
 def _open(path: Path, reference: Reference, position_m: Position | None, axis: Position) -> Outlook:
+    kept = _Kept(path)
     try:
         with h5py.File(path, "r") as file:
             frame = file["bounds"][:]
@@ -86,10 +91,12 @@ def _open(path: Path, reference: Reference, position_m: Position | None, axis: P
                 raise _damaged(path)
             bounds, datum_m = frame[:-3], float(frame[-1:].view(np.float64)[0])
             held = {
-                name: _Plain(path, file[name], _edges(len(file[name])) if name in DENSE else bounds)
+                name: _Plain(path, kept, file[name], _edges(len(file[name])) if name in DENSE else bounds)
                 for name in file
                 if name != "bounds"
             }
+    except FileNotFoundError:
+        raise
     except (OSError, KeyError, RuntimeError, TypeError, ValueError) as error:
         raise _damaged(path) from error
     rise_m, known = (held.pop(name) for name in DENSE)
@@ -98,11 +105,20 @@ def _open(path: Path, reference: Reference, position_m: Position | None, axis: P
     return Outlook(reference, of, position_m, datum_m, rise_m, known, bounds, one_in, held)  # type: ignore[arg-type] # sliced only
 
 
+class _Kept:
+    """A file that stays readable when another process lets it go, until nobody here needs it."""
+
+    def __init__(self, path: Path) -> None:
+        self.descriptor = os.open(path, os.O_RDONLY)
+        weakref.finalize(self, os.close, self.descriptor)
+
+
 class _Plain:
     """An array of a file, read as it is sliced; parts with a checksum of their own are held against it."""
 
-    def __init__(self, path: Path, dataset: h5py.Dataset, edges: Ints) -> None:
+    def __init__(self, path: Path, kept: _Kept, dataset: h5py.Dataset, edges: Ints) -> None:
         self._path = path
+        self._kept = kept
         self._at = dataset.id.get_offset() or 0
         self._shape = dataset.shape
         self._dtype = dataset.dtype if dataset.dtype.kind != "b" else np.dtype(bool)
@@ -115,11 +131,12 @@ class _Plain:
         first, stop, step = rows.indices(self._shape[0])
         count = (stop - first) * self._row_bytes
         try:
-            values = np.fromfile(self._path, np.uint8, count, offset=self._at + first * self._row_bytes)
+            raw = os.pread(self._kept.descriptor, count, self._at + first * self._row_bytes)
         except OSError as error:
             raise StoreError(f"{self._path}: cannot be read: {error}") from error
-        if len(values) != count:
+        if len(raw) != count:
             raise _damaged(self._path)
+        values = np.frombuffer(raw, np.uint8)
         for number in range(*np.searchsorted(self._edges, (first, stop)).tolist()):
             begin, end = (int(row - first) * self._row_bytes for row in self._edges[number : number + 2])
             if end <= len(values) and _crc(values[begin:end]) != self._crc[number]:

@@ -94,6 +94,12 @@ def test_a_damaged_one_is_told_deleted_and_made_anew(series, place):
     assert files(series) == []
 
 
+def test_one_that_another_process_lets_go_stays_readable(series):
+    kept = made(series, [])()
+    files(series)[0].unlink()
+    same(kept, look(open_reference(series, "1"), np.zeros(GRID.shape, bool), VZ6000, PLACE[0]))
+
+
 def test_where_there_is_no_room_it_is_made_each_time(series, monkeypatch):
     calls = []
     get = made(series, calls)
