@@ -37,7 +37,7 @@ from station.archive.reference import write_reference
 from station.archive.series import build_series
 from station.archive.sources import Source, read_source
 from station.config import Site, read_site
-from station.quantities import Bools, Grid, Measurement, Reference, Shared, Surface
+from station.quantities import Bools, Grid, Measurement, Reference, Shared
 from station.science.shared import basis
 from station.service.journal import Entry, Journal, State
 from station.service.show import show
@@ -119,14 +119,23 @@ def epoch_of(grid: Grid, start: datetime, seen: float = 0.31) -> store.Epoch:
     change_m = random_m * random.normal(size=grid.shape).astype(np.float32)
     change_m -= np.where(_patchy(np.random.default_rng(2), grid, 0.5), np.float32(0.2), np.float32(0.0))
     count = np.where(there, random.poisson(3, grid.shape) + 1, 0).astype(np.int32)
-    surface = Surface(grid, 2800.0 + change_m, change_m, count, random_m)
+    measured = Measurement.of(
+        grid,
+        there.astype(np.uint8),
+        elevation_m=2800.0 + change_m,
+        change_m=change_m,
+        uncertainty_m=np.hypot(random_m, 0.01),
+        random_uncertainty_m=random_m,
+        spread_m=random_m,
+        count=count,
+    )
     of = basis(grid, (grid.west_m, grid.north_m, 3200.0))
     size = len(of.names)
     return store.Epoch(
         start_s=start.timestamp(),
         end_s=start.timestamp() + 900,
         scan_id=f"{start:%y%m%d_%H%M%S}",
-        measurement=Measurement(surface, np.hypot(random_m, 0.01), random_m, there.astype(np.uint8), {}),
+        measurement=measured,
         shared=Shared(
             of.names, of.units, random.normal(size=size) * 1e-5, np.eye(size) * 1e-10, np.zeros(size)
         ),
@@ -268,7 +277,8 @@ def reading(folder: Path) -> dict[str, float]:
         held = [replace(one, shapes=_only(one, READ)) for one in _turns(series, group, SEEN_OF_A_YEAR)]
         join.write_joined(series, held, path, name, lambda: None)
     build_series(series)
-    seen = np.isfinite(epoch_of(FULL, starts[0], SEEN_OF_A_YEAR).measurement.surface.change_m)
+    measured = epoch_of(FULL, starts[0], SEEN_OF_A_YEAR).measurement
+    seen = np.isfinite(measured.laid(measured.change_m)[0])
     share = ndimage.uniform_filter(seen.astype(np.float32), 100)
     row, column = np.unravel_index(np.argmax(share), FULL.shape)  # where all is seen
     box = slice(row - 50, row + 50), slice(column - 50, column + 50)

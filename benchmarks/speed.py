@@ -86,10 +86,11 @@ def _reference(grid: Grid, seen: Bools) -> Reference:
 
 
 def _filled(random: np.random.Generator, gridder: Gridder, seen: Bools) -> Gridder:
-    cell = np.flatnonzero(seen.ravel())
+    row, column = np.nonzero(seen)
     for _ in range(POINTS_A_CELL):
-        residual_m = random.normal(0, NOISE_M, len(cell))
-        gridder.add(cell, residual_m, np.full(len(cell), 0.5))
+        residual_m = random.normal(0, NOISE_M, len(row))
+        number = gridder.numbered(column, row)
+        gridder.add(number, residual_m, np.full(len(number), 0.5))
     return gridder
 
 

@@ -88,9 +88,9 @@ def to_map(shots: Shots, pose: Pose) -> Points:
 def lay(gridder: Gridder, points: Points, intensity: Floats | None = None) -> None:
     """Add points on the map to the grid, as residuals to the reference where it is known."""
     inside, column, row = gridder.cells(points[0], points[1])
-    cell = gridder.flat(column, row)
-    residual_m = points[2][inside] - gridder.below(cell, column, row)
-    gridder.add(cell, residual_m, None if intensity is None else intensity[inside])
+    number = gridder.numbered(column, row)
+    residual_m = points[2][inside] - gridder.below(number, column, row)
+    gridder.add(number, residual_m, None if intensity is None else intensity[inside])
 
 
 @dataclass(frozen=True)
@@ -117,12 +117,12 @@ def level(gridder: Gridder, setup: Setup, told: Told, outlook: Outlook) -> Adjus
 
 def _cells(gridder: Gridder, outlook: Outlook) -> Iterator[Cells]:
     """Give the cells that an adjustment looks at, as the head comes by."""
-    for whole in outlook.sectors(looked_at=True):
-        seen = gridder.at(whole.cell).count > 0
+    for first, whole in outlook.sectors(looked_at=True):
+        sums = gridder.sums(first, first + len(whole))
+        seen = sums.count > 0
         if not seen.any():
             continue
-        sector = whole.some(seen)
-        sums = gridder.at(sector.cell)
+        sector, sums = whole.some(seen), sums.some(seen)
         felt = outlook.felt(sector)
         east_m, north_m, _ = outlook.offset_m(sector.cell, sector.height_m)
         yield Cells(
@@ -149,9 +149,9 @@ def on_reference(
     """
     variance_m2, correction_m = (np.zeros(outlook.grid.shape, np.float32) for _ in range(2))
     cell = outlook.cells["cell"][:]
-    variance_m2.reshape(-1)[cell] = outlook.cells["shot_m2"][:] * (gridder.at(cell).count > 0)
+    variance_m2.reshape(-1)[cell] = outlook.cells["shot_m2"][:] * (gridder.sums(0, len(cell)).count > 0)
     if levelled is not None:
-        for sector in outlook.sectors():
+        for _, sector in outlook.sectors():
             correction_m.reshape(-1)[sector.cell] = _correction(levelled, outlook.felt(sector))
     return variance_m2, correction_m
 
@@ -184,10 +184,8 @@ def measure(
 def stable_figures(measured: Measurement, outlook: Outlook) -> dict[str, float]:
     """Return how a scan does on stable ground it was not fitted to: number of cells, median, spread, z."""
     unused = outlook.having(Trait.STABLE, Trait.WITHHELD)
-    unused = unused[(measured.quality.reshape(-1)[unused] & np.uint8(Quality.STABLE_GROUND)) > 0]
-    change_m, sigma_m = (
-        raster.reshape(-1)[unused] for raster in (measured.surface.change_m, measured.uncertainty_m)
-    )
+    unused = unused[(measured.quality[unused] & np.uint8(Quality.STABLE_GROUND)) > 0]
+    change_m, sigma_m = measured.change_m[unused], measured.uncertainty_m[unused]
     figures = {"stable_count": float(len(change_m))}
     if len(change_m) >= FEW_STABLE:
         figures["stable_median"] = float(np.median(change_m))

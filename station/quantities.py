@@ -18,6 +18,7 @@ Floats = NDArray[np.float64]
 Floats32 = NDArray[np.float32]
 Reals = NDArray[np.floating[Any]]  # of either precision
 Ints = NDArray[np.int64]
+Ints32 = NDArray[np.int32]
 Bools = NDArray[np.bool_]
 
 
@@ -192,21 +193,6 @@ class Habits:
     line_motion_rad: float = radians(0.0008)
 
 
-@dataclass(frozen=True)
-class Surface:
-    """One scan on the grid.
-
-    `change_m` is the mean residual to the reference, NaN where there is none; everything is NaN (or zero
-    points) where the scan saw nothing.
-    """
-
-    grid: Grid
-    elevation_m: Floats32  # (ny, nx)
-    change_m: Floats32  # (ny, nx)
-    count: NDArray[np.int32]  # (ny, nx)
-    spread_m: Floats32  # (ny, nx) standard deviation of the points in the cell
-
-
 class Quality(IntFlag):
     """What to know of a cell before using it."""
 
@@ -219,21 +205,46 @@ class Quality(IntFlag):
 
 @dataclass(frozen=True)
 class Measurement:
-    """What a scan says of the surface, and how sure that is; all (ny, nx).
+    """What a scan says of the surface, and how sure that is, cell by cell; all (n,).
 
-    `uncertainty_m` is of a single cell, everything included; `random_uncertainty_m` is the part of it that
-    averages out. `terms` holds the budget of the scan's own heights term by term, where asked for.
+    `number` (ny, nx) tells which they are: -1 where the scan saw nothing, and even the reference knows
+    nothing. `change_m` is the mean residual to the reference, NaN where there is none; everything is NaN (or
+    zero points) where the scan saw nothing. `uncertainty_m` is of a single cell, everything included;
+    `random_uncertainty_m` is the part of it that averages out. `terms` holds the budget of the scan's own
+    heights term by term, where asked for.
     """
 
-    surface: Surface
+    grid: Grid
+    number: Ints32
+    elevation_m: Floats32
+    change_m: Floats32
     uncertainty_m: Floats32
     random_uncertainty_m: Floats32
+    spread_m: Floats32  # standard deviation of the points in the cell
+    count: Ints32
     quality: NDArray[np.uint8]  # bits of Quality
     terms: dict[str, Floats32]
 
-    def flagged(self, flag: Quality) -> Bools:
-        """Tell which cells (ny, nx) have a bit set."""
-        return np.asarray((self.quality & np.uint8(flag)) > 0)
+    @classmethod
+    def of(cls, grid: Grid, quality: NDArray[np.uint8], **rasters: NDArray[Any]) -> Measurement:
+        """Take rasters (ny, nx), named as the columns, in which every cell has its number."""
+        number = np.arange(grid.nx * grid.ny, dtype=np.int32).reshape(grid.shape)
+        terms = {name: rasters.pop(name).ravel() for name in list(rasters) if name.startswith("sigma_")}
+        columns = {name: values.ravel() for name, values in rasters.items()}
+        return cls(grid, number, quality=quality.ravel(), terms=terms, **columns)
+
+    def laid(self, *columns: NDArray[Any], rows: slice = slice(None)) -> list[NDArray[Any]]:
+        """Lay columns (n,) out on some rows of the grid, or all: NaN, or nought, where there is nothing."""
+        number = self.number[rows]
+        there = np.flatnonzero(number >= 0)
+        cells = number.reshape(-1)[there]
+        rasters = []
+        for values in columns:
+            nothing = np.nan if values.dtype.kind == "f" else 0
+            raster = np.full(number.shape, nothing, values.dtype)
+            raster.reshape(-1)[there] = values[cells]
+            rasters.append(raster)
+        return rasters
 
 
 @dataclass(frozen=True)

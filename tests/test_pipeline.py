@@ -57,38 +57,51 @@ def truth():
     return Reference.given(GRID, "truth", height(x_m, y_m))
 
 
-def scanned(shots, reference, unknown=None, **settings):
+NOWHERE = np.zeros(GRID.shape, bool)
+
+
+def scanned(shots, reference, unknown=None, stable=NOWHERE, **settings):
     sop = np.eye(4)
     sop[:3, 3] = SCANNER
     setup = Setup(VZ6000, GRID, SCANNER, **settings)
-    seen_from = reference and outlook_on(reference, setup, np.zeros(GRID.shape, bool))
+    seen_from = reference and outlook_on(reference, setup, stable)
     gridder = gridder_for(setup, seen_from)
     survey(gridder, [shots], Pose(frame_in_local_map(sop), None, None), lambda: None)
-    return measure(deepcopy(gridder), setup, unknown, seen_from), gridder, setup, seen_from
+    return Laid(measure(deepcopy(gridder), setup, unknown, seen_from)), gridder, setup, seen_from
+
+
+class Laid:
+    """The columns of a measurement as rasters."""
+
+    def __init__(self, measured):
+        self.measured = measured
+        self.terms = dict(zip(measured.terms, measured.laid(*measured.terms.values()), strict=True))
+
+    def __getattr__(self, name):
+        return self.measured.laid(getattr(self.measured, name))[0]
 
 
 def test_without_errors_the_surface_is_the_truth():
     measured, *_ = scanned(shots_at(*spots(200_000, 1), noise=False), truth())
-    inner = measured.surface.change_m[1:-1, 1:-1]
+    inner = measured.change_m[1:-1, 1:-1]
     assert np.abs(inner[np.isfinite(inner)]).max() < 0.01  # bilinear against waves of 2 m
 
 
 def test_random_uncertainty_is_calibrated():
     """Standard deviation of error over stated sigma, over all cells and by number of points."""
     measured, *_ = scanned(shots_at(*spots(150_000, 2)), truth())
-    surface = measured.surface
-    z = surface.change_m / measured.random_uncertainty_m
+    z = measured.change_m / measured.random_uncertainty_m
     assert np.nanstd(z) == pytest.approx(1.0, abs=0.05)
     for points in (1, 3, 6):
-        assert np.nanstd(z[surface.count == points]) == pytest.approx(1.0, abs=0.1)
+        assert np.nanstd(z[measured.count == points]) == pytest.approx(1.0, abs=0.1)
 
 
 def test_a_plain_mean_without_reference_knows_its_slope():
     measured, *_ = scanned(shots_at(*spots(150_000, 3)), None)
-    several = measured.surface.count >= 2
+    several = measured.count >= 2
     x_m, y_m = np.meshgrid(GRID.x_m, GRID.y_m)
-    z = (measured.surface.elevation_m - height(x_m, y_m)) / measured.random_uncertainty_m
-    assert np.isnan(measured.surface.change_m).all()
+    z = (measured.elevation_m - height(x_m, y_m)) / measured.random_uncertainty_m
+    assert np.isnan(measured.change_m).all()
     assert np.std(z[several & np.isfinite(z)]) == pytest.approx(1.0, abs=0.15)
     assert (measured.quality[several] & Quality.OUTSIDE_REFERENCE).all()
 
@@ -106,7 +119,7 @@ def test_a_master_from_scans_finds_the_truth_and_its_own_error():
     assert np.nanmedian(error) == pytest.approx(0.0, abs=1e-3)
     assert 1.4826 * np.nanmedian(np.abs(error)) < 0.03
     measured, *_ = scanned(shots_at(*spots(100_000, 30), seed=30), made)
-    z = measured.surface.change_m / measured.random_uncertainty_m
+    z = measured.change_m / measured.random_uncertainty_m
     assert np.nanstd(z) == pytest.approx(1.0, abs=0.1)
 
 
@@ -135,7 +148,7 @@ def test_shared_errors_go_into_the_cell_and_its_terms():
     assert measured.uncertainty_m[seen] == pytest.approx(total[seen], rel=1e-3)
     assert (measured.uncertainty_m > measured.random_uncertainty_m)[seen].all()
     # the published budgets take a lean of 0.008° for each point's own, and for no other cell's
-    lean_m = 1800 * math.radians(0.008) / np.sqrt(measured.surface.count[seen].mean())
+    lean_m = 1800 * math.radians(0.008) / np.sqrt(measured.count[seen].mean())
     for name in ("sigma_hartzell2015", "sigma_voordendag2023"):
         assert np.median(measured.terms[name][seen]) == pytest.approx(lean_m, rel=0.35)
 
@@ -152,7 +165,7 @@ def test_published_budget_on_request():
     terms = measured.terms
     of_points = ("sigma_instrument", "sigma_atmosphere", "sigma_geometry")
     point = np.sqrt(sum(np.square(terms[name]) for name in of_points))
-    wanted = point / np.sqrt(measured.surface.count, where=measured.surface.count > 0, out=None) + 0.02
+    wanted = point / np.sqrt(measured.count, where=measured.count > 0, out=None) + 0.02
     seen = np.isfinite(measured.uncertainty_m)
     assert measured.uncertainty_m[seen] == pytest.approx(wanted[seen], rel=0.05)
     assert (terms["sigma_raster"] + terms["sigma_registration"])[seen] == pytest.approx(
@@ -186,10 +199,10 @@ def test_blocks_and_order_change_nothing():
         columns = [np.split(axis[order], splits) for axis in (shots.x_m, shots.y_m, shots.z_m, time_s)]
         blocks = [Shots(*block) for block in zip(*columns, strict=True)]
         survey(gridder, blocks, Pose(frame, tilt, air), lambda: None)
-        made.append(measure(gridder, setup, None, None))
-    assert (made[0].surface.count > 0).mean() > 0.3
+        made.append(Laid(measure(gridder, setup, None, None)))
+    assert (made[0].count > 0).mean() > 0.3
     for name in ("elevation_m", "count", "spread_m"):
-        one, other = (getattr(measured.surface, name) for measured in made)
+        one, other = (getattr(measured, name) for measured in made)
         assert np.array_equal(one, other, equal_nan=True), name
     assert np.array_equal(made[0].uncertainty_m, made[1].uncertainty_m, equal_nan=True)
 
@@ -200,27 +213,26 @@ def test_a_real_change_is_found_and_flagged():
     raised = (x_m > 1700) & (x_m < 1800) & (np.abs(y_m) < 50)
     shots = Shots(shots.x_m, shots.y_m, shots.z_m + np.where(raised, 0.5, 0.0), None)
     measured, *_ = scanned(shots, truth())
-    inside = measured.surface.change_m[140:160, 55:70]
+    inside = measured.change_m[140:160, 55:70]
     assert np.nanmean(inside) == pytest.approx(0.5, abs=0.02)
     flagged = (measured.quality & Quality.CHANGE_SIGNIFICANT) > 0
     assert flagged[140:160, 55:70].mean() > 0.9
-    assert flagged[:60][np.isfinite(measured.surface.change_m[:60])].mean() == pytest.approx(0.05, abs=0.02)
+    assert flagged[:60][np.isfinite(measured.change_m[:60])].mean() == pytest.approx(0.05, abs=0.02)
 
 
 def test_a_part_of_much_stable_ground_says_nearly_what_all_of_it_says(monkeypatch):
     """Shots 30 mm too high, seen by every, every second, third and thirteenth row of rock."""
     shots = shots_at(*spots(150_000, 7))
     sunk = Shots(shots.x_m, shots.y_m, shots.z_m + 0.030, None)
-    _, gridder, setup, _ = scanned(sunk, truth())
     of = basis(GRID, SCANNER)
     told = Told(of, lines_of(of, np.eye(3), None), np.zeros((3, of.line_count)), None, weather_known=True)
     known = replace(truth(), habits=Habits(translation_m=0.1))
     stable = np.ones(GRID.shape, bool)
-    seen = gridder.seen()
     found = {}
     for step in (1, 2, 3, 13):
         monkeypatch.setattr(outlook, "STABLE_MOST", stable.size // step + 1)
-        seen_from = outlook_on(known, setup, stable)
+        _, gridder, setup, seen_from = scanned(sunk, known, stable=stable)
+        seen = gridder.rasters().count > 0
         found[step] = level(gridder, setup, told, seen_from)
         _, correction_m = on_reference(gridder, seen_from, (told, found[step]))
         assert np.median(correction_m[seen]) == pytest.approx(0.030, abs=0.003)

@@ -137,7 +137,7 @@ class Attribution:
                 file.setncattr("epoch_file", self.row.epoch_file)
                 for row in ROWS:
                     define(file, row, self.series, 1)
-            write_rasters(beside, ((row, maps[row.name]) for row in ROWS))
+            write_rasters(beside, ROWS, lambda rows: [maps[row.name][rows] for row in ROWS])
 
 
 def attribute(series: Series, epoch: int | str) -> Attribution:

@@ -28,7 +28,7 @@ from station.science.outlook import Outlook, Position
 
 ROWS = 128  # of the grid, that a checksum covers
 KEPT = 2  # at a time, of one station: a scanner that was moved may still have old scans to be done again
-DENSE = ("rise_m", "known")
+DENSE = ("rise_m", "number")
 
 Array = np.ndarray[Any, Any]
 
@@ -95,14 +95,14 @@ def _open(path: Path, reference: Reference, position_m: Position | None, axis: P
                 for name in file
                 if name != "bounds"
             }
+            rise_m, number = (held.pop(name) for name in DENSE)
     except FileNotFoundError:
         raise
     except (OSError, KeyError, RuntimeError, TypeError, ValueError) as error:
         raise _damaged(path) from error
-    rise_m, known = (held.pop(name) for name in DENSE)
     of = shared.basis(reference.grid, position_m, axis) if position_m else None
     one_in = int(frame[-3]), int(frame[-2])
-    return Outlook(reference, of, position_m, datum_m, rise_m, known, bounds, one_in, held)  # type: ignore[arg-type] # sliced only
+    return Outlook(reference, of, position_m, datum_m, rise_m, number, bounds, one_in, held)  # type: ignore[arg-type] # sliced only
 
 
 class _Kept:
@@ -129,14 +129,13 @@ class _Plain:
     def __getitem__(self, rows: slice) -> Array:
         """Return some rows."""
         first, stop, step = rows.indices(self._shape[0])
-        count = (stop - first) * self._row_bytes
+        values = np.empty((stop - first) * self._row_bytes, np.uint8)
         try:
-            raw = os.pread(self._kept.descriptor, count, self._at + first * self._row_bytes)
+            read = os.preadv(self._kept.descriptor, [values.data], self._at + first * self._row_bytes)
         except OSError as error:
             raise StoreError(f"{self._path}: cannot be read: {error}") from error
-        if len(raw) != count:
+        if read != len(values):
             raise _damaged(self._path)
-        values = np.frombuffer(raw, np.uint8)
         for number in range(*np.searchsorted(self._edges, (first, stop)).tolist()):
             begin, end = (int(row - first) * self._row_bytes for row in self._edges[number : number + 2])
             if end <= len(values) and _crc(values[begin:end]) != self._crc[number]:

@@ -7,9 +7,9 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from functools import cached_property, lru_cache, partial
+from functools import cached_property, lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -29,29 +29,32 @@ KEPT_BANDS = 2  # rows of chunks that are kept unpacked: of a band of cells and 
 Array = np.ndarray[Any, Any]
 
 
-def write_rasters(path: Path, rasters: Iterable[tuple[Variable, Array]]) -> None:
-    """Write rasters (ny, nx), NaN as fill, into the variables that a file has for them, as the first time.
+def write_rasters(path: Path, rows: Sequence[Variable], band: Callable[[slice], Sequence[Array]]) -> None:
+    """Write rasters into the variables that a file has for them, as the first time.
 
-    Chunks without any value are left unwritten.
+    `band` gives some rows (r, nx) of each of them, NaN as fill. Chunks without any value are left unwritten.
     """
     with h5py.File(path, "r+") as file, ThreadPoolExecutor(TOGETHER) as pool:
-        for row, values in rasters:
-            dataset = h5py.h5d.open(file.id, row.name.encode())
+        held = [h5py.h5d.open(file.id, row.name.encode()) for row in rows]
+        for row, dataset in zip(rows, held, strict=True):
             if row.dims[0] == "time":
-                dataset.set_extent((1, *values.shape))
-            *_, height, width = chunk = dataset.get_create_plist().get_chunk()
-            tops = range(0, len(values), height)
-            bands = pool.map(
-                partial(_deflated, row, (height, width)), (values[top : top + height] for top in tops)
-            )
-            for top, band in zip(tops, bands, strict=True):
-                for left, packed in band.items():
-                    dataset.write_direct_chunk((0, top, left)[-len(chunk) :], packed)
+                dataset.set_extent((1, *dataset.shape[1:]))
+        ny = held[0].shape[-2]
+        *_, height, width = chunk = held[0].get_create_plist().get_chunk()
+
+        def deflated(top: int) -> list[dict[int, bytes]]:
+            told = zip(rows, band(slice(top, min(top + height, ny))), strict=True)
+            return [_deflated(row, (height, width), values) for row, values in told]
+
+        tops = range(0, ny, height)
+        for top, packed in zip(tops, pool.map(deflated, tops), strict=True):
+            for dataset, chunks in zip(held, packed, strict=True):
+                for left, one in chunks.items():
+                    dataset.write_direct_chunk((0, top, left)[-len(chunk) :], one)
 
 
-def _deflated(row: Variable, size: tuple[int, int], values: Array) -> dict[int, bytes]:
+def _deflated(row: Variable, size: tuple[int, int], band: Array) -> dict[int, bytes]:
     """Return the chunks of a band of a raster that hold something, by their first column."""
-    band = np.ascontiguousarray(values)
     packed = {
         left: _packed(row, band[:, left : left + size[1]], size) for left in range(0, band.shape[1], size[1])
     }

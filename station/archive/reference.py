@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import Any
@@ -65,7 +65,6 @@ _ROWS = (
         comment="units are products of parameter_unit",
     ),
 )  # fmt: skip
-_BY_NAME = {row.name: row for row in _ROWS}
 
 
 @dataclass(frozen=True)
@@ -138,7 +137,7 @@ def write_reference(series: Series, reference: Reference, lineage: Lineage | Non
     with written_whole(kept) as beside:
         with netCDF4.Dataset(beside, "w", clobber=False) as file:
             _write(file, series, reference, lineage)
-        write_rasters(beside, _rasters(reference))
+        write_rasters(beside, [row for row in _ROWS if row.is_raster], lambda rows: _band(reference, rows))
     _name_newest(series, kept)
 
 
@@ -160,18 +159,17 @@ def _write(file: netCDF4.Dataset, series: Series, reference: Reference, lineage:
         file["shared_parameter_noise_variance"][:] = shared.noise_variance
 
 
-def _rasters(reference: Reference) -> Iterator[tuple[Variable, np.ndarray[Any, Any]]]:
-    """Give what lies on the grid, by variable."""
-    for name, values in (
-        ("reference_elevation", reference.elevation_m),
-        ("reference_random_uncertainty", np.sqrt(reference.random_variance_m2)),
-        ("reference_roughness", np.sqrt(reference.roughness_m2)),
-        ("reference_variance_factor", reference.variance_factor),
-        ("reference_intensity", reference.intensity),
-        ("reference_stable", reference.stable),
-        ("reference_seen", reference.seen),
-    ):
-        yield _BY_NAME[name], values
+def _band(reference: Reference, rows: slice) -> list[np.ndarray[Any, Any]]:
+    """Return some rows of what lies on the grid, in the order of `_ROWS`."""
+    return [
+        reference.elevation_m[rows],
+        np.sqrt(reference.random_variance_m2[rows]),
+        np.sqrt(reference.roughness_m2[rows]),
+        reference.variance_factor[rows],
+        reference.intensity[rows],
+        reference.stable[rows],
+        reference.seen[rows],
+    ]
 
 
 def settle_reference(series: Series) -> None:

@@ -17,7 +17,7 @@ import numpy as np
 
 from station.archive.layout import Series, define, lay_out, strings, text, written_whole
 from station.archive.rasters import write_rasters
-from station.archive.variables import BY_NAME, TERMS, TEXT_LENGTH, VARIABLES, VERDICTS, Variable
+from station.archive.variables import BY_NAME, TERMS, TEXT_LENGTH, VARIABLES, VERDICTS
 from station.errors import StoreError
 from station.quantities import Grid, Measurement, Shared
 
@@ -86,7 +86,12 @@ def write_epoch(series: Series, epoch: Epoch, newer_than: int = 0) -> Stored:
     with written_whole(path) as beside:
         with netCDF4.Dataset(beside, "w", clobber=False) as file:
             _write(file, series, epoch, path.name)
-        write_rasters(beside, _rasters(epoch.measurement))
+        columns = _columns(epoch.measurement)
+        write_rasters(
+            beside,
+            [BY_NAME[name] for name in columns],
+            lambda rows: epoch.measurement.laid(*columns.values(), rows=rows),
+        )
     return Stored(path, start, revision)
 
 
@@ -321,8 +326,8 @@ def _write(file: netCDF4.Dataset, series: Series, epoch: Epoch, name: str) -> No
     lay_out(file, series, title, 1, parameters)
     file["time"][0] = (epoch.start_s + epoch.end_s) / 2
     file["time_bnds"][0] = (epoch.start_s, epoch.end_s)
-    for row, _ in _rasters(epoch.measurement):
-        define(file, row, series, 1)
+    for column in _columns(epoch.measurement):
+        define(file, BY_NAME[column], series, 1)
     if shared is not None:
         define(file, BY_NAME["shared_parameter"], series, 1)[0] = shared.estimate
         define(file, BY_NAME["shared_parameter_covariance"], series, 1)[0] = shared.covariance
@@ -330,19 +335,18 @@ def _write(file: netCDF4.Dataset, series: Series, epoch: Epoch, name: str) -> No
     _write_words(file, series, epoch, name)
 
 
-def _rasters(measured: Measurement) -> list[tuple[Variable, np.ndarray[Any, Any]]]:
-    """Return what lies on the grid, by variable."""
-    rasters: dict[str, np.ndarray[Any, Any]] = {
-        "elevation": measured.surface.elevation_m,
-        "elevation_change": measured.surface.change_m,
+def _columns(measured: Measurement) -> dict[str, np.ndarray[Any, Any]]:
+    """Return what is kept of each cell, by variable."""
+    return {
+        "elevation": measured.elevation_m,
+        "elevation_change": measured.change_m,
         "elevation_change_uncertainty": measured.uncertainty_m,
         "elevation_change_random_uncertainty": measured.random_uncertainty_m,
-        "elevation_spread": measured.surface.spread_m,
-        "point_count": measured.surface.count,
+        "elevation_spread": measured.spread_m,
+        "point_count": measured.count,
         "quality": measured.quality,
         **{term: measured.terms[term] for term in TERMS if term in measured.terms},
     }
-    return [(BY_NAME[name], values) for name, values in rasters.items()]
 
 
 def _write_words(file: netCDF4.Dataset, series: Series, epoch: Epoch, name: str) -> None:

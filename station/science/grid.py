@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 if TYPE_CHECKING:
-    from station.quantities import Bools, Floats, Floats32, Grid, Ints
+    from station.quantities import Bools, Floats, Floats32, Grid, Ints, Ints32
     from station.science.terrain import Ground
 
 # Sums are whole numbers, of 2^-20 m (and m²), so that the order in which points come cannot matter.
@@ -20,8 +20,6 @@ BITS = 40  # of a number, in which brightness is summed up; the others count
 ONE = 1 << BITS
 STEP_MOST = 6.0  # sigmas: beyond, something happened
 CLASS_STEPS = 10.0  # what the class of a cell weighs against the steps from scan to scan of its own
-ALL = slice(None)
-Cell = NDArray[np.int64] | NDArray[np.int32]  # numbers of cells in the flattened grid
 ROUGHNESS_CELLS = 1.0  # one sigma of the neighbourhood that tells how rough a cell is
 
 
@@ -39,7 +37,7 @@ class Sums:
         return cls(*(np.concatenate([getattr(part, one.name) for part in parts]) for one in fields(cls)))
 
     @property
-    def count(self) -> NDArray[np.int32]:
+    def count(self) -> Ints32:
         """Points in each cell (ny, nx)."""
         return (self.tally >> BITS).astype(np.int32)
 
@@ -80,6 +78,9 @@ class Gridder:
 
     Averaging residuals rather than heights removes the sampling error of a slope, which is 0.11 m for one or
     two points in a 1 m cell at 25° (EQUATIONS 4.10), and the loss of change that goes with it (6.5).
+
+    Sums lie by the number of their cell, and memory is taken as far as cells have one: those that the
+    reference knows have theirs from it, in the order in which the head comes by, the others as they are met.
     """
 
     def __init__(self, grid: Grid, ground: Ground | None, datum_m: float) -> None:
@@ -87,9 +88,12 @@ class Gridder:
         self.grid = grid
         self._ground = ground
         self.datum_m = float(np.round(datum_m))
+        self.number = np.full(grid.shape, -1, np.int32) if ground is None else np.array(ground.number)
+        self.known = int(self.number.max()) + 1  # cells that the reference knows have the first numbers
+        self.taken = self.known
         # Of a cell side by side, for it is they that a shot has to wait for: number of points and brightness
         # in one, heights, and their squares.
-        self._sums = np.zeros((*grid.shape, 3), np.int64)
+        self._sums = np.zeros((grid.nx * grid.ny, 3), np.int64)
 
     def cells(self, x_m: Floats, y_m: Floats) -> tuple[Ints, Floats, Floats]:
         """Number of each point (n,) that lies on the grid, and its column and row, in fractions of cells.
@@ -101,46 +105,63 @@ class Gridder:
         inside = np.flatnonzero((column >= 0) & (column < self.grid.nx) & (row >= 0) & (row < self.grid.ny))
         return inside, column[inside], row[inside]
 
-    def flat(self, column: Floats, row: Floats) -> Ints:
-        """Index (n,) of each point's cell in the flattened grid."""
-        return row.astype(np.int64) * self.grid.nx + column.astype(np.int64)
+    def numbered(self, column: Floats, row: Floats) -> Ints32:
+        """Number (n,) of the cell of each point; cells that had none are given the next."""
+        cell = row.astype(np.int64) * self.grid.nx + column.astype(np.int64)
+        numbers = self.number.reshape(-1)
+        number = numbers.take(cell)
+        new = np.flatnonzero(number < 0)
+        if len(new):
+            cell = cell[new]
+            numbers[cell] = np.arange(len(cell))  # of several points in a cell the last one stays
+            met = cell[numbers[cell] == np.arange(len(cell))]
+            numbers[met] = np.arange(self.taken, self.taken + len(met))
+            self.taken += len(met)
+            number[new] = numbers[cell]
+        return number
 
-    def below(self, cell: Ints, column: Floats, row: Floats) -> Floats:
+    def below(self, number: Ints32, column: Floats, row: Floats) -> Floats:
         """Height (n,) that the residual of each point is taken from [m]: of the reference, or the datum."""
         if self._ground is None:
-            return np.full(len(cell), self.datum_m)
-        known = self._ground.known.reshape(-1)[cell]
-        return np.where(known, self._ground.height(column, row), self.datum_m)
+            return np.full(len(number), self.datum_m)
+        return np.where(number < self.known, self._ground.height(column, row), self.datum_m)
+
+    def is_empty(self) -> bool:
+        """Tell whether no point has come."""
+        return not self._sums[: self.taken, 0].any()
 
     def complete(self) -> None:
         """No more points come: let the ground go that only they need."""
         self._ground = None
 
-    def add(self, cell: Ints, residual_m: Floats, intensity: Floats | None) -> None:
-        """Add points (n,): their cell, height above reference or datum, and brightness, 0-1."""
+    def add(self, number: Ints32, residual_m: Floats, intensity: Floats | None) -> None:
+        """Add points (n,): number of their cell, height above reference or datum, and brightness, 0-1."""
         sums = self._sums.reshape(-1)
         steps = np.rint(residual_m * QUANTUM)
-        at = cell * 3
+        at = np.multiply(number, 3, dtype=np.int64)
         tally = ONE if intensity is None else ONE + np.rint(intensity * BRIGHTEST).astype(np.int64)
         np.add.at(sums, at, tally)
         np.add.at(sums, at + 1, steps.astype(np.int64))
         np.add.at(sums, at + 2, np.rint(steps * steps / QUANTUM).astype(np.int64))
 
-    def sums(self, rows: slice = ALL) -> Sums:
-        """Take a copy of some rows, or all."""
-        return Sums(*np.ascontiguousarray(np.moveaxis(self._sums[rows], -1, 0)))
+    def sums(self, first: int, end: int) -> Sums:
+        """Take a copy of the cells with some numbers."""
+        return Sums(*np.ascontiguousarray(self._sums[first:end].T))
 
-    def at(self, cell: Cell) -> Sums:
-        """Take a copy of some cells (n,), by their number in the flattened grid."""
-        return Sums(*np.ascontiguousarray(self._sums.reshape(-1, 3).take(cell, axis=0).T))
+    def at(self, number: Ints32) -> Sums:
+        """Take a copy of cells (n,) by their numbers."""
+        return Sums(*np.ascontiguousarray(self._sums.take(number, axis=0).T))
 
-    def seen(self, rows: slice = ALL) -> Bools:
-        """Return which cells (r, nx) of some rows, or all, have points."""
-        return np.asarray(self._sums[rows, :, 0] > 0)
+    def rasters(self) -> Sums:
+        """Lay out a copy of all sums on the grid, (ny, nx) each."""
+        laid = np.zeros((3, *self.grid.shape), np.int64)
+        there = self.number >= 0
+        laid[:, there] = self._sums[self.number[there]].T
+        return Sums(*laid)
 
     def memory(self) -> NDArray[np.float32]:
-        """Give the sums away: (ny, nx, 6), to be overwritten row by row once read."""
-        return self._sums.view(np.float32)
+        """Give the sums away: (numbers, 6), to be overwritten once read."""
+        return self._sums[: self.taken].view(np.float32)
 
 
 class Stack:
@@ -167,7 +188,7 @@ class Stack:
         `known`, on a reference: random variance of a shot and what to lower heights by, and the
         `roughness_m2` of that reference, (ny, nx) each. Then scans are also compared with each other.
         """
-        sums = gridder.sums()
+        sums = gridder.rasters()
         count = sums.count.astype(np.float64)
         seen = count > 0
         self._seen += seen

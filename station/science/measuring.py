@@ -13,15 +13,15 @@ from station.quantities import (
     Floats32,
     Grid,
     Ints,
+    Ints32,
     Measurement,
     Quality,
     Reals,
     Setup,
     Shared,
-    Surface,
 )
 from station.science import budget, change, ground, shared, uncertainty
-from station.science.grid import Cell, Gridder, Sums, slope_sampling_variance
+from station.science.grid import Gridder, Sums, slope_sampling_variance
 from station.science.outlook import HIGH_INCIDENCE_COS, MARGIN_ROWS, Outlook, Sector, Trait, gradients
 from station.science.shared import Sensitivities
 from station.science.view import View
@@ -38,30 +38,31 @@ def measured(gridder: Gridder, outlook: Outlook | None, judge: Judge) -> Measure
     names = budget.TERMS if setup.published_budget else (*budget.TERMS, *budget.PUBLISHED)
     made = _Made(
         gridder.memory(),
-        np.zeros(setup.grid.shape, np.uint8),
+        np.zeros(gridder.taken, np.uint8),
         {
-            name: np.full(setup.grid.shape, np.nan, np.float32)
+            name: np.full(gridder.taken, np.nan, np.float32)
             for name in names
             if setup.store_terms and setup.position_m is not None
         },
         setup.min_points,
     )
     if outlook is not None:
-        for whole in outlook.sectors():
-            sums = gridder.at(whole.cell)
+        for first, whole in outlook.sectors():
+            sums = gridder.sums(first, first + len(whole))
             seen = sums.count > 0
-            made.clear(whole.cell[~seen])
+            made.clear(first + np.flatnonzero(~seen))
             sector, sums = whole.some(seen), sums.some(seen)
-            made.put(sector.cell, sums, judge.known(sector, sums, outlook))
-    for fringe in _fringes(gridder, setup, outlook, made):
-        made.put(fringe.cell, fringe.sums, judge.beyond(fringe, gridder.datum_m))
-    return made.measurement(setup.grid)
+            made.put(first + np.flatnonzero(seen), sums, judge.known(sector, sums, outlook))
+    for fringe in _fringes(gridder, setup, outlook):
+        made.put(fringe.number, fringe.sums, judge.beyond(fringe, gridder.datum_m))
+    return made.measurement(setup.grid, gridder.number)
 
 
 @dataclass(frozen=True)
 class _Fringe:
     """Cells (n,) beyond what a reference knows, each with the height and the slope that the scan gives it."""
 
+    number: Ints32
     cell: Ints
     sums: Sums
     east_gradient: Floats
@@ -70,20 +71,20 @@ class _Fringe:
     @classmethod
     def of(cls, parts: list[_Fringe]) -> _Fringe:
         """Take some together."""
-        cell, east, north = (
+        number, cell, east, north = (
             np.concatenate([getattr(part, name) for part in parts])
-            for name in ("cell", "east_gradient", "north_gradient")
+            for name in ("number", "cell", "east_gradient", "north_gradient")
         )
-        return cls(cell, Sums.of([part.sums for part in parts]), east, north)
+        return cls(number, cell, Sums.of([part.sums for part in parts]), east, north)
 
 
-def _fringes(gridder: Gridder, setup: Setup, outlook: Outlook | None, made: _Made) -> Iterator[_Fringe]:
-    """Give the cells beyond the reference, many at a time; all others beyond it are cleared."""
+def _fringes(gridder: Gridder, setup: Setup, outlook: Outlook | None) -> Iterator[_Fringe]:
+    """Give the cells beyond the reference, many at a time."""
     above_m = np.empty((0, setup.grid.nx), np.float32)
     parts: list[_Fringe] = []
     for top in range(0, setup.grid.ny, BAND_ROWS):
         rows = slice(top, min(top + BAND_ROWS, setup.grid.ny))
-        part, above_m = _fringe(gridder, setup, outlook, made, rows, above_m)
+        part, above_m = _fringe(gridder, setup, outlook, rows, above_m)
         parts.append(part)
         if sum(len(part.cell) for part in parts) > TOGETHER or rows.stop == setup.grid.ny:
             yield _Fringe.of(parts)
@@ -91,34 +92,33 @@ def _fringes(gridder: Gridder, setup: Setup, outlook: Outlook | None, made: _Mad
 
 
 def _fringe(
-    gridder: Gridder, setup: Setup, outlook: Outlook | None, made: _Made, rows: slice, above_m: Floats32
+    gridder: Gridder, setup: Setup, outlook: Outlook | None, rows: slice, above_m: Floats32
 ) -> tuple[_Fringe, Floats32]:
     """Return the cells of some rows that no reference knows, and the heights of the last of these rows.
 
     `above_m` (r, nx) are those of the rows above, whose sums have given way. Heights are above the datum.
     """
     ahead, height = slice(rows.start, min(rows.stop + MARGIN_ROWS, setup.grid.ny)), rows.stop - rows.start
-    beyond = np.ones((ahead.stop - ahead.start, setup.grid.nx), bool)
-    if outlook is not None:
-        beyond = ~outlook.known[ahead]
-    row, column = np.nonzero(beyond & gridder.seen(ahead))
-    cell = (rows.start + row) * setup.grid.nx + column
-    sums = gridder.at(cell)
-    found_m = np.full(beyond.shape, np.nan, np.float32)
+    numbers = gridder.number[ahead]
+    row, column = np.nonzero(numbers >= gridder.known)
+    number = numbers[row, column]
+    sums = gridder.at(number)
+    found_m = np.full(numbers.shape, np.nan, np.float32)
     found_m[row, column] = np.where(sums.count >= setup.min_points, sums.mean_residual(), np.nan)
-    made.clear(np.flatnonzero(beyond[:height]) + rows.start * setup.grid.nx)
     here = row < height
-    row, column, cell, sums = row[here], column[here], cell[here], sums.some(here)
+    row, column, number, sums = row[here], column[here], number[here], sums.some(here)
     east, north = np.zeros((2, len(row)))
     if setup.position_m is not None and len(row):
         around_m = np.concatenate([above_m, found_m])
         if outlook is not None:  # what it knows of the cells beside is better
             there = slice(rows.start - len(above_m), ahead.stop)
             better_m = outlook.rise_m[there] + np.float32(outlook.datum_m - gridder.datum_m)
-            np.copyto(around_m, better_m, where=outlook.known[there])
+            known = gridder.number[there].view(np.uint32) < np.uint32(gridder.known)
+            np.copyto(around_m, better_m, where=known)
         inner = slice(len(above_m), len(above_m) + height)
         east, north = gradients(around_m, setup.grid.cell_m, inner, (row, column))
-    return _Fringe(cell, sums, east, north), found_m[:height][-MARGIN_ROWS:]
+    cell = (rows.start + row) * setup.grid.nx + column
+    return _Fringe(number, cell, sums, east, north), found_m[:height][-MARGIN_ROWS:]
 
 
 @dataclass(frozen=True)
@@ -140,21 +140,21 @@ def _as_one(values: Floats32) -> NDArray[np.void]:
 
 @dataclass(frozen=True)
 class _Made:
-    """Where the rasters of a scan come to be; the first in the memory of its sums (ny, nx, 6)."""
+    """Where the columns of a measurement come to be; the first in the memory of its sums (n, 6)."""
 
     memory: Floats32
     quality: NDArray[np.uint8]
     terms: dict[str, Floats32]
     min_points: int
 
-    def clear(self, cell: Cell) -> None:
-        """Say that cells (n,) hold nothing, until something is put there."""
+    def clear(self, number: Ints) -> None:
+        """Say that cells (m,) hold nothing."""
         nothing = np.array([np.nan] * 5 + [0], np.float32)  # nought has the same bits in both
-        _as_one(self.memory).reshape(-1)[cell] = _as_one(nothing)
+        _as_one(self.memory)[number] = _as_one(nothing)
 
-    def put(self, cell: Cell, sums: Sums, told: _Judged) -> None:
-        """Lay down cells (n,); of those with too few points no more than number and spread."""
-        whole = np.empty((len(cell), 6), np.float32)
+    def put(self, number: Ints | Ints32, sums: Sums, told: _Judged) -> None:
+        """Lay down cells (m,); of those with too few points no more than number and spread."""
+        whole = np.empty((len(number), 6), np.float32)
         np.rint(told.elevation_m / KEPT_M, out=whole[:, 0], casting="same_kind")
         whole[:, 0] *= KEPT_M
         whole[:, 1], whole[:, 2], whole[:, 3] = told.change_m, told.sigma_m, told.random_m
@@ -162,16 +162,17 @@ class _Made:
         whole.view(np.int32)[:, 5] = sums.count
         enough = sums.count >= self.min_points
         whole[~enough, :4] = np.nan
-        _as_one(self.memory).reshape(-1)[cell] = _as_one(whole)
-        self.quality.reshape(-1)[cell[enough]] = told.flags[enough]
+        _as_one(self.memory)[number] = _as_one(whole)
+        self.quality[number[enough]] = told.flags[enough]
         for name, values in told.terms.items():
-            self.terms[name].reshape(-1)[cell[enough]] = values[enough]
+            self.terms[name][number[enough]] = values[enough]
 
-    def measurement(self, grid: Grid) -> Measurement:
+    def measurement(self, grid: Grid, number: Ints32) -> Measurement:
         """Return all that was laid down."""
-        elevation_m, change_m, uncertainty_m, random_m, spread_m, _ = np.moveaxis(self.memory, -1, 0)
-        surface = Surface(grid, elevation_m, change_m, self.memory.view(np.int32)[..., 5], spread_m)
-        return Measurement(surface, uncertainty_m, random_m, self.quality, self.terms)
+        elevation_m, change_m, uncertainty_m, random_m, spread_m, _ = self.memory.T
+        count = self.memory.view(np.int32)[:, 5]
+        told = change_m, uncertainty_m, random_m, spread_m, count, self.quality
+        return Measurement(grid, number, elevation_m, *told, self.terms)
 
 
 @dataclass(frozen=True)

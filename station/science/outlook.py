@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from station.quantities import UPRIGHT, Bools, Floats, Floats32, Grid, Ints, Reals, Reference, Scanner
+from station.quantities import UPRIGHT, Bools, Floats, Floats32, Grid, Ints, Ints32, Reals, Reference, Scanner
 from station.science import ground, shared, terrain
 from station.science.shared import Basis, Sensitivities
 from station.science.terrain import Ground, smooth_gradient
@@ -58,7 +58,7 @@ class Trait(IntFlag):
 class Sector:
     """Known cells (n,) between two knots of the lean, by number."""
 
-    cell: NDArray[np.int32]  # in the flattened grid
+    cell: Ints32  # in the flattened grid
     height_m: Floats32  # mean of the reference over the cell, above its datum
     east_gradient: Floats32
     north_gradient: Floats32
@@ -85,11 +85,11 @@ class Sector:
 class Outlook:
     """A reference as seen from one place. No place: on the map, by others' registration.
 
-    `rise_m` and `known` (ny, nx) are those of `terrain.Ground`, above `datum_m`. `cells` are the fields of
-    `Sector` (n,), and `shot_m2`, the random variance of one shot, and `usual`, the share of the reference's
-    scans that saw the cell. Of these `bounds` part the sectors, each into the cells that an adjustment looks
-    at and the others: of very many a part tells all there is to tell. Arrays may be read only as they are
-    sliced.
+    `rise_m` and `number` (ny, nx) are those of `terrain.Ground`, above `datum_m`. `cells` are, by number, the
+    fields of `Sector` (n,), and `shot_m2`, the random variance of one shot, and `usual`, the share of the
+    reference's scans that saw the cell. Of these `bounds` part the sectors, each into the cells that an
+    adjustment looks at and the others: of very many a part tells all there is to tell. Arrays may be read
+    only as they are sliced.
     """
 
     reference: Reference
@@ -97,7 +97,7 @@ class Outlook:
     position_m: Position | None
     datum_m: float
     rise_m: Floats32
-    known: Bools
+    number: Ints32
     bounds: Ints  # (2 sectors + 1,)
     one_in: tuple[int, int]  # of so many cells an adjustment looks at one: of moving ones, of stable ones
     cells: Mapping[str, Array]
@@ -109,21 +109,24 @@ class Outlook:
 
     def ground(self) -> Ground:
         """Return the reference as shots look it up."""
-        return Ground(self.grid, self.datum_m, np.asarray(self.rise_m), np.asarray(self.known))
+        return Ground(self.grid, self.datum_m, np.asarray(self.rise_m), self.number)
 
-    def sectors(self, *, looked_at: bool = False) -> Iterator[Sector]:
-        """Give the sectors that have cells, or only those cells that an adjustment looks at."""
+    def sectors(self, *, looked_at: bool = False) -> Iterator[tuple[int, Sector]]:
+        """Give the sectors that have cells, or only those cells that an adjustment looks at.
+
+        Each with the number of its first cell.
+        """
         last = 1 if looked_at else 2
         for first, end in zip(self.bounds[:-1:2].tolist(), self.bounds[last::2].tolist(), strict=True):
             if end > first:
-                yield Sector(**{one.name: self.cells[one.name][first:end] for one in fields(Sector)})
+                yield first, Sector(**{one.name: self.cells[one.name][first:end] for one in fields(Sector)})
 
     def having(self, *traits: Trait) -> Ints:
         """Return the numbers (m,) of the cells that have all these traits."""
         wanted = np.uint8(sum(traits))
-        return np.asarray(self.cells["cell"][:][(self.cells["trait"][:] & wanted) == wanted])
+        return np.flatnonzero((self.cells["trait"][:] & wanted) == wanted)
 
-    def offset_m(self, cell: NDArray[np.int32], height_m: Floats32) -> tuple[Floats32, Floats32, Floats32]:
+    def offset_m(self, cell: Ints32, height_m: Floats32) -> tuple[Floats32, Floats32, Floats32]:
         """Way from the scanner to cells (n,) of such a height, eastward, northward and up [m]."""
         assert self.position_m is not None  # noqa: S101 - the callers' case
         row, column = np.divmod(cell, np.int32(self.grid.nx))
@@ -177,7 +180,7 @@ def look(
     grid = reference.grid
     of = shared.basis(grid, position_m, axis) if position_m else None
     below = terrain.ground(reference)
-    count, first = int(np.count_nonzero(below.known)), 0
+    count, first = int(below.number.max()) + 1, 0
     cells = {name: np.empty(count, dtype) for name, dtype in CELLS.items()}
     for top in range(0, grid.ny, BAND_ROWS):
         rows = slice(top, min(top + BAND_ROWS, grid.ny))
@@ -197,8 +200,9 @@ def look(
     bounds = np.searchsorted(place[order], np.arange(2 * parts + 1))
     for name in cells:  # one after the other: together they are the most that a scan needs
         cells[name] = cells[name][order]
-    surface = below.datum_m, below.rise_m, below.known
-    return Outlook(reference, of, position_m, *surface, bounds, one_in, cells)
+    number = np.full(grid.shape, -1, np.int32)
+    number.reshape(-1)[cells["cell"]] = np.arange(count)
+    return Outlook(reference, of, position_m, below.datum_m, below.rise_m, number, bounds, one_in, cells)
 
 
 def gradients(
@@ -224,7 +228,7 @@ def _cells(
     published: bool,
 ) -> dict[str, Array]:
     """Return what `Outlook.cells` holds, of the known cells of some rows."""
-    grid, known = reference.grid, below.known[rows]
+    grid, known = reference.grid, below.number[rows] >= 0
     row, column = np.nonzero(known)
     first = max(rows.start - MARGIN_ROWS, 0)
     around_m = np.where(

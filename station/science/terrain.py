@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import ndimage
 
-from station.quantities import Bools, Floats, Floats32, Grid, Ints, Reals, Reference
+from station.quantities import Bools, Floats, Floats32, Grid, Ints, Ints32, Reals, Reference
 
 ALL = slice(None)
 BAND_ROWS = 128  # looked at together: what a store chunk is high
@@ -79,13 +79,19 @@ def _under_gaussian(values: Floats32, cells: float, rows: slice) -> Floats32:
 class Ground:
     """The reference surface as shots look it up: bilinear between nodes at the cell centres.
 
-    `rise_m` (ny, nx) is height above `datum_m`, extended by one ring of cells beyond what is `known`.
+    `rise_m` (ny, nx) is height above `datum_m`, extended by one ring of cells beyond what is `known`. Known
+    cells have a `number` (ny, nx), from nought, all others -1.
     """
 
     grid: Grid
     datum_m: float
     rise_m: Floats32
-    known: Bools
+    number: Ints32
+
+    @property
+    def known(self) -> Bools:
+        """Which cells (ny, nx) are known."""
+        return np.asarray(self.number >= 0)
 
     def height(self, column: Floats, row: Floats) -> Floats:
         """Height of the surface below points (n,) [m], as `under`.
@@ -155,14 +161,17 @@ def nodes_for(means: Floats) -> Floats:
 
 
 def ground(reference: Reference) -> Ground:
-    """Prepare a master surface for looking up."""
+    """Prepare a master surface for looking up, its known cells numbered row by row."""
     rise_m = np.empty(reference.grid.shape, np.float32)
-    known = np.empty(reference.grid.shape, bool)
-    datum_m = _datum(reference)
+    number = np.full(reference.grid.shape, -1, np.int32)
+    datum_m, first = _datum(reference), 0
     for rows in _bands(reference):
         rise_m[rows] = reference.elevation_m[rows] - datum_m
-        known[rows] = np.isfinite(rise_m[rows])
-    return Ground(reference.grid, datum_m, np.nan_to_num(extend(rise_m), copy=False), known)
+        known = np.isfinite(rise_m[rows])
+        end = first + int(np.count_nonzero(known))
+        number[rows][known] = np.arange(first, end)
+        first = end
+    return Ground(reference.grid, datum_m, np.nan_to_num(extend(rise_m), copy=False), number)
 
 
 def _datum(reference: Reference) -> float:

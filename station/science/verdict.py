@@ -9,9 +9,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-from station.quantities import Bools, Floats, Habits, Ints, Measurement
+from station.quantities import Bools, Floats, Habits, Ints, Ints32, Measurement
 from station.science.adjustment import Adjustment
 from station.science.outlook import Outlook, Trait
 from station.science.shared import LEAN_KNOT_RAD, LEAN_PER_REFRACTION
@@ -48,8 +47,8 @@ class View:
         return float(self.seen.sum()) / usual if usual >= FEWEST_CELLS else 1.0
 
 
-def view(count: NDArray[np.int32], outlook: Outlook) -> View:
-    """Count the cells that a scan saw, of `count` (ny, nx) points, against what the reference's saw."""
+def view(count: Ints32, outlook: Outlook) -> View:
+    """Count the cells that a scan saw, of `count` (n,) points, against what the reference's saw."""
     of, grid, position_m = outlook.of, outlook.grid, outlook.position_m
     if of is None or position_m is None:
         raise ValueError("without a place nothing is looked at")
@@ -59,14 +58,15 @@ def view(count: NDArray[np.int32], outlook: Outlook) -> View:
     )
     stretches = int(reach_m / STRETCH_M) + 1
     every = 1 + int(outlook.bounds[-1]) // CELLS_MOST
+    known = slice(None, outlook.bounds[-1], every)
     cell, height_m, passed, share = (
-        outlook.cells[name][::every] for name in ("cell", "height_m", "passed", "usual")
+        outlook.cells[name][known] for name in ("cell", "height_m", "passed", "usual")
     )
     east_m, north_m, _ = outlook.offset_m(cell, height_m)
     stretch = (np.hypot(east_m, north_m) / np.float32(STRETCH_M)).astype(np.int64)
     key = (passed / LEAN_PER_REFRACTION).astype(np.int64) * stretches + stretch
     usual = np.bincount(key, np.nan_to_num(share), sectors * stretches).astype(np.float64)
-    there = (share > 0) & (count.reshape(-1)[cell] > 0)
+    there = (share > 0) & (count[known] > 0)
     found = np.bincount(key, there, sectors * stretches).astype(np.float64)
     shape = (sectors, stretches)
     edges = of.start_rad + LEAN_KNOT_RAD * LEAN_PER_REFRACTION * np.arange(sectors + 1)
@@ -130,12 +130,9 @@ def distrust(found: Adjustment, habits: Habits) -> list[str]:
 def misfit(measured: Measurement, stable: Ints) -> list[str]:
     """Say by how much stable ground is off in a scan that is not adjusted, unless sigma holds it.
 
-    `stable` (n,) are its cells in the flattened grid. Half of them are off by more than the figure told,
-    either way.
+    `stable` (m,) are the numbers of its cells. Half of them are off by more than the figure told, either way.
     """
-    change_m, sigma_m = (
-        raster.reshape(-1)[stable] for raster in (measured.surface.change_m, measured.uncertainty_m)
-    )
+    change_m, sigma_m = measured.change_m[stable], measured.uncertainty_m[stable]
     seen = np.isfinite(change_m)
     if np.count_nonzero(seen) < FEWEST_STABLE:
         return []
@@ -163,7 +160,7 @@ def judge(
     fatal = [f"flagged: {flag}"] if flag else []
     reasons = list(lacking)
     if outlook is not None and outlook.of is not None:
-        told = view(measured.surface.count, outlook)
+        told = view(measured.count, outlook)
         (fatal if told.share < BLIND else reasons).extend(hidden(told))
     if found is not None and outlook is not None:
         reasons += distrust(found, outlook.reference.habits)

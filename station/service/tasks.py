@@ -47,7 +47,7 @@ from station.service.gather import Gathered, gather
 from station.service.inbox import Arrival
 
 Progress = Callable[[], None]
-CELLS_MOST = 2_000_000  # that the figures of a scan are of; of more, some rows
+CELLS_MOST = 2_000_000  # that the figures of a scan are of; of more, some
 MOST_REFUSED = 0.6  # of the stable ground; then the filtered log alone is safer
 
 
@@ -209,7 +209,7 @@ def _measure(
         progress()
         gridder = gridder_for(gathered.setup, outlook)
         survey(gridder, reader.blocks(brightness=site.adjusts), gathered.pose, progress)
-    if not gridder.seen().any():
+    if gridder.is_empty():
         raise ScanError("no point falls on the grid: wrong scans.frame, SOP, CRS or units?")
     progress()
     levelled = levelled_to(site, gridder, gathered, outlook)
@@ -387,7 +387,7 @@ def _numbers(measured: Measurement, gathered: Gathered, points: int) -> dict[str
     lean, setup = gathered.lean, gathered.setup
     told = {
         "point_total": float(points),
-        "coverage": float(np.mean(measured.surface.count > 0)),
+        "coverage": float(np.count_nonzero(measured.count) / measured.number.size),
     }
     if setup.position_m is not None:
         told |= dict(zip(("scanner_east", "scanner_north", "scanner_height"), setup.position_m, strict=True))
@@ -410,13 +410,13 @@ def numbers_of_air(gathered: Gathered) -> dict[str, float]:
 
 def _figures(epoch: store.Epoch, seconds: float) -> dict[str, float | str]:
     """Return what the log line and the status show of a scan."""
-    measured, grid = epoch.measurement, epoch.measurement.surface.grid
+    measured = epoch.measurement
     told: dict[str, float | str] = {
         "points": int(epoch.numbers["point_total"]),
-        "cells": round(epoch.numbers["coverage"] * grid.nx * grid.ny),
+        "cells": int(np.count_nonzero(measured.count)),
     }
-    part = slice(None, None, 1 + grid.nx * grid.ny // CELLS_MOST)
-    change_m, sigma_m = measured.surface.change_m[part], measured.uncertainty_m[part]
+    part = slice(None, None, 1 + len(measured.count) // CELLS_MOST)
+    change_m, sigma_m = measured.change_m[part], measured.uncertainty_m[part]
     seen = np.isfinite(sigma_m)
     if seen.any():
         told["sigma_median_m"] = round(float(np.median(sigma_m[seen])), 4)

@@ -5,7 +5,7 @@ import pytest
 
 from station.archive.layout import Series
 from station.archive.store import Epoch
-from station.quantities import Grid, Measurement, Shared, Surface
+from station.quantities import Grid, Measurement, Shared
 
 GRID = Grid(west_m=632000.0, north_m=5186000.0, cell_m=10.0, nx=150, ny=140)
 START_S = 1_763_683_200.0  # 2025-11-21 00:00 UTC
@@ -31,15 +31,23 @@ def make_epoch(hour, *, value=None, grid=GRID, terms=False):
     elevation = np.where(seen, 2800.0 + grid.y_m[:, None] / 1e6, np.nan)
     count = np.where(seen, 3, 0).astype(np.int32)
     sigma = np.where(seen, 0.05, np.nan).astype(np.float32)
-    surface = Surface(grid, elevation, change, count, sigma)
+    measured = Measurement.of(
+        grid,
+        seen.astype(np.uint8),
+        elevation_m=elevation,
+        change_m=change,
+        uncertainty_m=2 * sigma,
+        random_uncertainty_m=sigma,
+        spread_m=sigma,
+        count=count,
+        **({"sigma_geometry": sigma} if terms else {}),
+    )
     names = ("tilt_east", "tilt_north", "range_bias")
     return Epoch(
         start_s=START_S + 3600 * hour,
         end_s=START_S + 3600 * hour + 900,
         scan_id=f"251121_{hour % 24:02d}0000",
-        measurement=Measurement(
-            surface, 2 * sigma, sigma, seen.astype(np.uint8), {"sigma_geometry": sigma} if terms else {}
-        ),
+        measurement=measured,
         shared=Shared(names, ("rad", "rad", "m"), np.zeros(3), np.diag([1e-10, 2e-10, 1.6e-5]), np.zeros(3)),
         verdict="good",
         verdict_reason="",

@@ -16,7 +16,7 @@ from station.archive.layout import Series
 from station.archive.reference import write_reference
 from station.archive.series import build_series
 from station.errors import StoreError
-from station.quantities import Grid, Habits, Measurement, Reference, Shared, Surface
+from station.quantities import Grid, Habits, Measurement, Reference, Shared
 from station.science import ground, prior, shared
 from station.science.adjustment import adjust
 from station.science.patches import Patches
@@ -56,12 +56,21 @@ def epoch(hour, adjustment, unknown, *, empty=False):
     change_m = np.where(seen, rng.normal(hour / 10, 0.1, GRID.shape), np.nan).astype(np.float32)
     sigma_m = np.where(seen, rng.uniform(0.01, 0.1, GRID.shape), np.nan).astype(np.float32)
     elevation_m = np.where(seen, 2900.0, np.nan)
-    surface = Surface(GRID, elevation_m, change_m, seen.astype(np.int32), sigma_m)
+    measured = Measurement.of(
+        GRID,
+        seen.astype(np.uint8),
+        elevation_m=elevation_m,
+        change_m=change_m,
+        uncertainty_m=2 * sigma_m,
+        random_uncertainty_m=sigma_m,
+        spread_m=sigma_m,
+        count=seen.astype(np.int32),
+    )
     return store.Epoch(
         start_s=START_S + 3600 * hour,
         end_s=START_S + 3600 * hour + 900,
         scan_id=f"251121_{hour:02d}0000",
-        measurement=Measurement(surface, 2 * sigma_m, sigma_m, seen.astype(np.uint8), {}),
+        measurement=measured,
         shared=unknown,
         verdict="good",
         verdict_reason="",
@@ -252,7 +261,7 @@ def test_noise_that_is_in_the_estimate_too_goes_off_a_difference(filled):
     rng = np.random.default_rng(5)
     for hour in (12, 13):
         told = epoch(hour, "joint", drawn(hour, 0.02))
-        rock = np.where(rng.uniform(size=GRID.shape) < 0.4, 8, 0).astype(np.uint8)
+        rock = np.where(rng.uniform(size=GRID.shape) < 0.4, 8, 0).astype(np.uint8).ravel()
         measured = replace(
             told.measurement, quality=np.where(told.measurement.quality, rock, 0).astype(np.uint8)
         )

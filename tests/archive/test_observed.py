@@ -17,7 +17,7 @@ from station.archive.observed import RECENT, _overall, observe
 from station.archive.reference import write_reference
 from station.archive.series import build_series
 from station.errors import StoreError
-from station.quantities import Grid, Habits, Measurement, Quality, Reference, Shared, Surface
+from station.quantities import Grid, Habits, Measurement, Quality, Reference, Shared
 from station.science import ground, shared, terrain
 from station.science.sensitivity import INPUTS
 
@@ -83,16 +83,25 @@ def filled(folder, drawn, *, times=1.0, adjustment="joint"):
         change_m[: hour % 3, :] = np.nan
         seen = np.isfinite(change_m)
         flat = np.where(seen, np.float32(SIGMA_M), np.float32(np.nan))
-        surface = Surface(GRID, np.where(seen, ELEVATION_M, np.nan), change_m, seen.astype(np.int32), flat)
         quality = np.where(seen, stable, 0).astype(np.uint8)
         uncertainty_m = np.where(seen, sigma_m, np.nan).astype(np.float32)
+        measured = Measurement.of(
+            GRID,
+            quality,
+            elevation_m=np.where(seen, ELEVATION_M, np.nan),
+            change_m=change_m,
+            uncertainty_m=uncertainty_m,
+            random_uncertainty_m=flat,
+            spread_m=flat,
+            count=seen.astype(np.int32),
+        )
         store.write_epoch(
             series,
             store.Epoch(
                 start_s=START_S + 3600 * hour,
                 end_s=START_S + 3600 * hour + 900,
                 scan_id=f"251121_{hour:02d}0000",
-                measurement=Measurement(surface, uncertainty_m, flat, quality, {}),
+                measurement=measured,
                 shared=unknown(),
                 verdict="good",
                 verdict_reason="",

@@ -38,8 +38,12 @@ def written(path, way):
             for name, raster in values().items():
                 made[name][0] = np.ma.masked_invalid(raster)
     if way == "own":
-        write_rasters(path, [(BY_NAME[name], raster) for name, raster in values().items()])
+        written(path, {BY_NAME[name]: raster for name, raster in values().items()})
     return path
+
+
+def written(path, rasters):
+    write_rasters(path, list(rasters), lambda rows: [raster[rows] for raster in rasters.values()])
 
 
 def test_the_library_reads_what_it_would_have_written_itself(tmp_path):
@@ -68,7 +72,7 @@ def test_rows_are_those_of_the_whole(tmp_path):
     with netCDF4.Dataset(path, "w") as file:
         lay_out(file, series, "a test", None)
         define(file, plane, series, 1)
-    write_rasters(path, [(plane, given)])
+    written(path, {plane: given})
     raster = Raster(path, plane.name, lambda found: np.where(found == np.float32(FILL), np.nan, found))
     assert np.array_equal(np.asarray(raster), given, equal_nan=True)
     chosen = np.zeros(GRID.shape, bool)
@@ -86,7 +90,7 @@ def test_a_damaged_chunk_is_told(tmp_path):
     with netCDF4.Dataset(damaged, "w") as file:
         lay_out(file, series, "a test", None)
         define(file, plane, series, 1)
-    write_rasters(damaged, [(plane, values()["elevation"])])
+    written(damaged, {plane: values()["elevation"]})
     raster = Raster(damaged, "whole", as_they_are)
     size = damaged.stat().st_size
     with damaged.open("r+b") as file:

@@ -15,7 +15,7 @@ from station.archive.layout import Series
 from station.archive.reference import write_reference
 from station.archive.series import build_series
 from station.config import read_site
-from station.quantities import Grid, Measurement, Quality, Reference, Surface
+from station.quantities import Grid, Measurement, Quality, Reference
 from station.readers.polygons import mask, read_polygons
 from station.science.change import significant
 
@@ -66,12 +66,21 @@ def make_epoch(hour, *, grid=GRID, scan_id=None, reference="1"):
     count = np.where(seen, 4, 0).astype(np.int32)
     quality = np.where(significant(change_m, sigma_m), Quality.CHANGE_SIGNIFICANT, 0).astype(np.uint8)
     elevation_m = np.where(seen, 2800.0, np.nan)
-    surface = Surface(grid, elevation_m, change_m, count, random_m)
+    measured = Measurement.of(
+        grid,
+        quality,
+        elevation_m=elevation_m,
+        change_m=change_m,
+        uncertainty_m=sigma_m,
+        random_uncertainty_m=random_m,
+        spread_m=random_m,
+        count=count,
+    )
     return store.Epoch(
         start_s=START_S + 3600 * hour,
         end_s=START_S + 3600 * hour + 900,
         scan_id=scan_id or f"251121_{hour % 24:02d}0000",
-        measurement=Measurement(surface, sigma_m, random_m, quality, {}),
+        measurement=measured,
         shared=None,
         verdict="good" if hour % 2 else "degraded",
         verdict_reason="" if hour % 2 else f"no weather {EVIL}",

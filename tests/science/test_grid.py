@@ -25,13 +25,13 @@ def gridded(points, reference=None, splits=()):
     for x_m, y_m, z_m in zip(*(np.split(axis, splits) for axis in points), strict=True):
         inside, column, row = gridder.cells(x_m, y_m)
         z_m = z_m[inside]  # noqa: PLW2901 - only what lies on the grid
-        gridder.add(gridder.flat(column, row), z_m - gridder.datum_m, None)
+        gridder.add(gridder.numbered(column, row), z_m - gridder.datum_m, None)
     return gridder
 
 
 def test_mean_count_and_spread_against_plain_loops():
     x_m, y_m, z_m = scatter()
-    sums = gridded((x_m, y_m, z_m)).sums()
+    sums = gridded((x_m, y_m, z_m)).rasters()
     for row in range(GRID.ny):
         for column in range(GRID.nx):
             north, west = GRID.north_m - row * GRID.cell_m, GRID.west_m + column * GRID.cell_m
@@ -47,8 +47,8 @@ def test_mean_count_and_spread_against_plain_loops():
 @given(st.permutations(range(60)), st.lists(st.integers(0, 60), max_size=5))
 def test_order_and_blocks_change_nothing_at_all(order, splits):
     points = np.array(scatter(seed=1, count=60))
-    plain = gridded(points).sums()
-    mixed = gridded(points[:, order], splits=sorted(splits)).sums()
+    plain = gridded(points).rasters()
+    mixed = gridded(points[:, order], splits=sorted(splits)).rasters()
     assert np.array_equal(plain.mean_residual(), mixed.mean_residual(), equal_nan=True)
     assert np.array_equal(plain.spread(), mixed.spread(), equal_nan=True)
     assert np.array_equal(plain.intensity(), mixed.intensity(), equal_nan=True)
@@ -56,7 +56,7 @@ def test_order_and_blocks_change_nothing_at_all(order, splits):
 
 def test_edges_belong_to_the_cell_east_and_south():
     gridder = gridded((np.array([100.0, 102.5, 120.0]), np.array([250.0, 247.5, 240.0]), np.full(3, 3000.0)))
-    assert np.argwhere(gridder.sums().count).tolist() == [[0, 0], [1, 1]]
+    assert np.argwhere(gridder.rasters().count).tolist() == [[0, 0], [1, 1]]
 
 
 def test_residuals_to_a_sloping_reference_lose_the_sampling_error():
@@ -73,12 +73,12 @@ def test_residuals_to_a_sloping_reference_lose_the_sampling_error():
     for gridder in (flat, with_reference):
         _, column, row = gridder.cells(x_m, y_m)
         below = 0.0 if gridder is flat else known.under(column, row)[0]
-        gridder.add(gridder.flat(column, row), z_m - below, None)
-    count = flat.sums().count
+        gridder.add(gridder.numbered(column, row), z_m - below, None)
+    count = flat.rasters().count
     single = count == 2
-    plain = (flat.sums().mean_residual() - truth)[single].std()
+    plain = (flat.rasters().mean_residual() - truth)[single].std()
     assert plain == pytest.approx(
         math.sqrt(slope_sampling_variance(1.0, np.array(slope), np.array(2))), rel=0.05
     )
     interior = single[:, 1:-1]
-    assert np.abs(with_reference.sums().mean_residual()[:, 1:-1][interior]).max() < 1e-3
+    assert np.abs(with_reference.rasters().mean_residual()[:, 1:-1][interior]).max() < 1e-3

@@ -27,10 +27,10 @@ def scans(made, height, seed=1, count=24, rise=0.0):
     stack = Stack(GRID)
     cell = np.repeat(np.arange(GRID.nx * GRID.ny), 4)
     for _ in range(count):
-        gridder = Gridder(GRID, made, POSITION[2])
+        gridder = Gridder(GRID, None, POSITION[2])
         residual = (height - made.elevation_m + rise).ravel()[cell]
         noise = rng.normal(0, NOISE_M, len(cell))
-        gridder.add(cell, residual + noise, None)
+        gridder.add(gridder.numbered(cell % GRID.nx, cell // GRID.nx), residual + noise, None)
         stack.add(gridder, (SHOT_M2, np.zeros_like(SHOT_M2)), np.zeros_like(SHOT_M2))
     return stack
 
@@ -67,8 +67,8 @@ def test_cells_that_vary_more_than_modelled_are_told_so():
     restless[:, 40:50] = True
     sigma = np.where(restless, 0.15, NOISE_M).ravel()
     for _ in range(40):
-        gridder = Gridder(GRID, made, POSITION[2])
-        gridder.add(cell, rng.normal(0, sigma), None)
+        gridder = Gridder(GRID, None, POSITION[2])
+        gridder.add(gridder.numbered(cell % GRID.nx, cell // GRID.nx), rng.normal(0, sigma), None)
         stack.add(gridder, (SHOT_M2, np.zeros_like(SHOT_M2)), np.zeros_like(SHOT_M2))
     factor = improved(made, stack, POSITION, "2", Habits()).variance_factor
     assert 6 < np.median(factor[restless]) < 10  # nine, steps beyond six sigma cut
@@ -80,9 +80,9 @@ def test_the_usual_view_is_the_share_of_scans_that_saw_a_cell():
     stack = Stack(GRID)
     cell = np.arange(GRID.nx * GRID.ny)
     for scan in range(8):
-        gridder = Gridder(GRID, made, POSITION[2])
+        gridder = Gridder(GRID, None, POSITION[2])
         seen = cell[: len(cell) // 2] if scan < 6 else cell
-        gridder.add(seen, np.zeros(len(seen)), None)
+        gridder.add(gridder.numbered(seen % GRID.nx, seen // GRID.nx), np.zeros(len(seen)), None)
         stack.add(gridder)
     better = improved(made, stack, POSITION, "2", Habits())
     assert np.unique(better.seen[:25]).tolist() == [1.0]

@@ -77,7 +77,7 @@ def test_cell_means_of_a_curved_surface_and_back():
     rng = np.random.default_rng(2)
     grid = Grid(0.0, 300.0, 10.0, 30, 30)
     nodes = np.broadcast_to(grid.x_m, grid.shape) ** 2 / 2000
-    surface = terrain.Ground(grid, 0.0, nodes.astype(np.float32), np.ones(grid.shape, bool))
+    surface = terrain.Ground(grid, 0.0, nodes.astype(np.float32), np.ones(grid.shape, np.int32))
     column, row = rng.uniform(14, 15, (2, 200_000))
     assert terrain.cell_means(nodes)[14, 14] == pytest.approx(surface.under(column, row)[0].mean(), abs=1e-3)
     assert terrain.cell_means(nodes)[14, 14] - nodes[14, 14] == pytest.approx(0.0125, abs=1e-6)

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from station.quantities import Grid, Measurement, Reference, Scanner, Surface
+from station.quantities import Grid, Measurement, Reference, Scanner
 from station.science import verdict
 from station.science.outlook import look
 
@@ -24,7 +24,8 @@ def reference(seen=0.9):
 
 
 def view(seen, known):
-    return verdict.view(seen.astype(np.int32), look(known, NOWHERE, SCANNER, HERE))
+    outlook = look(known, NOWHERE, SCANNER, HERE)
+    return verdict.view(seen.astype(np.int32).ravel()[outlook.cells["cell"]], outlook)
 
 
 def told(seen):
@@ -97,13 +98,16 @@ def test_cells_that_later_scans_saw_but_the_surface_lacks_do_not_count():
     assert verdict.hidden(found) == []
 
 
-def measured(change_m, sigma_m, seen=None):
-    seen = chance(0.9) if seen is None else seen
-    change_m = np.where(seen, change_m, np.nan).astype(np.float32)
-    nought = np.zeros(GRID.shape, np.float32)
-    surface = Surface(GRID, change_m.astype(float), change_m, seen.astype(np.int32), nought)
-    sigma = np.full(GRID.shape, sigma_m, np.float32)
-    return Measurement(surface, sigma, sigma, nought.astype(np.uint8), {})
+def measured(change_m, sigma_m, seen, outlook):
+    """What a scan says of the cells of an outlook, or, without one, of all."""
+    cell = np.arange(GRID.nx * GRID.ny) if outlook is None else outlook.cells["cell"]
+    number = np.full(GRID.shape, -1, np.int32)
+    number.ravel()[cell] = np.arange(len(cell))
+    change_m = np.where(seen, change_m, np.nan).astype(np.float32).ravel()[cell]
+    nought, sigma = np.zeros(len(cell), np.float32), np.full(len(cell), sigma_m, np.float32)
+    count = seen.astype(np.int32).ravel()[cell]
+    told = change_m, sigma, sigma, nought, count, nought.astype(np.uint8)
+    return Measurement(GRID, number, change_m, *told, {})
 
 
 def of_scans():
@@ -119,8 +123,8 @@ STABLE = (AWAY < 500) & (X > 0)
 
 def judged(change_m=0.0, sigma_m=0.1, seen=None, lacking=(), z=None, stable=STABLE, known=None):
     noise = np.random.default_rng(5).normal(0, 0.1, GRID.shape)
-    told = measured(noise + change_m, sigma_m, seen)
     outlook = look(of_scans() if known is None else known, stable, SCANNER, HERE)
+    told = measured(noise + change_m, sigma_m, chance(0.9) if seen is None else seen, outlook)
     return verdict.judge("", lacking, told, outlook, None, z)
 
 
@@ -153,7 +157,7 @@ def test_ground_no_fit_has_seen_may_scatter_by_three_sigma():
 
 
 def test_without_a_reference_only_what_was_lacking_counts():
-    told = measured(0.0, 0.1, AWAY < 100)
+    told = measured(0.0, 0.1, AWAY < 100, None)
     assert verdict.judge("", (), told, None, None, None) == ("good", "")
     assert verdict.judge("", ("a",), told, None, None, None) == ("degraded", "a")
     flagged = verdict.judge("spring cleaning", ("a",), told, None, None, None)

@@ -11,7 +11,7 @@ from station.archive.layout import Series
 from station.archive.series import build_series
 from station.config import read_site
 from station.errors import StoreError
-from station.quantities import Grid, Measurement, Shared, Surface
+from station.quantities import Grid, Measurement, Shared
 from station.science.shared import GLOBAL
 from station.service import health, moved
 from station.service.once import process_scans
@@ -24,7 +24,8 @@ STEP = np.radians(0.02)
 
 def epoch(hour, pose, **changes):
     flat = np.zeros(GRID.shape, np.float32)
-    surface = Surface(GRID, flat.astype(float), flat, flat.astype(np.int32), flat)
+    names = ("elevation_m", "change_m", "uncertainty_m", "random_uncertainty_m", "spread_m")
+    rasters = dict.fromkeys(names, flat) | {"count": flat.astype(np.int32)}
     size = len(GLOBAL)
     estimate = np.concatenate([pose, np.zeros(size - len(pose))])
     names, units = zip(*GLOBAL, strict=True)
@@ -33,7 +34,7 @@ def epoch(hour, pose, **changes):
             start_s=START_S + 3600 * hour,
             end_s=START_S + 3600 * hour + 900,
             scan_id=f"scan {hour}",
-            measurement=Measurement(surface, flat, flat, flat.astype(np.uint8), {}),
+            measurement=Measurement.of(GRID, flat.astype(np.uint8), **rasters),
             shared=Shared(names, units, estimate, np.eye(size) * 1e-12, np.zeros(size)),
             verdict="good",
             verdict_reason="",
