@@ -38,11 +38,11 @@ def written(path, way):
             for name, raster in values().items():
                 made[name][0] = np.ma.masked_invalid(raster)
     if way == "own":
-        written(path, {BY_NAME[name]: raster for name, raster in values().items()})
+        put(path, {BY_NAME[name]: raster for name, raster in values().items()})
     return path
 
 
-def written(path, rasters):
+def put(path, rasters):
     write_rasters(path, list(rasters), lambda rows: [raster[rows] for raster in rasters.values()])
 
 
@@ -72,7 +72,7 @@ def test_rows_are_those_of_the_whole(tmp_path):
     with netCDF4.Dataset(path, "w") as file:
         lay_out(file, series, "a test", None)
         define(file, plane, series, 1)
-    written(path, {plane: given})
+    put(path, {plane: given})
     raster = Raster(path, plane.name, lambda found: np.where(found == np.float32(FILL), np.nan, found))
     assert np.array_equal(np.asarray(raster), given, equal_nan=True)
     chosen = np.zeros(GRID.shape, bool)
@@ -90,7 +90,7 @@ def test_a_damaged_chunk_is_told(tmp_path):
     with netCDF4.Dataset(damaged, "w") as file:
         lay_out(file, series, "a test", None)
         define(file, plane, series, 1)
-    written(damaged, {plane: values()["elevation"]})
+    put(damaged, {plane: values()["elevation"]})
     raster = Raster(damaged, "whole", as_they_are)
     size = damaged.stat().st_size
     with damaged.open("r+b") as file:
