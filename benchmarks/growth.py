@@ -278,7 +278,7 @@ def reading(folder: Path) -> dict[str, float]:
         join.write_joined(series, held, path, name, lambda: None)
     build_series(series)
     measured = epoch_of(FULL, starts[0], SEEN_OF_A_YEAR).measurement
-    seen = np.isfinite(measured.laid(measured.change_m)[0])
+    seen = np.isfinite(measured.laid("change_m")[0])
     share = ndimage.uniform_filter(seen.astype(np.float32), 100)
     row, column = np.unravel_index(np.argmax(share), FULL.shape)  # where all is seen
     box = slice(row - 50, row + 50), slice(column - 50, column + 50)

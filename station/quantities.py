@@ -203,46 +203,56 @@ class Quality(IntFlag):
     CHANGE_SIGNIFICANT = 16  # at the 95 % level
 
 
+MEASURED = np.dtype(
+    [
+        ("elevation_m", np.float32),
+        ("change_m", np.float32),  # mean residual to the reference, NaN where there is none
+        ("uncertainty_m", np.float32),  # of a single cell, everything included
+        ("random_uncertainty_m", np.float32),  # the part of it that averages out
+        ("spread_m", np.float32),  # standard deviation of the points in the cell
+        ("count", np.int32),
+    ]
+)
+
+
 @dataclass(frozen=True)
 class Measurement:
     """What a scan says of the surface, and how sure that is, cell by cell; all (n,).
 
     `number` (ny, nx) tells which they are: -1 where the scan saw nothing, and even the reference knows
-    nothing. `change_m` is the mean residual to the reference, NaN where there is none; everything is NaN (or
-    zero points) where the scan saw nothing. `uncertainty_m` is of a single cell, everything included;
-    `random_uncertainty_m` is the part of it that averages out. `terms` holds the budget of the scan's own
-    heights term by term, where asked for.
+    nothing. `cells` holds what `MEASURED` names, NaN (or no points) where the scan saw nothing; `terms` the
+    budget of the scan's own heights term by term, where asked for.
     """
 
     grid: Grid
     number: Ints32
-    elevation_m: Floats32
-    change_m: Floats32
-    uncertainty_m: Floats32
-    random_uncertainty_m: Floats32
-    spread_m: Floats32  # standard deviation of the points in the cell
-    count: Ints32
+    cells: NDArray[np.void]  # of MEASURED
     quality: NDArray[np.uint8]  # bits of Quality
     terms: dict[str, Floats32]
 
     @classmethod
     def of(cls, grid: Grid, quality: NDArray[np.uint8], **rasters: NDArray[Any]) -> Measurement:
-        """Take rasters (ny, nx), named as the columns, in which every cell has its number."""
+        """Take rasters (ny, nx), of terms too, in which every cell has its number."""
         number = np.arange(grid.nx * grid.ny, dtype=np.int32).reshape(grid.shape)
-        terms = {name: rasters.pop(name).ravel() for name in list(rasters) if name.startswith("sigma_")}
-        columns = {name: values.ravel() for name, values in rasters.items()}
-        return cls(grid, number, quality=quality.ravel(), terms=terms, **columns)
+        cells = np.empty(number.size, MEASURED)
+        for name in MEASURED.names or ():
+            cells[name] = rasters.pop(name).ravel()
+        return cls(grid, number, cells, quality.ravel(), {name: one.ravel() for name, one in rasters.items()})
 
-    def laid(self, *columns: NDArray[Any], rows: slice = slice(None)) -> list[NDArray[Any]]:
-        """Lay columns (n,) out on some rows of the grid, or all: NaN, or nought, where there is nothing."""
+    def laid(self, *names: str, rows: slice = slice(None)) -> list[NDArray[Any]]:
+        """Lay columns out on some rows of the grid, or all: NaN, or nought, where there is nothing."""
         number = self.number[rows]
         there = np.flatnonzero(number >= 0)
-        cells = number.reshape(-1)[there]
+        number_there = number.reshape(-1)[there]
+        cells = self.cells.take(number_there)  # at once: it is the cells that have to be waited for
         rasters = []
-        for values in columns:
-            nothing = np.nan if values.dtype.kind == "f" else 0
-            raster = np.full(number.shape, nothing, values.dtype)
-            raster.reshape(-1)[there] = values[cells]
+        for name in names:
+            if name in (self.cells.dtype.names or ()):
+                values = cells[name]
+            else:
+                values = (self.quality if name == "quality" else self.terms[name]).take(number_there)
+            raster = np.full(number.shape, np.nan if values.dtype.kind == "f" else 0, values.dtype)
+            raster.reshape(-1)[there] = values
             rasters.append(raster)
         return rasters
 

@@ -75,10 +75,10 @@ class Laid:
 
     def __init__(self, measured):
         self.measured = measured
-        self.terms = dict(zip(measured.terms, measured.laid(*measured.terms.values()), strict=True))
+        self.terms = dict(zip(measured.terms, measured.laid(*measured.terms), strict=True))
 
     def __getattr__(self, name):
-        return self.measured.laid(getattr(self.measured, name))[0]
+        return self.measured.laid(name)[0]
 
 
 def test_without_errors_the_surface_is_the_truth():

@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, overload
+from typing import TYPE_CHECKING, overload
 
 import h5py
 import netCDF4
@@ -26,6 +26,15 @@ if TYPE_CHECKING:
 
 STAMP = "%Y%m%dT%H%M%SZ"
 JOINED = {"days": "%Y%m%d", "months": "%Y%m"}  # kinds of joined files, by how each names its time
+COLUMNS = {  # of a measurement, by variable
+    "elevation": "elevation_m",
+    "elevation_change": "change_m",
+    "elevation_change_uncertainty": "uncertainty_m",
+    "elevation_change_random_uncertainty": "random_uncertainty_m",
+    "elevation_spread": "spread_m",
+    "point_count": "count",
+    "quality": "quality",
+}
 AIR = ("air_temperature", "air_pressure", "relative_humidity")  # variables, told where weather was known
 _EPOCH_NAME = re.compile(r"_(\d{8}T\d{6}Z)(?:_r(\d+))?\.nc$")
 
@@ -87,11 +96,8 @@ def write_epoch(series: Series, epoch: Epoch, newer_than: int = 0) -> Stored:
         with netCDF4.Dataset(beside, "w", clobber=False) as file:
             _write(file, series, epoch, path.name)
         columns = _columns(epoch.measurement)
-        write_rasters(
-            beside,
-            [BY_NAME[name] for name in columns],
-            lambda rows: epoch.measurement.laid(*columns.values(), rows=rows),
-        )
+        rows = [BY_NAME[name] for name in columns]
+        write_rasters(beside, rows, lambda band: epoch.measurement.laid(*columns.values(), rows=band))
     return Stored(path, start, revision)
 
 
@@ -335,18 +341,9 @@ def _write(file: netCDF4.Dataset, series: Series, epoch: Epoch, name: str) -> No
     _write_words(file, series, epoch, name)
 
 
-def _columns(measured: Measurement) -> dict[str, np.ndarray[Any, Any]]:
+def _columns(measured: Measurement) -> dict[str, str]:
     """Return what is kept of each cell, by variable."""
-    return {
-        "elevation": measured.elevation_m,
-        "elevation_change": measured.change_m,
-        "elevation_change_uncertainty": measured.uncertainty_m,
-        "elevation_change_random_uncertainty": measured.random_uncertainty_m,
-        "elevation_spread": measured.spread_m,
-        "point_count": measured.count,
-        "quality": measured.quality,
-        **{term: measured.terms[term] for term in TERMS if term in measured.terms},
-    }
+    return COLUMNS | {term: term for term in TERMS if term in measured.terms}
 
 
 def _write_words(file: netCDF4.Dataset, series: Series, epoch: Epoch, name: str) -> None:

@@ -159,9 +159,9 @@ class Gridder:
         laid[:, there] = self._sums[self.number[there]].T
         return Sums(*laid)
 
-    def memory(self) -> NDArray[np.float32]:
-        """Give the sums away: (numbers, 6), to be overwritten once read."""
-        return self._sums[: self.taken].view(np.float32)
+    def memory(self) -> NDArray[np.uint8]:
+        """Give the sums away, all that there is of each cell in turn, to be overwritten once read."""
+        return self._sums[: self.taken].reshape(-1).view(np.uint8)
 
 
 class Stack:

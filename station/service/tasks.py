@@ -387,7 +387,7 @@ def _numbers(measured: Measurement, gathered: Gathered, points: int) -> dict[str
     lean, setup = gathered.lean, gathered.setup
     told = {
         "point_total": float(points),
-        "coverage": float(np.count_nonzero(measured.count) / measured.number.size),
+        "coverage": float(np.count_nonzero(measured.cells["count"]) / measured.number.size),
     }
     if setup.position_m is not None:
         told |= dict(zip(("scanner_east", "scanner_north", "scanner_height"), setup.position_m, strict=True))
@@ -413,10 +413,10 @@ def _figures(epoch: store.Epoch, seconds: float) -> dict[str, float | str]:
     measured = epoch.measurement
     told: dict[str, float | str] = {
         "points": int(epoch.numbers["point_total"]),
-        "cells": int(np.count_nonzero(measured.count)),
+        "cells": int(np.count_nonzero(measured.cells["count"])),
     }
-    part = slice(None, None, 1 + len(measured.count) // CELLS_MOST)
-    change_m, sigma_m = measured.change_m[part], measured.uncertainty_m[part]
+    part = slice(None, None, 1 + len(measured.cells) // CELLS_MOST)
+    change_m, sigma_m = (measured.cells[name][part] for name in ("change_m", "uncertainty_m"))
     seen = np.isfinite(sigma_m)
     if seen.any():
         told["sigma_median_m"] = round(float(np.median(sigma_m[seen])), 4)

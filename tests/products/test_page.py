@@ -148,7 +148,7 @@ def test_the_limit_is_fixed_once(write, series, small):
     folder = write()
     kept = json.loads((folder / "limit.json").read_text())["change_limit_m"]
     with np.errstate(invalid="ignore"):
-        sigma_m = small.make_epoch(0).measurement.uncertainty_m
+        sigma_m = small.make_epoch(0).measurement.cells["uncertainty_m"]
     assert 10 * np.nanmedian(sigma_m) <= kept <= 25 * np.nanmedian(sigma_m)
     store.revisions(series, store.rows(series)[0].start)[0].path.unlink()
     assert gallery._limit(series, folder, None) == kept  # the first epoch is asked no more

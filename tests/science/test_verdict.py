@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from station.quantities import Grid, Measurement, Reference, Scanner
+from station.quantities import MEASURED, Grid, Measurement, Reference, Scanner
 from station.science import verdict
 from station.science.outlook import look
 
@@ -103,11 +103,10 @@ def measured(change_m, sigma_m, seen, outlook):
     cell = np.arange(GRID.nx * GRID.ny) if outlook is None else outlook.cells["cell"]
     number = np.full(GRID.shape, -1, np.int32)
     number.ravel()[cell] = np.arange(len(cell))
-    change_m = np.where(seen, change_m, np.nan).astype(np.float32).ravel()[cell]
-    nought, sigma = np.zeros(len(cell), np.float32), np.full(len(cell), sigma_m, np.float32)
-    count = seen.astype(np.int32).ravel()[cell]
-    told = change_m, sigma, sigma, nought, count, nought.astype(np.uint8)
-    return Measurement(GRID, number, change_m, *told, {})
+    cells = np.zeros(len(cell), MEASURED)
+    cells["change_m"] = np.where(seen, change_m, np.nan).ravel()[cell]
+    cells["uncertainty_m"], cells["count"] = sigma_m, seen.ravel()[cell]
+    return Measurement(GRID, number, cells, np.zeros(len(cell), np.uint8), {})
 
 
 def of_scans():
