@@ -27,7 +27,7 @@ def plane():
 
 
 def all_of(sectors):
-    parts = list(sectors)
+    _, parts = zip(*sectors, strict=True)
     return {name: np.concatenate([getattr(one, name) for one in parts]) for name in vars(parts[0])}
 
 
@@ -35,6 +35,10 @@ def test_every_known_cell_comes_once_and_in_the_order_of_the_head():
     seen_from = look(plane(), STABLE, VZ6000, HERE)
     cells = all_of(seen_from.sectors())
     assert np.array_equal(np.sort(cells["cell"]), np.flatnonzero(KNOWN))
+    assert np.array_equal(seen_from.number.ravel()[cells["cell"]], np.arange(len(cells["cell"])))
+    assert (seen_from.number[~KNOWN] == -1).all()
+    for first, part in seen_from.sectors():
+        assert np.array_equal(seen_from.cells["cell"][first : first + len(part)], part.cell)
     knot = cells["passed"].astype(int)
     assert (np.diff(knot) >= 0).all()
     row, column = np.divmod(cells["cell"], GRID.nx)
@@ -63,7 +67,8 @@ def test_cells_are_seen_as_geometry_has_it():
     wanted_m2 = (0.010 * cos / upright) ** 2 + (range_m * angle_rad / upright) ** 2 * (1 - cos**2)
     assert cells["scatter_m2"][amidst] == pytest.approx(wanted_m2, rel=0.02)
     stable = seen_from.having(Trait.STABLE)
-    assert np.array_equal(np.sort(stable), np.flatnonzero(KNOWN & STABLE))
+    stable_cells = seen_from.cells["cell"][stable]
+    assert np.array_equal(np.sort(stable_cells), np.flatnonzero(KNOWN & STABLE))
 
 
 @pytest.mark.parametrize("moving_most", [3000, 9000])
@@ -90,7 +95,7 @@ def test_single_precision_is_enough_for_what_cells_share():
     flat = np.eye(len(unknown.names)) * np.diag(unknown.covariance)
     for covariance in (unknown.covariance, flat):
         told = Shared(unknown.names, unknown.units, unknown.estimate, covariance, unknown.noise_variance)
-        for sector in list(seen_from.sectors())[::10]:
+        for _, sector in list(seen_from.sectors())[::10]:
             single = seen_from.felt(sector)
             assert single.lean.dtype == np.float32
             view = seen_from.view(sector)
@@ -99,10 +104,10 @@ def test_single_precision_is_enough_for_what_cells_share():
 
 
 def test_without_a_place_sectors_are_parts_of_the_grid(monkeypatch):
-    (only,) = look(plane(), STABLE, VZ6000, None).sectors()
+    ((_, only),) = look(plane(), STABLE, VZ6000, None).sectors()
     assert np.array_equal(only.cell, np.flatnonzero(KNOWN))
     assert only.scatter_m2 == pytest.approx(0.010**2)
     monkeypatch.setattr(outlook, "TOGETHER", 1000)
-    parts = list(look(plane(), STABLE, VZ6000, None).sectors())
+    parts = [part for _, part in look(plane(), STABLE, VZ6000, None).sectors()]
     assert max(map(len, parts)) == 1000
     assert np.array_equal(np.concatenate([part.cell for part in parts]), only.cell)
