@@ -19,7 +19,7 @@ from station import __version__
 from station.archive.layout import Series, written_whole
 from station.archive.store import Row
 from station.products.colours import round_up
-from station.products.look import Base, base_of, look_at
+from station.products.look import Base, Look, base_of, look_at
 from station.products.maps import Caption, change_map, encoded, points_map, sigma_map
 from station.quantities import Grid
 
@@ -38,6 +38,7 @@ class Measured(NamedTuple):
     start: datetime
     version: str  # of the reference
     verdict: str  # what the caption says of it
+    look: Look | None = None  # where it need not be read
 
     @property
     def row(self) -> Row:
@@ -101,7 +102,10 @@ def hang(
             if drawn == MOST_DRAWN:
                 continue
             caption = Caption(style.station, f"{row.start:%Y-%m-%d %H:%M} UTC", one.verdict)
-            _draw(series, folder, row, one.version, caption, style.width_px, limit_m, name, last=last)
+            look = one.look or look_at(
+                row, kept_base(series, folder, one.version, style.width_px), points=last
+            )
+            _draw(look, place, caption, style.width_px, limit_m, name, last=last)
             drawn += 1
             progress()
         hung.append(Hung(row.start, f"maps/{name}"))
@@ -133,23 +137,13 @@ def thinned(starts: list[datetime]) -> list[int]:
 
 
 def _draw(
-    series: Series,
-    folder: Path,
-    row: Row,
-    version: str,
-    caption: Caption,
-    width_px: int,
-    limit_m: float,
-    name: str,
-    *,
-    last: bool,
+    look: Look, place: Path, caption: Caption, width_px: int, limit_m: float, name: str, *, last: bool
 ) -> None:
-    look = look_at(row, kept_base(series, folder, version, width_px), points=last)
     pictures = [change_map(look, caption, limit_m, width_px, "the reference")]
     if last:
         pictures += [sigma_map(look, caption, limit_m, width_px), points_map(look, caption, width_px)]
     for file, picture in zip(_names(name, last=last), pictures, strict=True):
-        put(folder / "maps" / file, encoded(picture))
+        put(place / file, encoded(picture))
 
 
 def put(path: Path, content: bytes) -> None:

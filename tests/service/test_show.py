@@ -7,7 +7,8 @@ from dataclasses import replace
 import station
 from station.config import read_site
 from station.service.once import process_scans
-from station.service.show import page_folder, show
+from station.service.pictures import page_folder
+from station.service.show import show
 from station.simulation.station import simulate, tiny
 
 
