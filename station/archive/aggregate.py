@@ -115,7 +115,7 @@ class Aggregates:
         change_m = held[0].change_m[seen] - (0.0 if other is None else held[1].change_m[seen])
         random_m2 = self._random(held, chosen, seen)
         box = _box(cells, 0)
-        around_m, noise_m2 = np.full(cells.shape, np.nan)[box], np.zeros(cells[box].shape)
+        around_m, noise_m2 = np.full(cells[box].shape, np.nan), np.zeros(cells[box].shape)
         around_m[chosen[box]], noise_m2[chosen[box]] = change_m, np.sum(random_m2, axis=0)
         weights, reach = area_weights(cells[box], chosen[box])
         chosen_weights = weights[chosen[box]]
