@@ -7,6 +7,7 @@ import json
 import time
 import zipfile
 from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from datetime import datetime, timedelta
 from pathlib import Path
@@ -26,6 +27,7 @@ from station.quantities import Grid
 ALL_FOR = timedelta(days=2)  # before the newest epoch; then the last map of each day …
 DAILY_FOR = timedelta(days=60)  # … and before that the last of each month
 MOST_DRAWN = 8  # at a time: an archive that was there before the page is shown bit by bit
+TOGETHER = 2  # pictures; to encode them takes most of the time
 GRACE_S = 3600.0  # a page that is open somewhere may still name a map that is kept no longer
 SIGMAS_TO_THE_END = 10.0
 
@@ -139,11 +141,16 @@ def thinned(starts: list[datetime]) -> list[int]:
 def _draw(
     look: Look, place: Path, caption: Caption, width_px: int, limit_m: float, name: str, *, last: bool
 ) -> None:
-    pictures = [change_map(look, caption, limit_m, width_px, "the reference")]
-    if last:
-        pictures += [sigma_map(look, caption, limit_m, width_px), points_map(look, caption, width_px)]
-    for file, picture in zip(_names(name, last=last), pictures, strict=True):
-        put(place / file, encoded(picture))
+    names = _names(name, last=last)
+    drawings: list[Callable[[], Image.Image]] = [
+        lambda: change_map(look, caption, limit_m, width_px, "the reference"),
+        lambda: sigma_map(look, caption, limit_m, width_px),
+        lambda: points_map(look, caption, width_px),
+    ]
+    with ThreadPoolExecutor(TOGETHER) as pool:
+        pictures = pool.map(lambda draw: encoded(draw()), drawings[: len(names)])
+        for file, picture in zip(names, pictures, strict=True):
+            put(place / file, picture)
 
 
 def put(path: Path, content: bytes) -> None:

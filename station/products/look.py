@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -24,7 +26,7 @@ CHANGE, SIGMA, RANDOM = (
 )
 POINTS = "point_count"
 
-Cells = Raster | np.ndarray[Any, Any]  # (ny, nx), of which some rows are asked for at a time
+Bands = Callable[[slice], Iterable[np.ndarray[Any, Any]]]  # gives some rows (r, nx) of each of some rasters
 
 
 @dataclass(frozen=True)
@@ -66,12 +68,12 @@ def base_of(series: Series, version: str, pixels: int) -> Base:
     """
     path = series.folder / f"reference_{version}.nc"
     grid = series.grid
-    surface = Raster(path, "reference_elevation")
+    surface = _stored(path, None, "reference_elevation")
     rows, columns = _known(surface, grid)
     longer = max(rows.stop - rows.start, columns.stop - columns.start)
     factor = max(1, longer // pixels)
     rows, columns = (_whole(part, factor, n) for part, n in ((rows, grid.ny), (columns, grid.nx)))
-    (total,), count = _sums([surface], rows, columns, factor)
+    count, total = _sums(surface, rows, columns, factor)
     with np.errstate(invalid="ignore"):
         elevation_m = total / count
     part = Grid(
@@ -93,12 +95,13 @@ def look_at(epoch: Row | Measurement, base: Base, *, points: bool = False) -> Lo
     """
     where = base.rows, base.columns
     if base.factor == 1:
-        change_m, sigma_m = (_cells(raster, *where) for raster in _rasters(epoch, CHANGE, SIGMA))
+        both = _bands(epoch, CHANGE, SIGMA)(base.rows)
+        change_m, sigma_m = (_cells(values, base.columns) for values in both)
     else:
         change_m, sigma_m = _means(epoch, (*where, base.factor))
     mean_points = None
     if points:
-        (total,), _ = _sums(_rasters(epoch, POINTS), *where, base.factor)
+        _, total = _sums(_bands(epoch, POINTS), *where, base.factor)
         mean_points = np.where(total > 0, total / base.factor**2, np.nan).astype(np.float32)
     return Look(base, change_m, sigma_m, mean_points)
 
@@ -110,12 +113,13 @@ def look_between(row: Row, other: Row, base: Base, series: Series) -> Look:
     Raises StoreError where a file cannot be read.
     """
     where = base.rows, base.columns, base.factor
-    surface = Raster(series.folder / f"reference_{base.version}.nc", "reference_random_uncertainty")
-    (_, before_m2), known = _sums([surface, surface], *where)
+    name = "reference_random_uncertainty"
+    surface = _stored(series.folder / f"reference_{base.version}.nc", None, name, name)
+    known, _, before_m2 = _sums(surface, *where)
     total_m2 = np.zeros(base.shade.shape, np.float32)
     change_m = []
     for one in (row, other):
-        sums, count = _sums(_rasters(one, CHANGE, SIGMA, RANDOM), *where)
+        count, *sums = _sums(_bands(one, CHANGE, SIGMA, RANDOM), *where)
         with np.errstate(invalid="ignore", divide="ignore"):
             change_m.append(sums[0] / count)
             own_m2 = np.maximum(sums[2] / count - before_m2 / known, 0) / count
@@ -124,51 +128,46 @@ def look_between(row: Row, other: Row, base: Base, series: Series) -> Look:
     return Look(base, difference_m, np.where(np.isfinite(difference_m), np.sqrt(total_m2), np.nan), None)
 
 
-def _rasters(epoch: Row | Measurement, *names: str) -> list[Cells]:
+def _bands(epoch: Row | Measurement, *names: str) -> Bands:
     if isinstance(epoch, Row):
-        return [Raster(epoch.path, name, index=epoch.index) for name in names]
-    held: dict[str, Cells] = {
+        return _stored(epoch.path, epoch.index, *names)
+    held = {
         CHANGE: epoch.surface.change_m,
         SIGMA: epoch.uncertainty_m,
         RANDOM: epoch.random_uncertainty_m,
         POINTS: epoch.surface.count,
     }
-    return [held[name] for name in names]
+    return lambda rows: (held[name][rows] for name in names)
+
+
+def _stored(path: Path, index: int | None, *names: str) -> Bands:
+    rasters = [Raster(path, name, index=index) for name in names]
+    return lambda rows: (raster[rows] for raster in rasters)
 
 
 def _means(epoch: Row | Measurement, base: tuple[slice, slice, int]) -> tuple[Floats32, Floats32]:
     """Mean change of blocks of cells and its sigma: what they share is taken as one within a block."""
-    (total, sigma_m2, random_m2), count = _sums(_rasters(epoch, CHANGE, SIGMA, RANDOM), *base)
+    count, total, sigma_m2, random_m2 = _sums(_bands(epoch, CHANGE, SIGMA, RANDOM), *base)
     with np.errstate(invalid="ignore", divide="ignore"):
         shared_m2 = np.maximum(sigma_m2 - random_m2, 0) / count
         return total / count, np.sqrt(random_m2 / count**2 + shared_m2)
 
 
-def _sums(
-    variables: list[Cells], rows: slice, columns: slice, factor: int
-) -> tuple[list[Floats32], Floats32]:
-    """Sums over blocks of cells, band by band: of the first variable's values, of the others' squares.
+def _sums(bands: Bands, rows: slice, columns: slice, factor: int) -> list[Floats32]:
+    """Sums over blocks of cells: of ones where the first raster has a value, of that, of the others' squares.
 
-    And how many cells have a value in the first. Of what is stored, inflating it takes nearly all the time.
+    Band by band. Of what is stored, inflating it takes nearly all the time.
     """
-    ny, nx = ((part.stop - part.start) // factor for part in (rows, columns))
-    sums = [np.zeros((ny, nx), np.float32) for _ in variables]
-    count = np.zeros((ny, nx), np.float32)
-    for top in range(0, ny, max(1, BAND_ROWS // factor)):
-        bottom = min(top + max(1, BAND_ROWS // factor), ny)
-        band = slice(rows.start + top * factor, rows.start + bottom * factor)
-        for place, (variable, total) in enumerate(zip(variables, sums, strict=True)):
-            values = _read(variable, band, columns)
-            if place == 0:
-                seen = values < FILL / 2
-                if not seen.any():
-                    break
-                count[top:bottom] = _blocks(seen.astype(np.float32), factor)
-            values *= seen
-            if place > 0:
-                values *= values
-            total[top:bottom] = _blocks(values, factor)
-    return sums, count
+    told = []
+    height = max(1, BAND_ROWS // factor) * factor
+    for top in range(rows.start, rows.stop, height):
+        part = bands(slice(top, min(top + height, rows.stop)))
+        first, *others = (_filled(values, columns) for values in part)
+        seen = first < FILL / 2
+        first *= seen
+        squares = ((values * seen) ** 2 for values in others)
+        told.append([_blocks(values, factor) for values in (seen.astype(np.float32), first, *squares)])
+    return [np.concatenate(parts) for parts in zip(*told, strict=True)]
 
 
 def _blocks(values: Floats32, factor: int) -> Floats32:
@@ -182,24 +181,25 @@ def _blocks(values: Floats32, factor: int) -> Floats32:
     return np.asarray(total)
 
 
-def _read(variable: Cells, rows: slice, columns: slice) -> Floats32:
-    """Return a part of a raster as it stands in a file, with the fill where it has no value."""
-    values = variable[rows][:, columns].astype(np.float32)
-    return np.fmin(values, np.float32(FILL), out=values)
+def _filled(values: np.ndarray[Any, Any], columns: slice) -> Floats32:
+    """Return some columns as they stand in a file, with the fill where they have no value."""
+    part = values[:, columns].astype(np.float32)
+    return np.fmin(part, np.float32(FILL), out=part)
 
 
-def _cells(variable: Cells, rows: slice, columns: slice) -> Floats32:
-    """Read a part of a raster, NaN where it has no value."""
-    values = _read(variable, rows, columns)
+def _cells(raster: np.ndarray[Any, Any], columns: slice) -> Floats32:
+    """Return some columns, NaN where they have no value."""
+    values = _filled(raster, columns)
     values[values > FILL / 2] = np.nan
     return values
 
 
-def _known(variable: Raster, grid: Grid) -> tuple[slice, slice]:
+def _known(surface: Bands, grid: Grid) -> tuple[slice, slice]:
     """Rows and columns of the grid between which the surface is known somewhere."""
     rows, columns = np.zeros(grid.ny, bool), np.zeros(grid.nx, bool)
     for top in range(0, grid.ny, BAND_ROWS):
-        known = _read(variable, slice(top, min(top + BAND_ROWS, grid.ny)), slice(None)) < FILL / 2
+        (values,) = surface(slice(top, min(top + BAND_ROWS, grid.ny)))
+        known = values < FILL / 2
         rows[top : top + BAND_ROWS] = known.any(axis=1)
         columns |= known.any(axis=0)
     if not rows.any():
