@@ -36,6 +36,7 @@ PRELOAD = (
     "station.service.show",
     "station.service.child",
     "typer",  # of the command that a child, too, has as its main module
+    "PIL.WebPImagePlugin",  # without it, each child brings those of all kinds of pictures to write one
     "laspy",
     "lazrs",
     "netCDF4",
