@@ -48,7 +48,7 @@ class Look:
     base: Base
     change_m: Floats32  # NaN where not seen
     sigma_m: Floats32
-    points: Floats32 | None  # per cell, NaN where not seen; None where not asked for
+    points: Floats32 | None = None  # per cell, NaN where not seen; None where not asked for
 
     @property
     def seen(self) -> Bools:
@@ -93,17 +93,14 @@ def look_at(epoch: Row | Measurement, base: Base, *, points: bool = False) -> Lo
     pixel's sigma is that of its mean: what cells share does not average out. Raises StoreError where the file
     cannot be read.
     """
-    where = base.rows, base.columns
+    counted = (POINTS,) if points else ()
     if base.factor == 1:
-        both = _bands(epoch, CHANGE, SIGMA)(base.rows)
-        change_m, sigma_m = (_cells(values, base.columns) for values in both)
+        cells = _bands(epoch, CHANGE, SIGMA, *counted)(base.rows)
+        change_m, sigma_m, *total = (_cells(values, base.columns) for values in cells)
     else:
-        change_m, sigma_m = _means(epoch, (*where, base.factor))
-    mean_points = None
-    if points:
-        _, total = _sums(_bands(epoch, POINTS), *where, base.factor)
-        mean_points = np.where(total > 0, total / base.factor**2, np.nan).astype(np.float32)
-    return Look(base, change_m, sigma_m, mean_points)
+        change_m, sigma_m, *total = _means(epoch, base, *counted)
+    mean_points = [np.where(one > 0, one / base.factor**2, np.nan).astype(np.float32) for one in total]
+    return Look(base, change_m, sigma_m, *mean_points)
 
 
 def look_between(row: Row, other: Row, base: Base, series: Series) -> Look:
@@ -125,7 +122,7 @@ def look_between(row: Row, other: Row, base: Base, series: Series) -> Look:
             own_m2 = np.maximum(sums[2] / count - before_m2 / known, 0) / count
             total_m2 += own_m2 + np.maximum(sums[1] - sums[2], 0) / count
     difference_m = change_m[0] - change_m[1]
-    return Look(base, difference_m, np.where(np.isfinite(difference_m), np.sqrt(total_m2), np.nan), None)
+    return Look(base, difference_m, np.where(np.isfinite(difference_m), np.sqrt(total_m2), np.nan))
 
 
 def _bands(epoch: Row | Measurement, *names: str) -> Bands:
@@ -145,18 +142,23 @@ def _stored(path: Path, index: int | None, *names: str) -> Bands:
     return lambda rows: (raster[rows] for raster in rasters)
 
 
-def _means(epoch: Row | Measurement, base: tuple[slice, slice, int]) -> tuple[Floats32, Floats32]:
-    """Mean change of blocks of cells and its sigma: what they share is taken as one within a block."""
-    count, total, sigma_m2, random_m2 = _sums(_bands(epoch, CHANGE, SIGMA, RANDOM), *base)
+def _means(epoch: Row | Measurement, base: Base, *counted: str) -> tuple[Floats32, ...]:
+    """Mean change of blocks of cells and its sigma: what they share is taken as one within a block.
+
+    And the sums of rasters that count something.
+    """
+    bands, where = _bands(epoch, CHANGE, SIGMA, RANDOM, *counted), (base.rows, base.columns, base.factor)
+    count, total, sigma_m2, random_m2, *totals = _sums(bands, *where, len(counted))
     with np.errstate(invalid="ignore", divide="ignore"):
         shared_m2 = np.maximum(sigma_m2 - random_m2, 0) / count
-        return total / count, np.sqrt(random_m2 / count**2 + shared_m2)
+        return total / count, np.sqrt(random_m2 / count**2 + shared_m2), *totals
 
 
-def _sums(bands: Bands, rows: slice, columns: slice, factor: int) -> list[Floats32]:
+def _sums(bands: Bands, rows: slice, columns: slice, factor: int, counted: int = 0) -> list[Floats32]:
     """Sums over blocks of cells: of ones where the first raster has a value, of that, of the others' squares.
 
-    Band by band. Of what is stored, inflating it takes nearly all the time.
+    Of the `counted` last ones it is what they count. Band by band; of what is stored, inflating it takes
+    nearly all the time.
     """
     told = []
     height = max(1, BAND_ROWS // factor) * factor
@@ -165,8 +167,10 @@ def _sums(bands: Bands, rows: slice, columns: slice, factor: int) -> list[Floats
         first, *others = (_filled(values, columns) for values in part)
         seen = first < FILL / 2
         first *= seen
-        squares = ((values * seen) ** 2 for values in others)
-        told.append([_blocks(values, factor) for values in (seen.astype(np.float32), first, *squares)])
+        last = len(others) - counted
+        squares = ((values * seen) ** 2 for values in others[:last])
+        summed = seen.astype(np.float32), first, *squares, *others[last:]
+        told.append([_blocks(values, factor) for values in summed])
     return [np.concatenate(parts) for parts in zip(*told, strict=True)]
 
 
