@@ -176,7 +176,7 @@ def _await_report(
                 started = True
                 if kind != "progress":
                     return kind, value
-        except (EOFError, ConnectionResetError):
+        except (EOFError, OSError):  # before a word, or amid one
             return ("died", None) if started else _NOT_STARTED
     return None
 

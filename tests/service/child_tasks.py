@@ -6,6 +6,7 @@ import ctypes
 import os
 import signal
 import sys
+import threading
 import time
 from pathlib import Path
 
@@ -58,6 +59,13 @@ def killed_times(times, note, _progress):
     if size <= times:
         os.kill(os.getpid(), signal.SIGKILL)
     return size - 1
+
+
+def killed_amid_its_report(note, _progress):
+    if not Path(note).exists():
+        Path(note).touch()
+        threading.Timer(0.3, os.kill, (os.getpid(), signal.SIGKILL)).start()
+    return bytes(5_000_000)
 
 
 def abort(_progress):

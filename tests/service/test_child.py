@@ -93,6 +93,14 @@ def test_a_child_killed_once_or_twice_is_started_again(tasks, tmp_path):
     assert (tmp_path / "other").stat().st_size == 3
 
 
+def test_a_child_killed_amid_its_report_is_started_again(tasks, tmp_path):
+    """More than a pipe holds is told, and the parent looks when the child is gone."""
+    late = [1.0]
+    pause = lambda: time.sleep(late.pop() if late else 0)  # noqa: E731
+    assert len(run(tasks.killed_amid_its_report, str(tmp_path / "note"), on_progress=pause)) == 5_000_000
+    assert not late
+
+
 def test_a_stop_ends_the_pause_before_the_next_try(tasks, tmp_path, monkeypatch):
     monkeypatch.setattr(child, "PAUSES_S", (60.0,))
     until_s = time.monotonic() + 1.0
