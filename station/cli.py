@@ -366,7 +366,7 @@ def serve(
     """Show the station's page on this machine, read-only."""
     from station.config import read_site
     from station.products.serve import serve as show
-    from station.service.show import page_folder
+    from station.service.pictures import page_folder
 
     folder = page_folder(read_site(site))
     print(f"http://127.0.0.1:{port}/ (Ctrl-C ends it)", file=sys.stderr)

@@ -67,6 +67,7 @@ class Aggregates:
     def __init__(self, series: Series) -> None:
         self._series = series
         self._references: dict[str | None, Reference] = {}
+        self._felt: tuple[Held, Bools, Sensitivities] | None = None  # the last, asked for again by the median
 
     def reference(self, version: str | None = None) -> Reference:
         """Return a surface that change is measured from, the newest or a version.
@@ -115,7 +116,7 @@ class Aggregates:
         change_m = held[0].change_m[seen] - (0.0 if other is None else held[1].change_m[seen])
         random_m2 = self._random(held, chosen, seen)
         box = _box(cells, 0)
-        around_m, noise_m2 = np.full(cells.shape, np.nan)[box], np.zeros(cells[box].shape)
+        around_m, noise_m2 = np.full(cells[box].shape, np.nan), np.zeros(cells[box].shape)
         around_m[chosen[box]], noise_m2[chosen[box]] = change_m, np.sum(random_m2, axis=0)
         weights, reach = area_weights(cells[box], chosen[box])
         chosen_weights = weights[chosen[box]]
@@ -232,6 +233,11 @@ class Aggregates:
 
     def felt(self, held: Held, cells: Bools) -> Sensitivities:
         """Return what the chosen cells (ny, nx) of an epoch feel of its shared parameters."""
+        if self._felt is None or self._felt[0] is not held or self._felt[1] is not cells:
+            self._felt = held, cells, self._sensitivities(held, cells)
+        return self._felt[2]
+
+    def _sensitivities(self, held: Held, cells: Bools) -> Sensitivities:
         grid, elevation_m = self._series.grid, held.reference.elevation_m
         of, position_m = self._basis(held.scanner)
         rows, columns = _box(cells, MARGIN_CELLS)

@@ -95,6 +95,12 @@ def _unshuffled(raw: bytes, stored: np.dtype[Any]) -> Array:
     return np.asarray(values.view(stored))
 
 
+def _around(chosen: Any) -> slice:  # noqa: ANN401 - numpy has no type for it
+    """Return where the chosen (n,) lie, and the first where there is none."""
+    there = np.flatnonzero(chosen)
+    return slice(int(there[0]), int(there[-1]) + 1) if len(there) else slice(0, 1)
+
+
 def as_stored(values: Array) -> Array:
     """Return values as they stand in the file, fill included."""
     return values
@@ -157,16 +163,14 @@ class Raster:
 
     def __getitem__(self, rows: slice | tuple[slice, slice] | Array) -> Array:
         """Return some rows (r, nx), of some columns, or the chosen cells (n,) of a mask (ny, nx)."""
-        if isinstance(rows, tuple):
-            return self[rows[0]][:, rows[1]]
         if isinstance(rows, np.ndarray):
-            there = np.flatnonzero(rows.any(axis=1))
-            box = slice(there[0], there[-1] + 1) if len(there) else slice(0, 1)
+            box = _around(rows.any(axis=1)), _around(rows.any(axis=0))
             return np.asarray(self[box][rows[box]])
-        first, stop, step = rows.indices(self.shape[0])
+        rows, columns = rows if isinstance(rows, tuple) else (rows, slice(None))
+        (first, stop, step), (left, right, _) = rows.indices(self.shape[0]), columns.indices(self.shape[1])
         height = self._size[0]
         bands = range(first - first % height, stop, height)
-        held = [self._band(top)[max(first - top, 0) : stop - top] for top in bands]
+        held = [self._band(top, left, right)[max(first - top, 0) : stop - top] for top in bands]
         return (held[0] if len(held) == 1 else np.concatenate(held))[::step]
 
     def __array__(self, dtype: Any = None, copy: bool | None = None) -> Array:  # noqa: ANN401, FBT001 - numpy's
@@ -177,23 +181,25 @@ class Raster:
         """Return the number of rows."""
         return self.shape[0]
 
-    def _read(self, top: int) -> Array:
-        """Return the rows of chunks that begin at one."""
+    def _read(self, top: int, left: int, right: int) -> Array:
+        """Return the rows of chunks that begin at one, from a column to another."""
         height, width = self._size
-        ny, nx = self.shape
         chunks = self._chunks
         if chunks is None:
             with self._file() as file:
-                return self._made(file[self._name][(*self._epoch, slice(top, top + height))])
-        rows = np.full((min(height, ny - top), nx), self._fill, self._stored)
+                place = *self._epoch, slice(top, top + height), slice(left, right)
+                return self._made(file[self._name][place])
+        rows = np.full((min(height, self.shape[0] - top), right - left), self._fill, self._stored)
         try:
             with self._path.open("rb") as file:
-                for left in range(0, nx, width):
-                    if (top, left) in chunks:
-                        at, size = chunks[top, left]
+                for edge in range(left - left % width, right, width):
+                    if (top, edge) in chunks:
+                        at, size = chunks[top, edge]
                         raw = isal_zlib.decompress(os.pread(file.fileno(), size, at))
                         tile = _unshuffled(raw, self._stored).reshape(height, width)
-                        rows[:, left : left + width] = tile[: len(rows), : nx - left]
+                        first = max(edge, left)
+                        part = tile[: len(rows), first - edge : right - edge]
+                        rows[:, first - left : edge + width - left] = part
         except (OSError, ValueError, IsalError) as error:  # type: ignore[misc] # the stub has no class
             raise StoreError(f"{self._path}: damaged, cannot be read: {error}") from error
         return self._made(rows)

@@ -7,6 +7,7 @@ import json
 import time
 import zipfile
 from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from datetime import datetime, timedelta
 from pathlib import Path
@@ -19,13 +20,14 @@ from station import __version__
 from station.archive.layout import Series, written_whole
 from station.archive.store import Row
 from station.products.colours import round_up
-from station.products.look import Base, base_of, look_at
+from station.products.look import Base, Look, base_of, look_at
 from station.products.maps import Caption, change_map, encoded, points_map, sigma_map
 from station.quantities import Grid
 
 ALL_FOR = timedelta(days=2)  # before the newest epoch; then the last map of each day …
 DAILY_FOR = timedelta(days=60)  # … and before that the last of each month
 MOST_DRAWN = 8  # at a time: an archive that was there before the page is shown bit by bit
+TOGETHER = 2  # pictures; to encode them takes most of the time
 GRACE_S = 3600.0  # a page that is open somewhere may still name a map that is kept no longer
 SIGMAS_TO_THE_END = 10.0
 
@@ -38,6 +40,7 @@ class Measured(NamedTuple):
     start: datetime
     version: str  # of the reference
     verdict: str  # what the caption says of it
+    look: Look | None = None  # where it need not be read
 
     @property
     def row(self) -> Row:
@@ -101,7 +104,10 @@ def hang(
             if drawn == MOST_DRAWN:
                 continue
             caption = Caption(style.station, f"{row.start:%Y-%m-%d %H:%M} UTC", one.verdict)
-            _draw(series, folder, row, one.version, caption, style.width_px, limit_m, name, last=last)
+            look = one.look or look_at(
+                row, kept_base(series, folder, one.version, style.width_px), points=last
+            )
+            _draw(look, place, caption, style.width_px, limit_m, name, last=last)
             drawn += 1
             progress()
         hung.append(Hung(row.start, f"maps/{name}"))
@@ -133,23 +139,18 @@ def thinned(starts: list[datetime]) -> list[int]:
 
 
 def _draw(
-    series: Series,
-    folder: Path,
-    row: Row,
-    version: str,
-    caption: Caption,
-    width_px: int,
-    limit_m: float,
-    name: str,
-    *,
-    last: bool,
+    look: Look, place: Path, caption: Caption, width_px: int, limit_m: float, name: str, *, last: bool
 ) -> None:
-    look = look_at(row, kept_base(series, folder, version, width_px), points=last)
-    pictures = [change_map(look, caption, limit_m, width_px, "the reference")]
-    if last:
-        pictures += [sigma_map(look, caption, limit_m, width_px), points_map(look, caption, width_px)]
-    for file, picture in zip(_names(name, last=last), pictures, strict=True):
-        put(folder / "maps" / file, encoded(picture))
+    names = _names(name, last=last)
+    drawings: list[Callable[[], Image.Image]] = [
+        lambda: change_map(look, caption, limit_m, width_px, "the reference"),
+        lambda: sigma_map(look, caption, limit_m, width_px),
+        lambda: points_map(look, caption, width_px),
+    ]
+    with ThreadPoolExecutor(TOGETHER) as pool:
+        pictures = pool.map(lambda draw: encoded(draw()), drawings[: len(names)])
+        for file, picture in zip(names, pictures, strict=True):
+            put(place / file, picture)
 
 
 def put(path: Path, content: bytes) -> None:

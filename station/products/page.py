@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -17,6 +17,7 @@ from station import __version__
 from station.archive.layout import Series
 from station.archive.store import Named
 from station.products.gallery import Gallery, Measured, Style, hang, put
+from station.products.look import Look
 from station.products.maps import ASSETS
 from station.products.record import AreaRecord, Record, read_areas, read_record
 from station.quantities import Floats
@@ -48,6 +49,7 @@ class Told:
     set_aside: list[dict[str, Any]]  # scan, reason, since
     faults: list[str]
     seconds: dict[str, float]  # that a scan took, by its id
+    looks: dict[str, Look] = field(default_factory=dict)  # that need not be read, by the file of the epoch
 
 
 def write_page(
@@ -70,7 +72,7 @@ def write_page(
     gallery = Gallery([], None, None, None, (0, 0))
     if record is not None:
         style = Style(told.name or series.station_id, width_px, limit_m)
-        gallery = hang(series, folder, _measured(series, record), style, progress)
+        gallery = hang(series, folder, _measured(series, record, told.looks), style, progress)
     for name, parts in STATIC.items():
         put(folder / name, b"".join((ASSETS / part).read_bytes() for part in parts))
     data = {
@@ -93,14 +95,21 @@ def _script(path: Path, name: str, value: object) -> None:
     put(path, f"window.{name}={body};\n".encode("ascii"))
 
 
-def _measured(series: Series, record: Record) -> list[Measured]:
+def _measured(series: Series, record: Record, looks: dict[str, Look]) -> list[Measured]:
     """Return the epochs that have a reference."""
     rows = Named(series)
     starts = (datetime.fromtimestamp(start_s, UTC) for start_s in record.start_s.tolist())
     told = zip(starts, record.words["reference_version"], record.verdict, strict=True)
-    reasons = record.words["verdict_reason"]
+    reasons, files = record.words["verdict_reason"], record.words["epoch_file"]
     return [
-        Measured(rows, at, start, version, "" if verdict == "good" else f"{verdict}: {reasons[at]}")
+        Measured(
+            rows,
+            at,
+            start,
+            version,
+            "" if verdict == "good" else f"{verdict}: {reasons[at]}",
+            looks.get(files[at]),
+        )
         for at, (start, version, verdict) in enumerate(told)
         if version
     ]

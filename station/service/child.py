@@ -8,6 +8,7 @@ milliseconds. A task is a function a fresh interpreter can import; its last argu
 from __future__ import annotations
 
 import fcntl
+import math
 import multiprocessing
 import multiprocessing.connection
 import os
@@ -34,6 +35,8 @@ PRELOAD = (
     "station.service.tasks",
     "station.service.show",
     "station.service.child",
+    "typer",  # of the command that a child, too, has as its main module
+    "PIL.WebPImagePlugin",  # without it, each child brings those of all kinds of pictures to write one
     "laspy",
     "lazrs",
     "netCDF4",
@@ -90,7 +93,7 @@ def run(
 ) -> T:
     """Return what `task(*args, progress)` returns, computed in a child with `memory_gb` of its own.
 
-    `on_progress` is called here for each `progress()` there, and while waiting within `timeout_s`. Raises the
+    `on_progress` is called here after `progress()` there, and while waiting within `timeout_s`. Raises the
     StationError the task raised; ScanError where the child ran out of memory or time, panicked, or died by a
     signal of its own making; NotReadyError where `should_stop()` became true, or the child could not be
     started or was killed from outside, again and again; RuntimeError with the child's traceback for a bug.
@@ -174,7 +177,7 @@ def _await_report(
                 started = True
                 if kind != "progress":
                     return kind, value
-        except (EOFError, ConnectionResetError):
+        except (EOFError, OSError):  # before a word, or amid one
             return ("died", None) if started else _NOT_STARTED
     return None
 
@@ -210,7 +213,7 @@ def _work(there: Connection, task: Callable[..., object], args: tuple[object, ..
     resource.setrlimit(resource.RLIMIT_AS, (limit, limit))
     there.send(("progress", None))  # from here on a death is the task's own
     try:
-        there.send(("returned", task(*args, lambda: there.send(("progress", None)))))
+        there.send(("returned", task(*args, _teller(there))))
     except StationError as error:
         there.send(("refused", type(error)(str(error))))
     except MemoryError:
@@ -219,6 +222,19 @@ def _work(there: Connection, task: Callable[..., object], args: tuple[object, ..
         there.send(("bug", traceback.format_exc()))
     except BaseException as panic:  # noqa: BLE001 - lazrs panics past Exception
         there.send(("panicked", f"{type(panic).__name__}: {panic}"))
+
+
+def _teller(there: Connection) -> Callable[[], None]:
+    """Return what tells of progress, often enough and no more: each word takes the parent's time too."""
+    told_s = -math.inf
+
+    def progress() -> None:
+        nonlocal told_s
+        if (now_s := time.monotonic()) >= told_s + _TICK_S:
+            told_s = now_s
+            there.send(("progress", None))
+
+    return progress
 
 
 def _end_with_the_parent() -> None:

@@ -17,7 +17,7 @@ from station.config import Site, read_site
 from station.quantities import Quality
 from station.service.journal import Entry, State
 from station.service.once import one_line, process_scans
-from station.service.show import page_folder
+from station.service.pictures import page_folder
 from station.service.tasks import series_of
 from station.simulation.station import demo, simulate
 

@@ -32,6 +32,7 @@ from station.pipeline import (
     stable_figures,
     survey,
 )
+from station.products.look import Look
 from station.quantities import Bools, Measurement, Quality, Reference, Setup
 from station.readers.flags import flag_on, read_flags
 from station.readers.polygons import mask, read_polygons
@@ -45,6 +46,7 @@ from station.science.terrain import nodes_for
 from station.service.content import held_still, sha256_of
 from station.service.gather import Gathered, gather
 from station.service.inbox import Arrival
+from station.service.pictures import look_in_memory
 
 Progress = Callable[[], None]
 CELLS_MOST = 2_000_000  # that the figures of a scan are of; of more, some
@@ -65,6 +67,7 @@ class Outcome:
     figures: dict[str, float | str]
     log_sha256: str
     epoch_sha256: str  # of the file
+    look: Look | None = None  # for its pictures; without, they take it from the store
 
 
 @dataclass(frozen=True)
@@ -116,13 +119,15 @@ def attend(site: Site, arrival: Arrival, past: Past, progress: Progress) -> Outc
     if sha256 in past.stored:
         return Same(past.stored[sha256], sha256)
     progress()
-    return redo(site, arrival, past, progress)
+    return redo(site, arrival, past, progress, looked_at=site.products.page)
 
 
-def redo(site: Site, arrival: Arrival, past: Past, progress: Progress) -> Outcome | Refused:
+def redo(
+    site: Site, arrival: Arrival, past: Past, progress: Progress, *, looked_at: bool = False
+) -> Outcome | Refused:
     """Measure a scan, whatever is known of it, from the version of the reference it was measured from."""
     try:
-        return process(site, arrival, progress, patient=past.patient, past=past)
+        return process(site, arrival, progress, patient=past.patient, past=past, looked_at=looked_at)
     except ScanError as error:
         is_file = arrival.path.is_file() and not arrival.path.is_symlink()
         return Refused(
@@ -137,8 +142,9 @@ def process(
     *,
     patient: bool = False,
     past: Past = Past(),
+    looked_at: bool = False,
 ) -> Outcome:
-    """Measure a scan and store its epoch, unless just this is stored.
+    """Measure a scan and store its epoch, unless just this is stored; have a look at it if that is wanted.
 
     Raises ScanError where the scan cannot be used; NotReadyError where it changes meanwhile, begins in the
     future, or `patient` and still without weather shortly after its arrival.
@@ -165,6 +171,7 @@ def process(
         figures=_figures(epoch, time.monotonic() - began_s),
         log_sha256=epoch.provenance["log_sha256"],
         epoch_sha256=sha256_of(written.path),
+        look=look_in_memory(site, series, epoch) if looked_at else None,
     )
 
 

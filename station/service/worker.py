@@ -109,7 +109,7 @@ class Worker:
         alone = self._mending(publish)
         remember(self._journal, arrival.name, outcome)
         _say(arrival.name, outcome)
-        self.show(arrival.name, outcome.start_utc_s)
+        self.show(arrival.name, outcome)
         self._make_reference_when_due()
         if self._patient and alone > OPEN_EPOCHS:
             self.begin_joining(in_backlog=True)
@@ -263,13 +263,13 @@ class Worker:
         self.show()
         return False
 
-    def show(self, name: str = "", start_utc_s: float | None = None) -> None:
+    def show(self, name: str = "", outcome: Outcome | None = None) -> None:
         """Bring the page up to what is stored, and say if the scan just stored shows that the scanner moved.
 
         What fails there keeps no scan from the store.
         """
         try:
-            shown = self.run(show, start_utc_s)
+            shown = self.run(show, outcome)
         except (StationError, RuntimeError) as error:
             log.warning("%s", logfmt(page="failed", reason=error))
             return

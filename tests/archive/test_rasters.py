@@ -1,5 +1,6 @@
 """Rasters written and read past the netCDF library, against that library."""
 
+import h5py
 import netCDF4
 import numpy as np
 import pytest
@@ -78,9 +79,29 @@ def test_rows_are_those_of_the_whole(tmp_path):
     chosen = np.zeros(GRID.shape, bool)
     nothing, chosen[125:140, 7:150:3] = chosen.copy(), True
     rows = slice(0, 10), slice(120, 260), slice(290, 400), slice(5, 290, 3)
-    for part in (*rows, (slice(120, 130), slice(5, 140)), chosen, nothing):
+    boxes = (
+        (slice(120, 130), slice(5, 140)),
+        (slice(131, 300), slice(128, 210)),
+        (slice(0, 300), slice(130, 131)),
+    )
+    for part in (*rows, *boxes, chosen, nothing):
         assert np.array_equal(raster[part], given[part], equal_nan=True)
     assert (raster.shape, raster.dtype, len(raster)) == (GRID.shape, np.float32, GRID.ny)
+
+
+def test_of_a_box_no_chunk_beside_it_is_looked_at(tmp_path):
+    path = written(tmp_path / "own.nc", "own")
+    with h5py.File(path, "r") as file:
+        beside = file["elevation"].id.get_chunk_info_by_coord((0, 128, 0))
+    box = slice(128, 256), slice(128, 200)
+    before = Raster(path, "elevation", index=0)[box]
+    with path.open("r+b") as file:
+        file.seek(beside.byte_offset)
+        file.write(bytes(beside.size))
+    raster = Raster(path, "elevation", index=0)
+    assert np.array_equal(raster[box], before)
+    with pytest.raises(StoreError, match="damaged"):
+        raster[128:256]
 
 
 def test_a_damaged_chunk_is_told(tmp_path):

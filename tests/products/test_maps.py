@@ -12,6 +12,7 @@ from station.archive.aggregate import Aggregates
 from station.archive.layout import Series
 from station.archive.reference import write_reference
 from station.archive.series import build_series
+from station.products import maps
 from station.products.colours import change_scale, points_scale, round_up, sigma_scale
 from station.products.look import base_of, look_at, look_between
 from station.products.maps import MOST_BYTES, PAPER, Caption, change_map, encoded, points_map, sigma_map
@@ -92,6 +93,22 @@ def test_what_does_not_fit_is_a_mean_with_its_sigma(series, last, small, pixels)
     assert base.grid.y_m[-1] == pytest.approx(small.GRID.y_m[base.rows][-factor:].mean())
 
 
+@pytest.mark.parametrize("pixels", [WIDTH, 29, 11])
+def test_an_epoch_in_memory_looks_as_it_will_in_the_store(series, small, pixels):
+    epoch = small.make_epoch(11)
+    epoch.measurement.surface.change_m[21, 33] = np.nan  # points, but no change
+    base = base_of(series, "1", pixels)
+    told, read = (
+        look_at(one, base, points=True)
+        for one in (epoch.measurement, store.rows_in(store.write_epoch(series, epoch).path)[0])
+    )
+    assert np.isfinite(told.points).sum() > 100 * (base.factor == 1)
+    for name in ("change_m", "sigma_m", "points"):
+        one, other = getattr(told, name), getattr(read, name)
+        assert np.array_equal(np.isnan(one), np.isnan(other)), name
+        assert np.nanmax(np.abs(one - other)) <= 2**-11, name  # half of the last digit that a file keeps
+
+
 def test_sigma_between_two_epochs_is_that_of_the_store(series, small):
     """Cell by cell what `station.variance` says, where no parameters are shared."""
     before = len(store.rows(series))
@@ -134,6 +151,18 @@ def test_what_is_sent_keeps_grey_grey_and_colours_near(series, last):
     assert np.ptp(told[grey], axis=-1).max() <= 3
     assert np.abs(told - wanted).mean() < 4
     assert np.percentile(np.abs(told - wanted), 99) < 25
+
+
+def test_some_bands_tell_how_good_a_picture_may_be(monkeypatch):
+    """What comes out is what one quality after the other, on the whole, would have given."""
+    grey = np.random.default_rng(3).normal(150, 12, (700, 500)).clip(90, 250)
+    grey[:, 200:] = np.linspace(100, 240, 300)
+    picture = Image.fromarray(np.repeat(grey[..., None], 3, axis=-1).astype(np.uint8))
+    limits = 70_000, 38_000, 24_000, 17_000, 7_000, 500
+    found = [encoded(picture, most_bytes) for most_bytes in limits]
+    monkeypatch.setattr(maps, "SAMPLE_ONE_IN", 1)
+    assert found == [encoded(picture, most_bytes) for most_bytes in limits]
+    assert len({len(one) for one in found}) == len(limits)
 
 
 def test_scales_are_fixed_and_even():
