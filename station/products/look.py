@@ -11,7 +11,7 @@ import numpy as np
 
 from station.archive.layout import Series
 from station.archive.rasters import Raster
-from station.archive.store import Row
+from station.archive.store import COLUMNS, Row
 from station.archive.variables import FILL
 from station.quantities import Bools, Floats32, Grid, Measurement
 from station.science.change import significant
@@ -128,13 +128,7 @@ def look_between(row: Row, other: Row, base: Base, series: Series) -> Look:
 def _bands(epoch: Row | Measurement, *names: str) -> Bands:
     if isinstance(epoch, Row):
         return _stored(epoch.path, epoch.index, *names)
-    held = {
-        CHANGE: epoch.surface.change_m,
-        SIGMA: epoch.uncertainty_m,
-        RANDOM: epoch.random_uncertainty_m,
-        POINTS: epoch.surface.count,
-    }
-    return lambda rows: (held[name][rows] for name in names)
+    return lambda rows: epoch.laid(*(COLUMNS[name] for name in names), rows=rows)
 
 
 def _stored(path: Path, index: int | None, *names: str) -> Bands:

@@ -96,7 +96,8 @@ def test_what_does_not_fit_is_a_mean_with_its_sigma(series, last, small, pixels)
 @pytest.mark.parametrize("pixels", [WIDTH, 29, 11])
 def test_an_epoch_in_memory_looks_as_it_will_in_the_store(series, small, pixels):
     epoch = small.make_epoch(11)
-    epoch.measurement.surface.change_m[21, 33] = np.nan  # points, but no change
+    number = epoch.measurement.number[21, 33]
+    epoch.measurement.cells["change_m"][number] = np.nan  # points, but no change
     base = base_of(series, "1", pixels)
     told, read = (
         look_at(one, base, points=True)
