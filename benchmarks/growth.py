@@ -33,12 +33,15 @@ from station.archive.aggregate import AreaChange
 from station.archive.areas import update_areas
 from station.archive.layout import Series
 from station.archive.layout import text as letters_of
+from station.archive.opened import open_series
 from station.archive.reference import write_reference
 from station.archive.series import build_series
 from station.archive.sources import Source, read_source
 from station.config import Site, read_site
 from station.quantities import Bools, Grid, Measurement, Reference, Shared, Surface
 from station.science.shared import basis
+from station.service.content import sha256_of
+from station.service.integrity import store_files
 from station.service.journal import Entry, Journal, State
 from station.service.show import show
 from station.service.tasks import areas_of, series_of
@@ -168,12 +171,15 @@ def fill(site: Site, epochs: int, seen: float = 0.31, *, until: datetime | None 
     for kind, stamp, group in _closed(joined):
         place = series.folder / kind / group[0].strftime("%Y/%m" if kind == "days" else "%Y")
         name = group[0].strftime(stamp)
-        held = list(_turns(series, group, seen))
+        held = list((_days if kind == "months" else _turns)(series, group, seen))
         join.write_joined(series, held, place / f"{series.station_id}_{name}_r1.nc", name, lambda: None)
     for start in by_themselves:
         store.write_epoch(series, epoch_of(site.grid_cells, start, seen))
     with Journal(site.station.data / "journal.sqlite") as journal:
         journal.adopt(_entry(series, start) for start in starts)
+        journal.note_files(
+            {str(path.relative_to(series.folder)): sha256_of(path) for path in store_files(series)}
+        )
     build_series(series)
     update_areas(series, areas_of(site), _Quick(), lambda: None)
     publish(site, lambda: None)
@@ -204,28 +210,45 @@ def _closed(starts: list[datetime]) -> Iterator[tuple[str, str, list[datetime]]]
                 yield "days", "%Y%m%d", list(day)
 
 
-def _turns(series: Series, starts: list[datetime], seen: float) -> Iterator[Source]:
+def _turns(
+    series: Series, starts: list[datetime], seen: float, names: tuple[str, ...] | None = None
+) -> Iterator[Source]:
     """Give sources for epochs at these starts, which take turns with a few rasters."""
-    templates = []
-    for hour in range(DISTINCT):
-        made = replace(series, folder=series.folder.parent / "templates")
-        start = datetime(2020, 1, 1, hour, tzinfo=UTC)
-        path = store.epoch_folder(made, start) / f"{series.station_id}_{start:{store.STAMP}}.nc"
-        if not path.is_file():
-            store.write_epoch(made, epoch_of(series.grid, start, seen))
-        templates.append(read_source(path, 0, 0, 1))
+    made = replace(series, folder=series.folder.parent / "templates")
     for at, start in enumerate(starts):
-        template = templates[at % DISTINCT]
-        words = dict(template.words)
-        words["time"] = np.array([start.timestamp() + 450])
-        words["time_bnds"] = np.array([[start.timestamp(), start.timestamp() + 900]])
-        for name, value in (
-            ("epoch_file", f"{series.station_id}_{start:{store.STAMP}}.nc"),
-            ("scan_id", f"{start:%y%m%d_%H%M%S}"),
-            ("scan_sha256", np.random.default_rng(at).bytes(32).hex()),
-        ):
-            words[name] = letters_of([value], "text")
-        yield replace(template, at=at, words=words)
+        like = datetime(2020, 1, 1, at % DISTINCT, tzinfo=UTC)
+        path = store.epoch_folder(made, like) / f"{series.station_id}_{like:{store.STAMP}}.nc"
+        if not path.is_file():
+            store.write_epoch(made, epoch_of(series.grid, like, seen))
+        yield _only(_dated(read_source(path, 0, at, 1), series, [start]), names)
+
+
+def _days(
+    series: Series, starts: list[datetime], seen: float, names: tuple[str, ...] | None = None
+) -> Iterator[Source]:
+    """Give sources for the days of a month, each of which is the same day that was joined before."""
+    path = series.folder.parent / "templates" / "day.nc"
+    if not path.is_file():
+        day = [datetime(2020, 1, 1, hour, tzinfo=UTC) for hour in range(24)]
+        join.write_joined(series, list(_turns(series, day, seen, names)), path, "a day", lambda: None)
+    at = 0
+    for _, group in groupby(starts, lambda start: start.date()):
+        day = list(group)
+        yield _dated(read_source(path, 0, at, len(day)), series, day)
+        at += len(day)
+
+
+def _dated(source: Source, series: Series, starts: list[datetime]) -> Source:
+    """Return a source as if its epochs were of these starts."""
+    words, start_s = dict(source.words), np.array([start.timestamp() for start in starts])
+    words["time"], words["time_bnds"] = start_s + 450, np.stack([start_s, start_s + 900], axis=-1)
+    for name, values in (
+        ("epoch_file", [f"{series.station_id}_{start:{store.STAMP}}.nc" for start in starts]),
+        ("scan_id", [f"{start:%y%m%d_%H%M%S}" for start in starts]),
+        ("scan_sha256", [np.random.default_rng(int(one)).bytes(32).hex() for one in start_s]),
+    ):
+        words[name] = letters_of(values, "text")
+    return replace(source, words=words)
 
 
 def _entry(series: Series, start: datetime) -> Entry:
@@ -265,7 +288,8 @@ def reading(folder: Path) -> dict[str, float]:
     for kind, stamp, group in _closed(starts):
         name = group[0].strftime(stamp)
         path = series.folder / kind / f"{series.station_id}_{name}_r1.nc"
-        held = [replace(one, shapes=_only(one, READ)) for one in _turns(series, group, SEEN_OF_A_YEAR)]
+        made = _days if kind == "months" else _turns
+        held = list(made(series, group, SEEN_OF_A_YEAR, READ))
         join.write_joined(series, held, path, name, lambda: None)
     build_series(series)
     seen = np.isfinite(epoch_of(FULL, starts[0], SEEN_OF_A_YEAR).measurement.surface.change_m)
@@ -274,18 +298,22 @@ def reading(folder: Path) -> dict[str, float]:
     box = slice(row - 50, row + 50), slice(column - 50, column + 50)
 
     def open_map() -> object:
-        with store.open_series(series.folder) as told:
+        with open_series(series.folder) as told:
             return told.elevation_change[YEAR // 2].load()
 
     def open_box() -> object:
-        with store.open_series(series.folder) as told:
+        with open_series(series.folder) as told:
             return told.elevation_change[:, box[0], box[1]].load()
 
     return {"map_s": _wall(open_map), "box_year_s": _wall(open_box)}
 
 
-def _only(source: Source, names: tuple[str, ...]) -> dict[str, tuple[int, ...]]:
-    return {name: shape for name, shape in source.shapes.items() if name in names}
+def _only(source: Source, names: tuple[str, ...] | None) -> Source:
+    return (
+        source
+        if names is None
+        else replace(source, shapes={name: shape for name, shape in source.shapes.items() if name in names})
+    )
 
 
 def _wall(work: Callable[[], object]) -> float:

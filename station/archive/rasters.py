@@ -18,12 +18,12 @@ import numpy as np
 from isal import isal_zlib
 from isal.igzip_lib import IsalError
 
+from station.archive.tiles import Tiles, places, unpacked
 from station.archive.variables import FILL, Variable
 from station.errors import StoreError
 
 LEVEL = 1
 TOGETHER = 2  # chunks deflated or inflated at once
-FILTERS = (h5py.h5z.FILTER_SHUFFLE, h5py.h5z.FILTER_DEFLATE)
 KEPT_BANDS = 2  # rows of chunks that are kept unpacked: of a band of cells and what is around it
 
 Array = np.ndarray[Any, Any]
@@ -80,18 +80,6 @@ def _packed(row: Variable, values: Array, size: tuple[int, int]) -> bytes | None
     return isal_zlib.compress(np.ascontiguousarray(shuffled), LEVEL)
 
 
-def _unshuffled(raw: bytes, stored: np.dtype[Any]) -> Array:
-    """Return values (n,) whose first bytes stand first, then their second bytes, and so on."""
-    planes = np.frombuffer(raw, np.uint8).reshape(stored.itemsize, -1)
-    if stored.itemsize != 4:
-        return np.asarray(np.ascontiguousarray(planes.T).view(stored))
-    values = planes[3].astype(np.uint32)  # four times as fast
-    for plane in planes[2::-1]:
-        values <<= 8
-        values |= plane
-    return np.asarray(values.view(stored))
-
-
 def as_stored(values: Array) -> Array:
     """Return values as they stand in the file, fill included."""
     return values
@@ -128,24 +116,15 @@ class Raster:
             raise StoreError(f"{self._path}: cannot be read: {error}") from error
 
     @cached_property
-    def _chunks(self) -> dict[tuple[int, int], tuple[int, int]] | None:
-        """Where each chunk that holds something begins in the file, and its length.
+    def _chunks(self) -> dict[tuple[int, ...], tuple[int, int]] | None:
+        """Where each chunk that holds something begins in the file, and its length, by its corner.
 
-        None where the raster is packed in another way: by another program, and no need to be fast.
+        None where there are those of other epochs too, or they are packed in another way.
         """
         with self._file() as file:
             dataset = file[self._name]
-            plist = dataset.id.get_create_plist()
-            filters = tuple(plist.get_filter(k)[0] for k in range(plist.get_nfilters()))
-            if filters != FILTERS or dataset.chunks[:-2] not in ((), (1,)):
-                return None
-            found = {}
-            for top in range(0, self.shape[0], self._size[0]):
-                for left in range(0, self.shape[1], self._size[1]):
-                    chunk = dataset.id.get_chunk_info_by_coord((*self._epoch, top, left))
-                    if chunk.byte_offset is not None:
-                        found[top, left] = chunk.byte_offset, chunk.size
-        return found
+            alone = dataset.ndim == 2 or len(dataset) == 1
+            return places(dataset) if alone and Tiles(dataset).is_plain else None
 
     @property
     def dtype(self) -> np.dtype[Any]:
@@ -178,19 +157,27 @@ class Raster:
         """Return the rows of chunks that begin at one."""
         height, width = self._size
         ny, nx = self.shape
-        chunks = self._chunks
-        if chunks is None:
-            with self._file() as file:
-                return self._made(file[self._name][(*self._epoch, slice(top, top + height))])
         rows = np.full((min(height, ny - top), nx), self._fill, self._stored)
         try:
-            with self._path.open("rb") as file:
-                for left in range(0, nx, width):
-                    if (top, left) in chunks:
-                        at, size = chunks[top, left]
-                        raw = isal_zlib.decompress(os.pread(file.fileno(), size, at))
-                        tile = _unshuffled(raw, self._stored).reshape(height, width)
-                        rows[:, left : left + width] = tile[: len(rows), : nx - left]
-        except (OSError, ValueError, IsalError) as error:  # type: ignore[misc] # the stub has no class
+            if self._chunks is None:
+                self._read_from_many(rows, top)
+            else:
+                with self._path.open("rb") as file:
+                    for left in range(0, nx, width):
+                        if (corner := (*self._epoch, top, left)) in self._chunks:
+                            at, size = self._chunks[corner]
+                            part = slice(0, len(rows)), slice(0, min(width, nx - left))
+                            raw = os.pread(file.fileno(), size, at)
+                            rows[:, left : left + width] = unpacked(raw, self._stored, self._size, part)
+        except (OSError, RuntimeError, ValueError, IsalError) as error:  # type: ignore[misc] # the stub has no class
             raise StoreError(f"{self._path}: damaged, cannot be read: {error}") from error
         return self._made(rows)
+
+    def _read_from_many(self, rows: Array, top: int) -> None:
+        """Read rows that begin at one, of an epoch among others or of a file that another program packed."""
+        width = self._size[1]
+        with self._file() as file:
+            tiles = Tiles(file[self._name])
+            for left in range(0, rows.shape[1], width):
+                part = slice(0, len(rows)), slice(0, min(width, rows.shape[1] - left))
+                rows[:, left : left + width] = tiles.read((*self._epoch, top, left), part)

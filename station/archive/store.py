@@ -1,4 +1,4 @@
-"""Write an epoch, never lose one; say what is stored; open the series."""
+"""Write an epoch, never lose one; say what is stored."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, overload
+from typing import Any, overload
 
 import h5py
 import netCDF4
@@ -20,9 +20,6 @@ from station.archive.rasters import write_rasters
 from station.archive.variables import BY_NAME, TERMS, TEXT_LENGTH, VARIABLES, VERDICTS, Variable
 from station.errors import StoreError
 from station.quantities import Grid, Measurement, Shared
-
-if TYPE_CHECKING:
-    import xarray as xr
 
 STAMP = "%Y%m%dT%H%M%SZ"
 JOINED = {"days": "%Y%m%d", "months": "%Y%m"}  # kinds of joined files, by how each names its time
@@ -293,25 +290,6 @@ def series_in(site_or_folder: str | Path) -> Series:
             return Series(folder, str(file.station_id), grid, crs)
     except (OSError, RuntimeError, KeyError, IndexError, AttributeError) as error:
         raise StoreError(f"{folder}: no series to be read there (station status): {error}") from error
-
-
-def open_series(site_or_folder: str | Path) -> xr.Dataset:
-    """Return the whole series of a site file or data folder, lazily.
-
-    Raises StoreError where there is none, or where a file it points to is gone: that would read as missing.
-    """
-    import xarray as xr  # noqa: PLC0415 - a fifth of the service's start, which does without
-
-    place = folder_of(site_or_folder)
-    path = place / "series.nc"
-    if not path.is_file():
-        raise StoreError(f"{path}: no series yet; has a scan been processed? (station status)")
-    gone = sorted(str(source) for source in sources(path) if not source.is_file())
-    if gone:
-        raise StoreError(
-            f"{path}: {len(gone)} of its files are gone, first {gone[0]}: put them back beside it"
-        )
-    return xr.open_dataset(path, engine="netcdf4", decode_timedelta=False)
 
 
 def _write(file: netCDF4.Dataset, series: Series, epoch: Epoch, name: str) -> None:

@@ -30,7 +30,7 @@ class Told:
 
 @pytest.fixture(autouse=True)
 def short_chunks(monkeypatch):
-    for module in (layout, building, sources, areas):
+    for module in (layout, building, areas):
         monkeypatch.setattr(module, "TIMES_TOGETHER", TOGETHER)
 
 
