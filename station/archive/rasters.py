@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from functools import cached_property, lru_cache, partial
 from pathlib import Path
@@ -80,6 +80,12 @@ def _packed(row: Variable, values: Array, size: tuple[int, int]) -> bytes | None
     return isal_zlib.compress(np.ascontiguousarray(shuffled), LEVEL)
 
 
+def _around(chosen: Any) -> slice:  # noqa: ANN401 - numpy has no type for it
+    """Return where the chosen (n,) lie, and the first where there is none."""
+    there = np.flatnonzero(chosen)
+    return slice(int(there[0]), int(there[-1]) + 1) if len(there) else slice(0, 1)
+
+
 def as_stored(values: Array) -> Array:
     """Return values as they stand in the file, fill included."""
     return values
@@ -133,16 +139,14 @@ class Raster:
 
     def __getitem__(self, rows: slice | tuple[slice, slice] | Array) -> Array:
         """Return some rows (r, nx), of some columns, or the chosen cells (n,) of a mask (ny, nx)."""
-        if isinstance(rows, tuple):
-            return self[rows[0]][:, rows[1]]
         if isinstance(rows, np.ndarray):
-            there = np.flatnonzero(rows.any(axis=1))
-            box = slice(there[0], there[-1] + 1) if len(there) else slice(0, 1)
+            box = _around(rows.any(axis=1)), _around(rows.any(axis=0))
             return np.asarray(self[box][rows[box]])
-        first, stop, step = rows.indices(self.shape[0])
+        rows, columns = rows if isinstance(rows, tuple) else (rows, slice(None))
+        (first, stop, step), (left, right, _) = rows.indices(self.shape[0]), columns.indices(self.shape[1])
         height = self._size[0]
         bands = range(first - first % height, stop, height)
-        held = [self._band(top)[max(first - top, 0) : stop - top] for top in bands]
+        held = [self._band(top, left, right)[max(first - top, 0) : stop - top] for top in bands]
         return (held[0] if len(held) == 1 else np.concatenate(held))[::step]
 
     def __array__(self, dtype: Any = None, copy: bool | None = None) -> Array:  # noqa: ANN401, FBT001 - numpy's
@@ -153,31 +157,30 @@ class Raster:
         """Return the number of rows."""
         return self.shape[0]
 
-    def _read(self, top: int) -> Array:
-        """Return the rows of chunks that begin at one."""
+    def _read(self, top: int, left: int, right: int) -> Array:
+        """Return the rows of chunks that begin at one, from a column to another."""
         height, width = self._size
-        ny, nx = self.shape
-        rows = np.full((min(height, ny - top), nx), self._fill, self._stored)
+        rows = np.full((min(height, self.shape[0] - top), right - left), self._fill, self._stored)
         try:
-            if self._chunks is None:
-                self._read_from_many(rows, top)
-            else:
-                with self._path.open("rb") as file:
-                    for left in range(0, nx, width):
-                        if (corner := (*self._epoch, top, left)) in self._chunks:
-                            at, size = self._chunks[corner]
-                            part = slice(0, len(rows)), slice(0, min(width, nx - left))
-                            raw = os.pread(file.fileno(), size, at)
-                            rows[:, left : left + width] = unpacked(raw, self._stored, self._size, part)
+            for edge, tile in self._tiles(top, range(left - left % width, right, width)):
+                first = max(edge, left)
+                part = tile[: len(rows), first - edge : right - edge]
+                rows[:, first - left : edge + width - left] = part
         except (OSError, RuntimeError, ValueError, IsalError) as error:  # type: ignore[misc] # the stub has no class
             raise StoreError(f"{self._path}: damaged, cannot be read: {error}") from error
         return self._made(rows)
 
-    def _read_from_many(self, rows: Array, top: int) -> None:
-        """Read rows that begin at one, of an epoch among others or of a file that another program packed."""
-        width = self._size[1]
-        with self._file() as file:
-            tiles = Tiles(file[self._name])
-            for left in range(0, rows.shape[1], width):
-                part = slice(0, len(rows)), slice(0, min(width, rows.shape[1] - left))
-                rows[:, left : left + width] = tiles.read((*self._epoch, top, left), part)
+    def _tiles(self, top: int, edges: range) -> Iterator[tuple[int, Array]]:
+        """Give the chunks of some columns of a band, as far as they hold something."""
+        if self._chunks is None:
+            with self._file() as file:
+                tiles = Tiles(file[self._name])
+                for edge in edges:
+                    yield edge, tiles.read((*self._epoch, top, edge))
+            return
+        with self._path.open("rb") as file:
+            for edge in edges:
+                if (corner := (*self._epoch, top, edge)) in self._chunks:
+                    at, size = self._chunks[corner]
+                    raw = os.pread(file.fileno(), size, at)
+                    yield edge, unpacked(raw, self._stored, self._size)

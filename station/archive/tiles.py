@@ -30,7 +30,12 @@ def places(dataset: Any) -> dict[tuple[int, ...], tuple[int, int]]:  # noqa: ANN
     return found
 
 
-def unpacked(raw: bytes, stored: np.dtype[Any], size: tuple[int, int], part: tuple[slice, slice]) -> Array:
+ALL = slice(None), slice(None)
+
+
+def unpacked(
+    raw: bytes, stored: np.dtype[Any], size: tuple[int, int], part: tuple[slice, slice] = ALL
+) -> Array:
     """Return a part of a chunk of that size (height, width), with the fill that stands in it.
 
     Raises IsalError where it is damaged, ValueError where it is of another size.
@@ -64,11 +69,12 @@ class Tiles:
         # Asked for a chunk of a variable that has none at all, the library tells of any size.
         self._has_some = self.is_plain and dataset.id.chunk_iter(lambda _: True) is not None
 
-    def read(self, corner: tuple[int, ...], part: tuple[slice, slice]) -> Array:
-        """Return a part of the chunk at a corner, with the fill that stands for what is missing.
+    def read(self, corner: tuple[int, ...], part: tuple[slice, slice] | None = None) -> Array:
+        """Return a chunk, by its corner, or a part of it; with the fill that stands for what is missing.
 
         Raises OSError, RuntimeError, ValueError or IsalError where it is damaged.
         """
+        part = part or (slice(0, self.size[0]), slice(0, self.size[1]))
         if self._has_some:
             try:
                 mask, raw = self._dataset.id.read_direct_chunk(corner)
