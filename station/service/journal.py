@@ -304,6 +304,12 @@ class Journal:
         with self._faults():
             return {name for (name,) in self._rows.execute("SELECT name FROM scan")}
 
+    def epochs(self, state: State | None = None) -> dict[str, str]:
+        """Return the epoch of each scan that has one, or of those of one state, by the scan's name."""
+        told = "SELECT name, epoch FROM scan WHERE epoch IS NOT NULL AND state = coalesce(?, state)"
+        with self._faults():
+            return dict(self._rows.execute(f"{told} ORDER BY name", (state,)).fetchall())
+
     def usable(self) -> list[str]:
         """Return the scans stored with a good verdict, by their start."""
         told = "SELECT name FROM scan WHERE state = 'stored' AND verdict = 'good' ORDER BY start_utc_s, name"

@@ -240,14 +240,14 @@ class Worker:
 
     def _adopt(self) -> None:
         """Make rows for epochs that the journal does not know: it was lost, or older than the store."""
-        found = self._mending(unknown, self._journal.rows())
+        found = self._mending(unknown, self._journal.epochs())
         if found:
             log.warning("%s", logfmt(journal="made anew", epochs=len(found), reason="it knew not of them"))
         self._journal.adopt(found)
         self.run(restore_zeros)
 
     def _have_lost_done_again(self) -> None:
-        for name in self.run(lost, self._journal.rows(State.STORED)):
+        for name in self.run(lost, self._journal.epochs(State.STORED)):
             if (self._site.scans.inbox / name).is_file():
                 log.warning("%s", logfmt(scan=name, reason="its epoch is missing from the store: done again"))
                 self._journal.again([name])
