@@ -90,8 +90,9 @@ def now_of(series: Series) -> datetime:
 
 def count_closed(series: Series) -> int:
     """Return how many epochs of days that are closed in the time of the series lie in files of their own."""
-    now = now_of(series)
-    alone = (stored(path) for path in sources(series.path))
+    named = Named(series)
+    now = datetime.fromtimestamp(float(named.start_s[-1]), UTC)
+    alone = (stored(path) for path in named.files)
     return sum(one is not None and _closed("days", one.start, now) for one in alone)
 
 

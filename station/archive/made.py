@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import os
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -49,7 +48,7 @@ def note(series: Series, made: Made) -> None:
         "newest_start_s": made.newest_start_s,
         "sources": [
             {
-                "name": os.path.relpath(one.path, series.folder),
+                "name": str(one.path.relative_to(series.folder)),
                 "stamp": _stamp(one.path),
                 "rows": [one.first, one.at, one.count],
                 "shapes": one.shapes,

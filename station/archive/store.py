@@ -14,9 +14,11 @@ from typing import Any, overload
 import h5py
 import netCDF4
 import numpy as np
+from isal.igzip_lib import IsalError
 
 from station.archive.layout import Series, define, lay_out, strings, text, written_whole
 from station.archive.rasters import write_rasters
+from station.archive.tiles import column
 from station.archive.variables import BY_NAME, TERMS, TEXT_LENGTH, VARIABLES, VERDICTS, Variable
 from station.errors import StoreError
 from station.quantities import Grid, Measurement, Shared
@@ -199,14 +201,19 @@ class Named(Sequence[Row]):
             with h5py.File(series.path, "r") as file:
                 self.time_s = np.asarray(file["time"][:], dtype=np.float64)
                 self.start_s = np.asarray(file["time_bnds"][:, 0], dtype=np.float64)
-                self.epoch_file = file["epoch_file"][:].view(self.epoch_file.dtype)[:, 0]
+                self.epoch_file = column(file["epoch_file"]).view(self.epoch_file.dtype)[:, 0]
                 for one in file["elevation"].virtual_sources():
                     whole = one.src_space.get_select_type() == h5py.h5s.SEL_ALL
                     first = 0 if whole else one.src_space.get_select_bounds()[0][0]
                     self._at.append(one.vspace.get_select_bounds()[0][0])
                     self._there.append((series.folder / one.file_name, first))
-        except (OSError, RuntimeError, KeyError, ValueError) as error:
+        except (OSError, RuntimeError, KeyError, ValueError, IsalError) as error:  # type: ignore[misc] # the stub has no class
             raise StoreError(f"{series.path}: damaged, cannot be read: {error}") from error
+
+    @property
+    def files(self) -> set[Path]:
+        """Return the files they lie in."""
+        return {path for path, _ in self._there}
 
     def __len__(self) -> int:
         """Return how many there are."""

@@ -51,23 +51,48 @@ def unpacked(
     return np.asarray(values.view(stored))
 
 
+def column(dataset: Any, first: int = 0) -> Array:  # noqa: ANN401 - h5py has no types
+    """Return a variable over time as it stands in the file, from the row on that a chunk begins with.
+
+    As `dataset[first:]`, in a quarter of the time where it is text. Raises OSError, RuntimeError, ValueError
+    or IsalError where it is damaged.
+    """
+    chunks, shape = dataset.chunks, dataset.shape
+    if not _is_packed(dataset) or chunks[1:] != shape[1:] or first % chunks[0]:
+        return np.asarray(dataset[first:])
+    held = []
+    for row in range(first, len(dataset), chunks[0]):
+        mask, raw = dataset.id.read_direct_chunk((row, *[0] * (len(shape) - 1)))
+        if mask:
+            return np.asarray(dataset[first:])
+        planes = np.frombuffer(isal_zlib.decompress(raw), np.uint8).reshape(dataset.dtype.itemsize, -1)
+        held.append(np.ascontiguousarray(planes.T).view(dataset.dtype).reshape(chunks))
+    return np.concatenate(held)[: len(dataset) - first]
+
+
+def _is_packed(dataset: Any) -> bool:  # noqa: ANN401
+    """Tell whether a variable has chunks, shuffled and deflated.
+
+    Asked for a chunk of one that has none at all, the library tells of any size.
+    """
+    plist = dataset.id.get_create_plist()
+    filters = tuple(plist.get_filter(k)[0] for k in range(plist.get_nfilters()))
+    return filters == FILTERS and dataset.id.chunk_iter(lambda _: True) is not None
+
+
 class Tiles:
     """Parts of the chunks of a raster in an open file; several threads may read.
 
-    `size` is the rows and columns of a chunk, `is_plain` whether chunks are of one epoch, shuffled and
-    deflated: else they are the library's to unpack.
+    `size` is the rows and columns of a chunk, `is_plain` whether there are chunks, each of one epoch and
+    shuffled and deflated: else they are the library's to unpack.
     """
 
     def __init__(self, dataset: Any) -> None:  # noqa: ANN401 - h5py has no types
         self._dataset = dataset
         self._stored, self._fill = dataset.dtype, dataset.fillvalue
-        plist = dataset.id.get_create_plist()
-        filters = tuple(plist.get_filter(k)[0] for k in range(plist.get_nfilters()))
         chunks = dataset.chunks or dataset.shape
         self.size: tuple[int, int] = chunks[-2:]
-        self.is_plain = filters == FILTERS and chunks[:-2] in ((), (1,))
-        # Asked for a chunk of a variable that has none at all, the library tells of any size.
-        self._has_some = self.is_plain and dataset.id.chunk_iter(lambda _: True) is not None
+        self.is_plain = chunks[:-2] in ((), (1,)) and _is_packed(dataset)
 
     def read(self, corner: tuple[int, ...], part: tuple[slice, slice] | None = None) -> Array:
         """Return a chunk, by its corner, or a part of it; with the fill that stands for what is missing.
@@ -75,7 +100,7 @@ class Tiles:
         Raises OSError, RuntimeError, ValueError or IsalError where it is damaged.
         """
         part = part or (slice(0, self.size[0]), slice(0, self.size[1]))
-        if self._has_some:
+        if self.is_plain:
             try:
                 mask, raw = self._dataset.id.read_direct_chunk(corner)
                 if not mask:

@@ -7,9 +7,11 @@ from dataclasses import dataclass
 import h5py
 import netCDF4
 import numpy as np
+from isal.igzip_lib import IsalError
 
 from station.archive.areas import AREA_VARIABLES
 from station.archive.layout import Series, strings
+from station.archive.tiles import column
 from station.archive.variables import FILL, VERDICTS
 from station.errors import StoreError
 from station.quantities import Floats
@@ -54,9 +56,9 @@ def read_record(series: Series) -> Record:
                 start_s=np.asarray(file["time_bnds"][:, 0], dtype=np.float64),
                 verdict=[VERDICTS[one] for one in file["verdict"][:].tolist()],
                 numbers={name: np.where(one < FILL / 2, one, np.nan) for name, one in numbers.items()},
-                words={name: strings(file[name][:]) for name in WORDS},
+                words={name: strings(column(file[name])) for name in WORDS},
             )
-    except (OSError, RuntimeError, KeyError, IndexError) as error:
+    except (OSError, RuntimeError, KeyError, IndexError, ValueError, IsalError) as error:  # type: ignore[misc] # the stub has no class
         raise StoreError(f"{series.path}: cannot be read: {error}") from error
 
 

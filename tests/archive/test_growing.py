@@ -165,6 +165,22 @@ def test_what_else_a_series_says_is_brought_up_too(grown, epoch):
         assert file.attrs["station_name"] == b"Kesselwandferner"
 
 
+def test_a_store_is_settled_until_a_file_comes_or_goes(grown, epoch):
+    series, update = grown
+    assert made.settled(series) is None
+    for hour in (1, 2):
+        written = store.write_epoch(series, epoch(hour, grid=SMALL))
+        assert made.settled(series) is None
+        update()
+        assert list(made.settled(series)) == rows(series)
+    os.utime(written.path)
+    assert made.settled(series) is None
+    update()
+    assert len(made.settled(series)) == 2
+    written.path.unlink()
+    assert made.settled(series) is None
+
+
 @pytest.mark.slow
 def test_what_follows_a_scan_costs_little_more_after_a_year(tmp_path, monkeypatch):
     """Fifteen times as many epochs, less than twice the CPU; measuring, which does not grow, is apart."""

@@ -16,6 +16,7 @@ from station.archive.layout import Series, define, lay_out
 from station.archive.rasters import Raster, write_rasters
 from station.archive.series import build_series
 from station.archive.store import write_epoch
+from station.archive.tiles import column
 from station.archive.variables import BY_NAME
 from station.errors import StoreError
 
@@ -89,6 +90,25 @@ def test_a_damaged_file_is_told(stored):
         assert np.isfinite(own.elevation_change[2]).any()
         with pytest.raises(StoreError, match=f"{path.name}: damaged"):
             own.elevation_change[:, 5, 5].load()
+
+
+def test_a_column_is_what_the_library_reads(stored, tmp_path):
+    with h5py.File(stored.path) as file:
+        light = [one for one in file.values() if one.shape and one.chunks and one.shape[0] == 6]
+        assert {"epoch_file", "time", "verdict", "point_total"} <= {one.name[1:] for one in light}
+        for one in light:
+            assert column(one).dtype == one.dtype
+            assert np.array_equal(column(one), one[:])
+    with h5py.File(tmp_path / "odd.h5", "w") as file:
+        given = np.random.default_rng(1).integers(0, 99, (23, 5)).astype("i2")
+        packed = {"compression": "gzip", "shuffle": True, "dtype": "i2", "maxshape": (None, 5)}
+        for name, chunks in (("whole", (4, 5)), ("cut", (4, 3))):
+            made = file.create_dataset(name, (23, 5), chunks=chunks, **packed)
+            assert np.array_equal(column(made), np.zeros((23, 5)))  # nothing is written yet
+            made[:] = given
+            assert np.array_equal(column(made), given)
+            assert np.array_equal(column(made, 8), given[8:])
+            assert np.array_equal(column(made, 3), given[3:])
 
 
 def test_an_epoch_among_many_is_read_as_quickly_as_the_first(tmp_path, series):
