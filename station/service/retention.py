@@ -52,8 +52,8 @@ def retire(
 ) -> list[tuple[str, str, str]]:
     """Move or delete raw scans and their logs; return of each its name, what was done, and why not.
 
-    `kept` are those whose bytes or epoch are not proved by their checksums, of the store in `files`. At one that
-    `waits`, as the folders cannot be written, it ends. A file that holds many of the epochs is read once.
+    `kept` are those whose bytes or epoch are not proved by their checksums, of the store in `files`. At one
+    that `waits`, as the folders cannot be written, it ends. A file that holds many epochs is read once.
     """
     told: list[tuple[str, str, str]] = []
     proved: set[Path] = set()
