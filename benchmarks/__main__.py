@@ -174,11 +174,17 @@ def _over_cells(run: Run, full: str) -> list[Row]:
 
 
 def _over_epochs(found: dict[str, float]) -> list[Row]:
-    few, year = (
-        Cost(sum(value for name, value in found.items() if name.endswith(f"_s_{word}")))
-        for word in ("few", "year")
-    )
-    return [Row("station, epoch 10", few, few), Row("station, epoch 8,760", year, few, {"cpu": MUST_EPOCHS})]
+    rows = []
+    for size, note in (("full", "of the full grid"), ("small", "of a tiny grid")):
+        few, year = (
+            Cost(sum(value for name, value in found.items() if name.endswith(f"_s_{size}_{word}")))
+            for word in ("few", "year")
+        )
+        rows += [
+            Row("station, epoch 10", few, few, note=note),
+            Row("station, epoch 8,760", year, few, {"cpu": MUST_EPOCHS}, note=note),
+        ]
+    return rows
 
 
 def _archive(run: Run) -> list[Row]:
@@ -203,11 +209,25 @@ def _store(run: Run) -> list[tuple[str, list[Row]]]:
     if run.quick:
         return [(OVER_EPOCHS, _archive(run)), ("start-up", starting)]
     _, found = run.own("epochs")
-    starting.append(Row("station run", Cost(found["run_cpu_s"], found["ready_s"]), must={"wall_s": 5.0}))
+
+    def took(name: str) -> Cost:
+        return Cost(found[f"{name}_cpu_s"], found[f"{name}_s"])
+
+    starting += [
+        Row(f"station run, {state} files", took(f"ready_{state}"), must={"wall_s": 5.0})
+        for state in ("cold", "warm")
+    ]
     joined = Cost(found["join_day_cpu_s"], found["join_day_s"], found["join_day_gb"])
     reading = [
-        Row("a map opened", Cost(0.0, found["map_s"]), must={"wall_s": 1.0}),
-        Row("a 100 m box, all year", Cost(0.0, found["box_year_s"]), must={"wall_s": 5.0}),
+        *(
+            Row(f"{title}, {state} files", took(f"{name}_{state}"), must={"wall_s": most}, note=note)
+            for title, name, most, note in (
+                ("a map opened", "map", 1.0, ""),
+                ("a 100 m box, all year", "box_year", 5.0, ""),
+                ("the same", "box_year_plain", 5.0, "station.open"),
+            )
+            for state in ("cold", "warm")
+        ),
         Row("a day joined", joined, must={"peak_gb": 1.5}),
     ]
     return [(OVER_EPOCHS, _over_epochs(found) + _archive(run)), ("a year stored", reading + starting)]

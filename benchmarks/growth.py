@@ -1,31 +1,20 @@
-"""What a scan costs at the store's side, and how that grows with the epochs stored.
-
-python -m benchmarks.growth [--folder DIR]
-"""
+"""What a scan costs at the store's side, and how that grows with the epochs stored."""
 
 from __future__ import annotations
 
-import argparse
 import json
-import multiprocessing
 import os
 import shutil
-import signal
-import subprocess
-import sys
-import tempfile
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from datetime import UTC, datetime, timedelta
 from itertools import groupby
-from multiprocessing.connection import Connection
 from pathlib import Path
 
 import netCDF4
 import numpy as np
-from rich.console import Console
-from rich.table import Table
+import xarray as xr
 from scipy import ndimage
 
 from station.archive import join, store
@@ -33,12 +22,15 @@ from station.archive.aggregate import AreaChange
 from station.archive.areas import update_areas
 from station.archive.layout import Series
 from station.archive.layout import text as letters_of
+from station.archive.opened import open_series
 from station.archive.reference import write_reference
 from station.archive.series import build_series
 from station.archive.sources import Source, read_source
 from station.config import Site, read_site
 from station.quantities import Bools, Grid, Measurement, Reference, Shared
 from station.science.shared import basis
+from station.service.content import sha256_of
+from station.service.integrity import store_files
 from station.service.journal import Entry, Journal, State
 from station.service.show import show
 from station.service.tasks import areas_of, series_of
@@ -53,6 +45,7 @@ DISTINCT = 3  # rasters that the epochs of a store take turns with
 ROUNDS = 3
 SHOWN = 20
 READ = ("elevation", "elevation_change")  # variables of the year on the full grid
+SEEN = 0.31  # of a grid's cells, in an epoch
 SEEN_OF_A_YEAR = 0.02  # of its cells: the rest is neither stored nor read
 SITE = """
 [station]
@@ -111,7 +104,7 @@ def _box(grid: Grid, name: str, share: float) -> dict[str, object]:
     }
 
 
-def epoch_of(grid: Grid, start: datetime, seen: float = 0.31) -> store.Epoch:
+def epoch_of(grid: Grid, start: datetime, seen: float = SEEN) -> store.Epoch:
     """An epoch that sees so large a share of the grid, in patches, where half of the ground moved."""
     random = np.random.default_rng(int(start.timestamp()) // 3600)
     there = _patchy(np.random.default_rng(1), grid, seen)
@@ -164,10 +157,10 @@ def _patchy(random: np.random.Generator, grid: Grid, share: float) -> Bools:
     return np.asarray(fine >= np.quantile(coarse, 1 - share))
 
 
-def fill(site: Site, epochs: int, seen: float = 0.31, *, until: datetime | None = None) -> datetime:
+def fill(site: Site, epochs: int, *, joined_seen: float = SEEN, until: datetime | None = None) -> datetime:
     """Store so many hourly epochs, the older ones joined as the service does; return the next one's start.
 
-    Joined files take their rasters from a few epochs.
+    They take their rasters from a few epochs, joined ones from those that see so large a share of the grid.
     """
     series = series_of(site)
     end = (until or datetime.now(UTC)).replace(minute=0, second=0, microsecond=0) - timedelta(hours=2)
@@ -177,18 +170,32 @@ def fill(site: Site, epochs: int, seen: float = 0.31, *, until: datetime | None 
     for kind, stamp, group in _closed(joined):
         place = series.folder / kind / group[0].strftime("%Y/%m" if kind == "days" else "%Y")
         name = group[0].strftime(stamp)
-        held = list(_turns(series, group, seen))
+        held = list((_days if kind == "months" else _turns)(series, group, joined_seen))
         join.write_joined(series, held, place / f"{series.station_id}_{name}_r1.nc", name, lambda: None)
-    for start in by_themselves:
-        store.write_epoch(series, epoch_of(site.grid_cells, start, seen))
+    for source, start in zip(_turns(series, by_themselves, SEEN), by_themselves, strict=True):
+        alone(series, source.path, start)
     with Journal(site.station.data / "journal.sqlite") as journal:
         journal.adopt(_entry(series, start) for start in starts)
+        journal.note_files(
+            {str(path.relative_to(series.folder)): sha256_of(path) for path in store_files(series)}
+        )
     build_series(series)
     update_areas(series, areas_of(site), _Quick(), lambda: None)
     publish(site, lambda: None)
     for _ in range(SHOWN):  # until all maps are drawn
         show(site, None, lambda: None)
     return end
+
+
+def alone(series: Series, like: Path, start: datetime) -> None:
+    """Store an epoch file that is another of another time, as quickly as it is copied."""
+    path = store.epoch_folder(series, start) / f"{series.station_id}_{start:{store.STAMP}}.nc"
+    path.parent.mkdir(parents=True, exist_ok=True)
+    shutil.copyfile(like, path)
+    with netCDF4.Dataset(path, "a") as file:
+        file["time"][:] = start.timestamp() + 450
+        file["time_bnds"][:] = (start.timestamp(), start.timestamp() + 900)
+        file["epoch_file"][0] = letters_of([path.name], "text")[0]
 
 
 class _Quick:
@@ -213,28 +220,45 @@ def _closed(starts: list[datetime]) -> Iterator[tuple[str, str, list[datetime]]]
                 yield "days", "%Y%m%d", list(day)
 
 
-def _turns(series: Series, starts: list[datetime], seen: float) -> Iterator[Source]:
+def _turns(
+    series: Series, starts: list[datetime], seen: float, names: tuple[str, ...] | None = None
+) -> Iterator[Source]:
     """Give sources for epochs at these starts, which take turns with a few rasters."""
-    templates = []
-    for hour in range(DISTINCT):
-        made = replace(series, folder=series.folder.parent / "templates")
-        start = datetime(2020, 1, 1, hour, tzinfo=UTC)
-        path = store.epoch_folder(made, start) / f"{series.station_id}_{start:{store.STAMP}}.nc"
-        if not path.is_file():
-            store.write_epoch(made, epoch_of(series.grid, start, seen))
-        templates.append(read_source(path, 0, 0, 1))
+    made = replace(series, folder=series.folder.parent / f"templates-{seen:g}")
     for at, start in enumerate(starts):
-        template = templates[at % DISTINCT]
-        words = dict(template.words)
-        words["time"] = np.array([start.timestamp() + 450])
-        words["time_bnds"] = np.array([[start.timestamp(), start.timestamp() + 900]])
-        for name, value in (
-            ("epoch_file", f"{series.station_id}_{start:{store.STAMP}}.nc"),
-            ("scan_id", f"{start:%y%m%d_%H%M%S}"),
-            ("scan_sha256", np.random.default_rng(at).bytes(32).hex()),
-        ):
-            words[name] = letters_of([value], "text")
-        yield replace(template, at=at, words=words)
+        like = datetime(2020, 1, 1, at % DISTINCT, tzinfo=UTC)
+        path = store.epoch_folder(made, like) / f"{series.station_id}_{like:{store.STAMP}}.nc"
+        if not path.is_file():
+            store.write_epoch(made, epoch_of(series.grid, like, seen))
+        yield _only(_dated(read_source(path, 0, at, 1), series, [start]), names)
+
+
+def _days(
+    series: Series, starts: list[datetime], seen: float, names: tuple[str, ...] | None = None
+) -> Iterator[Source]:
+    """Give sources for the days of a month, each of which is the same day that was joined before."""
+    path = series.folder.parent / f"templates-{seen:g}" / "day.nc"
+    if not path.is_file():
+        day = [datetime(2020, 1, 1, hour, tzinfo=UTC) for hour in range(24)]
+        join.write_joined(series, list(_turns(series, day, seen, names)), path, "a day", lambda: None)
+    at = 0
+    for _, group in groupby(starts, lambda start: start.date()):
+        day = list(group)
+        yield _dated(read_source(path, 0, at, len(day)), series, day)
+        at += len(day)
+
+
+def _dated(source: Source, series: Series, starts: list[datetime]) -> Source:
+    """Return a source as if its epochs were of these starts."""
+    words, start_s = dict(source.words), np.array([start.timestamp() for start in starts])
+    words["time"], words["time_bnds"] = start_s + 450, np.stack([start_s, start_s + 900], axis=-1)
+    for name, values in (
+        ("epoch_file", [f"{series.station_id}_{start:{store.STAMP}}.nc" for start in starts]),
+        ("scan_id", [f"{start:%y%m%d_%H%M%S}" for start in starts]),
+        ("scan_sha256", [np.random.default_rng(int(one)).bytes(32).hex() for one in start_s]),
+    ):
+        words[name] = letters_of(values, "text")
+    return replace(source, words=words)
 
 
 def _entry(series: Series, start: datetime) -> Entry:
@@ -248,13 +272,13 @@ def _entry(series: Series, start: datetime) -> Entry:
     )  # fmt: skip
 
 
-def cost(site: Site, start: datetime, seen: float = 0.31) -> dict[str, float]:
+def cost(site: Site, start: datetime) -> dict[str, float]:
     """Return CPU seconds of what follows the measuring of a scan, the best of a few scans."""
     series = series_of(site)
     taken: dict[str, list[float]] = {}
     for one in range(ROUNDS + 1):
         begun = start + timedelta(hours=one)
-        store.write_epoch(series, epoch_of(site.grid_cells, begun, seen))
+        store.write_epoch(series, epoch_of(site.grid_cells, begun))
         steps: dict[str, Callable[[], object]] = {
             "publish_s": lambda: publish(site, lambda: None),
             "show_s": lambda begun=begun: show(site, begun.timestamp(), lambda: None),
@@ -274,7 +298,8 @@ def reading(folder: Path) -> dict[str, float]:
     for kind, stamp, group in _closed(starts):
         name = group[0].strftime(stamp)
         path = series.folder / kind / f"{series.station_id}_{name}_r1.nc"
-        held = [replace(one, shapes=_only(one, READ)) for one in _turns(series, group, SEEN_OF_A_YEAR)]
+        made = _days if kind == "months" else _turns
+        held = list(made(series, group, SEEN_OF_A_YEAR, READ))
         join.write_joined(series, held, path, name, lambda: None)
     build_series(series)
     measured = epoch_of(FULL, starts[0], SEEN_OF_A_YEAR).measurement
@@ -283,117 +308,48 @@ def reading(folder: Path) -> dict[str, float]:
     row, column = np.unravel_index(np.argmax(share), FULL.shape)  # where all is seen
     box = slice(row - 50, row + 50), slice(column - 50, column + 50)
 
-    def open_map() -> object:
-        with store.open_series(series.folder) as told:
-            return told.elevation_change[YEAR // 2].load()
+    def a_map(told: xr.Dataset) -> None:
+        told.elevation_change[YEAR // 2].load()
 
-    def open_box() -> object:
-        with store.open_series(series.folder) as told:
-            return told.elevation_change[:, box[0], box[1]].load()
+    def a_box(told: xr.Dataset) -> None:
+        told.elevation_change[:, box[0], box[1]].load()
 
-    return {"map_s": _wall(open_map), "box_year_s": _wall(open_box)}
+    def plainly(path: Path) -> xr.Dataset:
+        return xr.open_dataset(path / "series.nc", decode_timedelta=False)
 
-
-def _only(source: Source, names: tuple[str, ...]) -> dict[str, tuple[int, ...]]:
-    return {name: shape for name, shape in source.shapes.items() if name in names}
-
-
-def _wall(work: Callable[[], object]) -> float:
-    began_s = time.monotonic()
-    work()
-    return time.monotonic() - began_s
-
-
-def joining(folder: Path, seen: float = 0.31) -> dict[str, float]:
-    """Return how long the joining of a day takes on the full grid, and the most memory it needs."""
-    series = Series(folder / "data", "hef", FULL, "EPSG:32632")
-    templates = replace(series, folder=folder / "templates")
-    day = datetime(2026, 7, 1, tzinfo=UTC)
-    for hour in range(DISTINCT):
-        store.write_epoch(templates, epoch_of(FULL, day + timedelta(hours=hour), seen))
-    for hour in range(24):
-        start = day + timedelta(hours=hour)
-        given = store.epochs(templates)[hour % DISTINCT].path
-        path = store.epoch_folder(series, start) / f"{series.station_id}_{start:{store.STAMP}}.nc"
-        path.parent.mkdir(parents=True, exist_ok=True)
-        shutil.copyfile(given, path)
-        with netCDF4.Dataset(path, "a") as file:
-            file["time"][:] = start.timestamp() + 450
-            file["time_bnds"][:] = (start.timestamp(), start.timestamp() + 900)
-            file["epoch_file"][0] = letters_of([path.name], "text")[0]
-    build_series(series)
-    here, there = multiprocessing.get_context("spawn").Pipe()
-    child = multiprocessing.get_context("spawn").Process(target=_join_once, args=(series, there))
-    child.start()
-    taken = here.recv()
-    child.join()
-    return dict(zip(("join_day_s", "join_day_cpu_s", "join_day_gb"), taken, strict=True))
-
-
-def _join_once(series: Series, there: Connection) -> None:
-    began_s, before_s = time.monotonic(), time.process_time()
-    join.join_closed(series, datetime(2026, 7, 3, tzinfo=UTC), lambda: None)
-    taken = time.monotonic() - began_s, time.process_time() - before_s
-    told = (
-        Path("/proc/self/status").read_text().split("VmHWM:")[1].split()[0]
-    )  # kB; rusage tells the parent's
-    there.send((*taken, int(told) / 2**20))
-
-
-def starting(site_file: Path) -> dict[str, float]:
-    """Return how long the service takes until it says that it runs, wall and CPU [s]."""
-    before_s = os.times()
-    began_s = time.monotonic()
-    command = [sys.executable, "-m", "station.cli", "run", str(site_file)]
-    with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as service:
-        assert service.stderr is not None  # noqa: S101 - asked for
-        for line in service.stderr:
-            if "service=running" in line:
-                break
-        ready_s = time.monotonic() - began_s
-        service.send_signal(signal.SIGTERM)
-        service.communicate()
-    after_s = os.times()
-    cpu_s = after_s.children_user + after_s.children_system
-    return {"ready_s": ready_s, "run_cpu_s": cpu_s - before_s.children_user - before_s.children_system}
-
-
-def main() -> None:
-    """Print what a scan costs at few epochs and at a year of them."""
-    parser = argparse.ArgumentParser(description="What a scan costs as the store grows.")
-    parser.add_argument("--folder", type=Path)
-    asked = parser.parse_args()
-    with tempfile.TemporaryDirectory() as passing:
-        folder = asked.folder or Path(passing)
-        found = growth(folder)
-    table = Table(title="Growth")
-    table.add_column("figure")
-    table.add_column("value", justify="right")
-    for name, value in found.items():
-        table.add_row(name, f"{value:.3g}")
-    Console(width=100).print(table)
-
-
-def growth(folder: Path) -> dict[str, float]:
-    """Return what a scan costs after it was measured, at few epochs and at a year of them, and the ratios."""
-    found: dict[str, float] = {}
-    for word, epochs in (("few", FEW), ("year", YEAR)):
-        place = folder / word
-        shutil.rmtree(place, ignore_errors=True)
-        site = station_of(place, SMALL)
-        found |= {f"{name}_{word}": value for name, value in cost(site, fill(site, epochs)).items()}
-    found |= {
-        name.replace("_s_few", "_ratio"): found[name.replace("_few", "_year")] / value
-        for name, value in found.items()
-        if name.endswith("_few")
-    }
-    found |= starting(folder / "year" / "site.toml")
-    for work in (joining, reading):
-        place = folder / work.__name__
-        shutil.rmtree(place, ignore_errors=True)
-        found |= work(place)
+    found = {}
+    for name, opened, work in (
+        ("map", open_series, a_map), ("box_year", open_series, a_box), ("box_year_plain", plainly, a_box)
+    ):  # fmt: skip
+        forget(series.folder)
+        for state in ("cold", "warm"):
+            found |= {
+                f"{name}_{state}_{key}": value for key, value in _took(opened, series.folder, work).items()
+            }
     return found
 
 
-if __name__ == "__main__":
-    main()
+def forget(folder: Path) -> None:
+    """Have the kernel let go of what it keeps of files: they are read from the disk again."""
+    for path in folder.rglob("*.nc"):
+        file = os.open(path, os.O_RDONLY)
+        os.fsync(file)
+        os.posix_fadvise(file, 0, 0, os.POSIX_FADV_DONTNEED)
+        os.close(file)
+
+
+def _took(
+    opened: Callable[[Path], xr.Dataset], folder: Path, work: Callable[[xr.Dataset], None]
+) -> dict[str, float]:
+    began_s, used_s = time.monotonic(), time.process_time()
+    with opened(folder) as told:
+        work(told)
+    return {"s": time.monotonic() - began_s, "cpu_s": time.process_time() - used_s}
+
+
+def _only(source: Source, names: tuple[str, ...] | None) -> Source:
+    return (
+        source
+        if names is None
+        else replace(source, shapes={name: shape for name, shape in source.shapes.items() if name in names})
+    )

@@ -14,8 +14,8 @@ from scipy.stats import median_abs_deviation
 
 from benchmarks.stations import Method, site_of
 from station.archive.aggregate import SLACK
+from station.archive.opened import open_series
 from station.archive.reference import read_reference
-from station.archive.store import open_series
 from station.config import Site
 from station.quantities import Bools, Floats, Grid, Quality, Reference
 from station.science import ground, held, shared, terrain

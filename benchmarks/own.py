@@ -169,9 +169,9 @@ def _with(site: Path, name: str, says: str, instead: str) -> Path:
 
 def epochs() -> dict[str, float]:
     """Return what the store takes, where few epochs are stored and where a year is."""
-    from benchmarks.growth import growth  # noqa: PLC0415 - the other jobs do without
+    from benchmarks.stored import stored  # noqa: PLC0415 - the other jobs do without
 
-    return growth(Path("epochs"))
+    return stored(Path("epochs"))
 
 
 @contextmanager

@@ -27,7 +27,7 @@ def open(site_or_folder: str | Path) -> xr.Dataset:  # noqa: A001 - reads well a
 
     Takes a site file or the station's data folder; raises StoreError where there is no series yet.
     """
-    from station.archive.store import open_series  # noqa: PLC0415 - importing station stays cheap
+    from station.archive.opened import open_series  # noqa: PLC0415 - importing station stays cheap
 
     return open_series(site_or_folder)
 

@@ -32,6 +32,7 @@ from station.archive.store import (
 
 DAY_CLOSED = timedelta(hours=6)  # after its end; a later scan makes a new revision
 MONTH_CLOSED = timedelta(days=2)
+INDEX_BYTES = 2**20  # of where the chunks are, that lie together: a reader needs some of all of it
 GRACE = timedelta(hours=48)  # a reader may hold an older series.nc as long
 
 
@@ -44,8 +45,8 @@ def join_closed(
     """Join the epochs of closed days, and of closed months, anew where they are not; return the files made.
 
     `series.nc` names them when it is built next. Epochs that differ in their shared parameters (the scanner
-    was moved) are not joined with each other. `progress` is called after every epoch; `prove` raises
-    StoreError where a file about to be copied is damaged. Nothing is done while another process joins.
+    was moved) are not joined with each other. `progress` is called again and again; `prove` raises StoreError
+    where a file about to be copied is damaged. Nothing is done while another process joins.
     """
     made: list[Path] = []
     with _only_here(series) as is_ours:
@@ -89,8 +90,9 @@ def now_of(series: Series) -> datetime:
 
 def count_closed(series: Series) -> int:
     """Return how many epochs of days that are closed in the time of the series lie in files of their own."""
-    now = now_of(series)
-    alone = (stored(path) for path in sources(series.path))
+    named = Named(series)
+    now = datetime.fromtimestamp(float(named.start_s[-1]), UTC)
+    alone = (stored(path) for path in named.files)
     return sum(one is not None and _closed("days", one.start, now) for one in alone)
 
 
@@ -127,7 +129,7 @@ def write_joined(
             for row in HEAVY:
                 if any(row.name in source.shapes for source in held):
                     define(file, row, series, len(file["time"]))
-        with h5py.File(beside, "r+", libver=ORDINARY) as file:
+        with h5py.File(beside, "r+", libver=ORDINARY, meta_block_size=INDEX_BYTES) as file:
             for row in HEAVY:
                 if row.name in file:
                     file[row.name].resize(len(file["time"]), axis=0)
@@ -137,20 +139,16 @@ def write_joined(
 
 
 def _copy_rows(file: Any, source: Source, progress: Callable[[], None]) -> None:  # noqa: ANN401 - h5py has no types
+    """Copy the wanted rows of the large variables of a source."""
     with h5py.File(source.path, "r") as origin:
-        pairs = [(origin[name], file[name]) for name in source.shapes]
-        for row in range(source.count):
-            for one, made in pairs:
-                _copy(one, source.first + row, made, source.at + row)
-            progress()
-
-
-def _copy(origin: Any, first: int, made: Any, at: int) -> None:  # noqa: ANN401 - h5py has no types
-    """Copy a row of a large variable."""
-    if is_laid_out_alike(origin, made):
-        copy_chunks(origin, first, made, at)
-    else:  # written by an older version
-        made[at] = origin[first]
+        for name in source.shapes:
+            one, made = origin[name], file[name]
+            if is_laid_out_alike(one, made):
+                copy_chunks(one, source.first, made, source.at, source.count, progress)
+                continue
+            for row in range(source.count):  # written by an older version
+                made[source.at + row] = one[source.first + row]
+                progress()
 
 
 def sweep(series: Series, now: datetime) -> list[Path]:

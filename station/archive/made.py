@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import os
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,7 +15,7 @@ from typing import Any
 from station import __version__
 from station.archive.layout import Series
 from station.archive.sources import Parameters, Source, read_source
-from station.archive.store import listing, stored
+from station.archive.store import Named, listing, stored
 from station.archive.variables import VARIABLES
 
 NOTE = ".series.json"
@@ -49,7 +48,7 @@ def note(series: Series, made: Made) -> None:
         "newest_start_s": made.newest_start_s,
         "sources": [
             {
-                "name": os.path.relpath(one.path, series.folder),
+                "name": str(one.path.relative_to(series.folder)),
                 "stamp": _stamp(one.path),
                 "rows": [one.first, one.at, one.count],
                 "shapes": one.shapes,
@@ -90,6 +89,12 @@ def newer(series: Series) -> tuple[Made, list[Source]] | None:
         start_s, last_s = one.start.timestamp(), time_s
         fresh.append(source)
     return Made(sources, made.parameters, last_s, start_s), fresh
+
+
+def settled(series: Series) -> Named | None:
+    """Return the epochs of the series if the store is just as when `series.nc` was made; else None."""
+    told = _noted(series)
+    return Named(series) if told is not None and listing(series) == set(told["files"]) else None
 
 
 def _noted(series: Series) -> dict[str, Any] | None:

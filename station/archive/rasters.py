@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import cached_property, lru_cache
 from pathlib import Path
@@ -18,12 +18,12 @@ import numpy as np
 from isal import isal_zlib
 from isal.igzip_lib import IsalError
 
+from station.archive.tiles import Tiles, places, unpacked
 from station.archive.variables import FILL, Variable
 from station.errors import StoreError
 
 LEVEL = 1
 TOGETHER = 2  # chunks deflated or inflated at once
-FILTERS = (h5py.h5z.FILTER_SHUFFLE, h5py.h5z.FILTER_DEFLATE)
 KEPT_BANDS = 2  # rows of chunks that are kept unpacked: of a band of cells and what is around it
 
 Array = np.ndarray[Any, Any]
@@ -83,18 +83,6 @@ def _packed(row: Variable, values: Array, size: tuple[int, int]) -> bytes | None
     return isal_zlib.compress(np.ascontiguousarray(shuffled), LEVEL)
 
 
-def _unshuffled(raw: bytes, stored: np.dtype[Any]) -> Array:
-    """Return values (n,) whose first bytes stand first, then their second bytes, and so on."""
-    planes = np.frombuffer(raw, np.uint8).reshape(stored.itemsize, -1)
-    if stored.itemsize != 4:
-        return np.asarray(np.ascontiguousarray(planes.T).view(stored))
-    values = planes[3].astype(np.uint32)  # four times as fast
-    for plane in planes[2::-1]:
-        values <<= 8
-        values |= plane
-    return np.asarray(values.view(stored))
-
-
 def _around(chosen: Any) -> slice:  # noqa: ANN401 - numpy has no type for it
     """Return where the chosen (n,) lie, and the first where there is none."""
     there = np.flatnonzero(chosen)
@@ -137,24 +125,15 @@ class Raster:
             raise StoreError(f"{self._path}: cannot be read: {error}") from error
 
     @cached_property
-    def _chunks(self) -> dict[tuple[int, int], tuple[int, int]] | None:
-        """Where each chunk that holds something begins in the file, and its length.
+    def _chunks(self) -> dict[tuple[int, ...], tuple[int, int]] | None:
+        """Where each chunk that holds something begins in the file, and its length, by its corner.
 
-        None where the raster is packed in another way: by another program, and no need to be fast.
+        None where there are those of other epochs too, or they are packed in another way.
         """
         with self._file() as file:
             dataset = file[self._name]
-            plist = dataset.id.get_create_plist()
-            filters = tuple(plist.get_filter(k)[0] for k in range(plist.get_nfilters()))
-            if filters != FILTERS or dataset.chunks[:-2] not in ((), (1,)):
-                return None
-            found = {}
-            for top in range(0, self.shape[0], self._size[0]):
-                for left in range(0, self.shape[1], self._size[1]):
-                    chunk = dataset.id.get_chunk_info_by_coord((*self._epoch, top, left))
-                    if chunk.byte_offset is not None:
-                        found[top, left] = chunk.byte_offset, chunk.size
-        return found
+            alone = dataset.ndim == 2 or len(dataset) == 1
+            return places(dataset) if alone and Tiles(dataset).is_plain else None
 
     @property
     def dtype(self) -> np.dtype[Any]:
@@ -184,22 +163,27 @@ class Raster:
     def _read(self, top: int, left: int, right: int) -> Array:
         """Return the rows of chunks that begin at one, from a column to another."""
         height, width = self._size
-        chunks = self._chunks
-        if chunks is None:
-            with self._file() as file:
-                place = *self._epoch, slice(top, top + height), slice(left, right)
-                return self._made(file[self._name][place])
         rows = np.full((min(height, self.shape[0] - top), right - left), self._fill, self._stored)
         try:
-            with self._path.open("rb") as file:
-                for edge in range(left - left % width, right, width):
-                    if (top, edge) in chunks:
-                        at, size = chunks[top, edge]
-                        raw = isal_zlib.decompress(os.pread(file.fileno(), size, at))
-                        tile = _unshuffled(raw, self._stored).reshape(height, width)
-                        first = max(edge, left)
-                        part = tile[: len(rows), first - edge : right - edge]
-                        rows[:, first - left : edge + width - left] = part
-        except (OSError, ValueError, IsalError) as error:  # type: ignore[misc] # the stub has no class
+            for edge, tile in self._tiles(top, range(left - left % width, right, width)):
+                first = max(edge, left)
+                part = tile[: len(rows), first - edge : right - edge]
+                rows[:, first - left : edge + width - left] = part
+        except (OSError, RuntimeError, ValueError, IsalError) as error:  # type: ignore[misc] # the stub has no class
             raise StoreError(f"{self._path}: damaged, cannot be read: {error}") from error
         return self._made(rows)
+
+    def _tiles(self, top: int, edges: range) -> Iterator[tuple[int, Array]]:
+        """Give the chunks of some columns of a band, as far as they hold something."""
+        if self._chunks is None:
+            with self._file() as file:
+                tiles = Tiles(file[self._name])
+                for edge in edges:
+                    yield edge, tiles.read((*self._epoch, top, edge))
+            return
+        with self._path.open("rb") as file:
+            for edge in edges:
+                if (corner := (*self._epoch, top, edge)) in self._chunks:
+                    at, size = self._chunks[corner]
+                    raw = os.pread(file.fileno(), size, at)
+                    yield edge, unpacked(raw, self._stored, self._size)

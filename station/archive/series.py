@@ -115,6 +115,8 @@ def write_words(
 
 def _places(source: Source, parameters: Parameters) -> list[int]:
     """Return where the source's shared parameters stand among all (p,)."""
+    if source.parameters is parameters:  # as nearly always in a series that grows
+        return list(range(len(parameters)))
     place = {name: index for index, name in enumerate(parameters)}
     return [place[name] for name in source.parameters]
 
@@ -124,7 +126,7 @@ def _point_all(file: Any, series: Series, held: list[Source], parameters: Parame
 
     Below h5py's comfort, which takes most of the time of a hundred files.
     """
-    paths = [os.path.relpath(source.path, series.folder).encode() for source in held]
+    paths = [str(source.path.relative_to(series.folder)).encode() for source in held]
     known: dict[tuple[object, ...], list[tuple[Any, Any]]] = {}  # rasters lie alike
     for row in HEAVY:
         if not any(row.name in source.shapes for source in held):
@@ -165,7 +167,7 @@ def _spaces(
 
 def _blocks(places: list[int]) -> list[tuple[int, int, int]]:
     """Cut places into stretches that follow one another: (from, to, how many)."""
-    if places == list(range(len(places))):  # as nearly always
+    if places == list(range(len(places))):
         return [(0, 0, len(places))]
     blocks = []
     for _, group in groupby(enumerate(places), key=lambda pair: pair[1] - pair[0]):

@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from itertools import groupby, product
+from itertools import groupby
+from operator import itemgetter
 from pathlib import Path
 from typing import Any
 
 import h5py
 import numpy as np
 
-from station.archive.layout import TIMES_TOGETHER, strings
+from station.archive.layout import strings
 from station.archive.store import Row
 from station.archive.variables import VARIABLES
 from station.errors import StoreError
@@ -96,19 +97,39 @@ def is_laid_out_alike(one: Any, other: Any) -> bool:  # noqa: ANN401 - h5py has 
     return all(getattr(one, key) == getattr(other, key) for key in LAYOUT)
 
 
-def copy_chunks(origin: Any, first: int, made: Any, at: int) -> None:  # noqa: ANN401 - h5py has no types
-    """Copy the chunks that begin at a row as they are, compressed: twenty times faster than decoding them."""
-    steps = (range(0, size, step) for size, step in zip(origin.shape[1:], origin.chunks[1:], strict=True))
-    for corner in product(*steps):
-        if origin.id.get_chunk_info_by_coord((first, *corner)).size:  # nought where nothing was seen
-            mask, chunk = origin.id.read_direct_chunk((first, *corner))
-            made.id.write_direct_chunk((at, *corner), chunk, mask)
+def copy_chunks(
+    origin: Any,  # noqa: ANN401 - h5py has no types
+    first: int,
+    made: Any,  # noqa: ANN401
+    at: int,
+    count: int,
+    progress: Callable[[], None] = lambda: None,
+) -> None:
+    """Copy the chunks that begin in some rows as they are: twenty times faster than decoding them.
+
+    What is of one place comes together, so that a box over time is read in long runs. `progress` is called
+    after each place. What was never written has no chunk.
+    """
+    there: list[tuple[int, ...]] = []
+
+    def note(chunk: Any) -> None:  # noqa: ANN401
+        if first <= chunk.chunk_offset[0] < first + count:
+            there.append(chunk.chunk_offset)
+
+    origin.id.chunk_iter(note)  # all at once: to ask for one takes as long as there are chunks before it
+    for place, corners in groupby(sorted(there, key=_place_and_row), key=itemgetter(slice(1, None))):
+        for corner in corners:
+            mask, chunk = origin.id.read_direct_chunk(corner)
+            made.id.write_direct_chunk((corner[0] - first + at, *place), chunk, mask)
+        progress()
+
+
+def _place_and_row(corner: tuple[int, ...]) -> tuple[int, ...]:
+    return (*corner[1:], corner[0])
 
 
 def take_over(old: Any, file: Any, names: Sequence[str], count: int) -> None:  # noqa: ANN401 - h5py has no types
     """Copy the first epochs of variables that are small per scan from the file before, in whole chunks."""
     for name in names:
         if name in file:
-            origin, made = old[name], file[name]
-            for at in range(0, count, TIMES_TOGETHER):
-                copy_chunks(origin, at, made, at)
+            copy_chunks(old[name], 0, file[name], 0, count)

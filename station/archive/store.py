@@ -1,4 +1,4 @@
-"""Write an epoch, never lose one; say what is stored; open the series."""
+"""Write an epoch, never lose one; say what is stored."""
 
 from __future__ import annotations
 
@@ -9,20 +9,19 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import TYPE_CHECKING, overload
+from typing import overload
 
 import h5py
 import netCDF4
 import numpy as np
+from isal.igzip_lib import IsalError
 
 from station.archive.layout import Series, define, lay_out, strings, text, written_whole
 from station.archive.rasters import write_rasters
+from station.archive.tiles import column
 from station.archive.variables import BY_NAME, TERMS, TEXT_LENGTH, VARIABLES, VERDICTS
 from station.errors import StoreError
 from station.quantities import Grid, Measurement, Shared
-
-if TYPE_CHECKING:
-    import xarray as xr
 
 STAMP = "%Y%m%dT%H%M%SZ"
 JOINED = {"days": "%Y%m%d", "months": "%Y%m"}  # kinds of joined files, by how each names its time
@@ -213,14 +212,19 @@ class Named(Sequence[Row]):
             with h5py.File(series.path, "r") as file:
                 self.time_s = np.asarray(file["time"][:], dtype=np.float64)
                 self.start_s = np.asarray(file["time_bnds"][:, 0], dtype=np.float64)
-                self.epoch_file = file["epoch_file"][:].view(self.epoch_file.dtype)[:, 0]
+                self.epoch_file = column(file["epoch_file"]).view(self.epoch_file.dtype)[:, 0]
                 for one in file["elevation"].virtual_sources():
                     whole = one.src_space.get_select_type() == h5py.h5s.SEL_ALL
                     first = 0 if whole else one.src_space.get_select_bounds()[0][0]
                     self._at.append(one.vspace.get_select_bounds()[0][0])
                     self._there.append((series.folder / one.file_name, first))
-        except (OSError, RuntimeError, KeyError, ValueError) as error:
+        except (OSError, RuntimeError, KeyError, ValueError, IsalError) as error:  # type: ignore[misc] # the stub has no class
             raise StoreError(f"{series.path}: damaged, cannot be read: {error}") from error
+
+    @property
+    def files(self) -> set[Path]:
+        """Return the files they lie in."""
+        return {path for path, _ in self._there}
 
     def __len__(self) -> int:
         """Return how many there are."""
@@ -306,25 +310,6 @@ def series_in(site_or_folder: str | Path) -> Series:
         raise StoreError(f"{folder}: no series to be read there (station status): {error}") from error
 
 
-def open_series(site_or_folder: str | Path) -> xr.Dataset:
-    """Return the whole series of a site file or data folder, lazily.
-
-    Raises StoreError where there is none, or where a file it points to is gone: that would read as missing.
-    """
-    import xarray as xr  # noqa: PLC0415 - a fifth of the service's start, which does without
-
-    place = folder_of(site_or_folder)
-    path = place / "series.nc"
-    if not path.is_file():
-        raise StoreError(f"{path}: no series yet; has a scan been processed? (station status)")
-    gone = sorted(str(source) for source in sources(path) if not source.is_file())
-    if gone:
-        raise StoreError(
-            f"{path}: {len(gone)} of its files are gone, first {gone[0]}: put them back beside it"
-        )
-    return xr.open_dataset(path, engine="netcdf4", decode_timedelta=False)
-
-
 def _write(file: netCDF4.Dataset, series: Series, epoch: Epoch, name: str) -> None:
     shared = epoch.shared
     parameters = (shared.names, shared.units) if shared is not None else ((), ())
@@ -332,8 +317,8 @@ def _write(file: netCDF4.Dataset, series: Series, epoch: Epoch, name: str) -> No
     lay_out(file, series, title, 1, parameters)
     file["time"][0] = (epoch.start_s + epoch.end_s) / 2
     file["time_bnds"][0] = (epoch.start_s, epoch.end_s)
-    for column in _columns(epoch.measurement):
-        define(file, BY_NAME[column], series, 1)
+    for variable in _columns(epoch.measurement):
+        define(file, BY_NAME[variable], series, 1)
     if shared is not None:
         define(file, BY_NAME["shared_parameter"], series, 1)[0] = shared.estimate
         define(file, BY_NAME["shared_parameter_covariance"], series, 1)[0] = shared.covariance

@@ -125,13 +125,16 @@ def _names(name: str, *, last: bool) -> tuple[str, ...]:
 
 
 def thinned(starts: list[datetime]) -> list[int]:
-    """Return which of some moments, in their order, are kept: fewer the older they are."""
+    """Return which of some moments, in their order, are kept: fewer the older they are.
+
+    Whole days grow too old for a map each: what is kept of a month was drawn as that of its day.
+    """
     newest = starts[-1]
     kept: dict[object, int] = {}
     for index, start in enumerate(starts):
         if newest - start <= ALL_FOR:
             kept[start] = index
-        elif newest - start <= DAILY_FOR:
+        elif newest.date() - start.date() <= DAILY_FOR:
             kept[start.date()] = index
         else:
             kept[(start.year, start.month)] = index

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import h5py
-import netCDF4
 import numpy as np
+from isal.igzip_lib import IsalError
 
 from station.archive.areas import AREA_VARIABLES
 from station.archive.layout import Series, strings
+from station.archive.tiles import column
 from station.archive.variables import FILL, VERDICTS
 from station.errors import StoreError
 from station.quantities import Floats
@@ -49,14 +51,13 @@ def read_record(series: Series) -> Record:
     """Read it from `series.nc`; raise StoreError where that cannot be."""
     try:
         with h5py.File(series.path, "r") as file:
-            numbers = {name: np.asarray(file[name][:], dtype=np.float64) for name in NUMBERS}
             return Record(
                 start_s=np.asarray(file["time_bnds"][:, 0], dtype=np.float64),
                 verdict=[VERDICTS[one] for one in file["verdict"][:].tolist()],
-                numbers={name: np.where(one < FILL / 2, one, np.nan) for name, one in numbers.items()},
-                words={name: strings(file[name][:]) for name in WORDS},
+                numbers={name: _known(file[name][:]) for name in NUMBERS},
+                words={name: strings(column(file[name])) for name in WORDS},
             )
-    except (OSError, RuntimeError, KeyError, IndexError) as error:
+    except (OSError, RuntimeError, KeyError, IndexError, ValueError, IsalError) as error:  # type: ignore[misc] # the stub has no class
         raise StoreError(f"{series.path}: cannot be read: {error}") from error
 
 
@@ -66,21 +67,23 @@ def read_areas(series: Series) -> list[AreaRecord]:
     if not path.is_file():
         return []
     try:
-        with netCDF4.Dataset(path) as file:
-            start_s = np.asarray(file["time_bnds"][:, 0], dtype=np.float64)
-            names = [str(name) for name in file["area_name"][:]]
-            size_m2 = _column(file["area_size"])
+        with h5py.File(path, "r") as file:
             over_time = [row.name for row in AREA_VARIABLES if row.dims == ("time", "area")]
-            if not set(over_time) <= set(file.variables):
+            if not set(over_time) <= set(file):
                 return []
-            columns = {name: _column(file[name]) for name in over_time}
-    except (OSError, RuntimeError, KeyError, IndexError) as error:
+            start_s = np.asarray(file["time_bnds"][:, 0], dtype=np.float64)
+            names = [name.tobytes().rstrip(b"\0").decode() for name in file["area_name"][:]]
+            size_m2 = file["area_size"][:]
+            columns = {name: _known(column(file[name])) for name in over_time}
+    except (OSError, RuntimeError, KeyError, IndexError, ValueError, IsalError) as error:  # type: ignore[misc] # the stub has no class
         raise StoreError(f"{path}: cannot be read: {error}") from error
     return [
-        AreaRecord(name, float(size_m2[i]), start_s, {key: column[:, i] for key, column in columns.items()})
+        AreaRecord(name, float(size_m2[i]), start_s, {key: one[:, i] for key, one in columns.items()})
         for i, name in enumerate(names)
     ]
 
 
-def _column(variable: netCDF4.Variable) -> Floats:  # type: ignore[type-arg]
-    return np.asarray(np.ma.filled(variable[:].astype(np.float64), np.nan))
+def _known(values: np.ndarray[Any, Any]) -> Floats:
+    """Return values, NaN where they are missing."""
+    told = values.astype(np.float64)
+    return np.where(told < FILL / 2, told, np.nan)

@@ -115,11 +115,12 @@ class _Drift:
 
 def _drift(time_s: Floats, level: Floats, habit: Floats) -> _Drift:
     """Learn how a pose moves from the median differences over several lags, which outliers leave alone."""
-    lags = np.array([lag for lag in LAGS if lag < len(level) / 2])
-    apart_s = np.array([_median(time_s[lag:] - time_s[:-lag]) for lag in lags])
-    found = np.stack([(1.4826 * _median(np.abs(level[lag:] - level[:-lag]))) ** 2 for lag in lags])
+    lags = [lag for lag in LAGS if lag < len(level) / 2]
+    both = np.column_stack([level, time_s])
+    apart = np.stack([_median(np.abs(both[lag:] - both[:-lag])) for lag in lags])
+    apart_s, found = apart[:, -1], (1.4826 * apart[:, :-1]) ** 2
     design = np.stack([apart_s / apart_s[0], np.full(len(lags), 2.0)], axis=-1)
-    walk, noise = np.linalg.lstsq(design, found, rcond=None)[0]
+    walk, noise = np.linalg.solve(design.T @ design, design.T @ found)
     scans = len(level)
     worth = HABITS_WORTH / (scans + HABITS_WORTH)
     walk = np.clip(walk, 0.02 * found[0], found[0]) * (1 - worth) + habit**2 * worth

@@ -125,11 +125,14 @@ def _chance(estimate: Floats, variance: Floats) -> float:
     return float(special.chdtrc(np.count_nonzero(seen), size))
 
 
-def lateness(of: Expected, habits: Habits) -> Lateness | None:
-    """How late the log is, by how alike its swaying is to that of the ground; None where it is too short."""
+def lateness(of: Expected, habits: Habits, reference_scans: int) -> Lateness | None:
+    """How late the log is, by how alike its swaying is to that of the ground; None where it is too short.
+
+    The ground is a mean of so many scans (0: it comes from elsewhere), and leans by what is left of theirs.
+    """
     if len(of.log_rad) < FEWEST_LINES or np.ptp(of.lines.time_s) < SHORTEST_S:
         return None
-    late_s, odds = _odds_of_lateness(of, habits)
+    late_s, odds = _odds_of_lateness(of, habits, 1 / reference_scans if reference_scans else 0.0)
     chance = np.exp(odds - odds.max())
     chance /= chance.sum()
     mean_s = float(chance @ late_s)
@@ -137,10 +140,11 @@ def lateness(of: Expected, habits: Habits) -> Lateness | None:
     return Lateness(mean_s, sigma_s, float(odds.max() - odds[np.argmin(np.abs(late_s))]))
 
 
-def _odds_of_lateness(of: Expected, habits: Habits) -> tuple[Floats, Floats]:
+def _odds_of_lateness(of: Expected, habits: Habits, leans: float) -> tuple[Floats, Floats]:
     """Lateness (n,) [s] and the logarithm of its likelihood (n,).
 
-    Slow waves, and the lines at both ends that have no partner, are left free.
+    `leans` is what the reference has of the variance of a scan's motion: no adjustment takes that off, as all
+    its scans lean by it alike. Slow waves, and the lines at both ends that have no partner, are left free.
     """
     time_s = of.lines.time_s
     into_s = time_s - time_s[0]
@@ -149,20 +153,31 @@ def _odds_of_lateness(of: Expected, habits: Habits) -> tuple[Floats, Floats]:
     free = np.concatenate(
         [np.cos(np.pi * np.outer(into_s / into_s[-1], waves)), np.eye(len(time_s))[:, edge]], axis=1
     )
-    weighted = of.precision @ free
-    within = linalg.cho_factor(free.T @ weighted)
+    whole = motion(habits, of.lines)
     late_s = np.arange(-LATE_MOST_S, LATE_MOST_S + LATE_STEP_S / 2, LATE_STEP_S)
-    sway_rad = _sway(of, habits)
+    sway_rad = _sway(of, habits, whole, leans)
     off = of.log_rad[:, None] - np.stack([np.interp(time_s - s, time_s, sway_rad) for s in late_s], axis=1)
-    chi2 = np.sum(off * (of.precision @ off), axis=0)
+    weighted, over = np.split(_over(of.precision, leans * whole, np.hstack([free, off])), [free.shape[1]], 1)
+    within = linalg.cho_factor(free.T @ weighted)
+    chi2 = np.sum(off * over, axis=0)
     chi2 -= np.sum((weighted.T @ off) * linalg.cho_solve(within, weighted.T @ off), axis=0)
     noise = chi2.min() / (len(time_s) - free.shape[1])  # against what the log is thought to have
     return late_s, -chi2 / 2 / max(noise, 1.0)
 
 
-def _sway(of: Expected, habits: Habits) -> Floats:
-    """What the ground expects a sensor to feel (lines,) [rad]: without what lines have of their own."""
-    whole = motion(habits, of.lines)
+def _over(precision: Floats, beside: Floats, values: Floats) -> Floats:
+    """Return values (n, k) over the covariance of a precision (n, n) and of what is beside it (n, n)."""
+    weighted = precision @ values
+    if not beside.any():
+        return weighted
+    return np.asarray(linalg.solve(np.eye(len(precision)) + precision @ beside, weighted))
+
+
+def _sway(of: Expected, habits: Habits, whole: Floats, leans: float) -> Floats:
+    """What the ground expects a sensor to feel (lines,) [rad]: without what lines have of their own.
+
+    `whole` (lines, lines) is the covariance of a scan's motion, of which the reference leans by a share.
+    """
     mean_rad = of.ground_rad.mean()
-    alone_rad = habits.line_motion_rad**2 * linalg.solve(whole, of.ground_rad - mean_rad, assume_a="pos")
-    return np.asarray(of.ground_rad - alone_rad)
+    shown = linalg.solve((1 + leans) * whole, of.ground_rad - mean_rad, assume_a="pos")
+    return np.asarray(mean_rad + whole @ shown - habits.line_motion_rad**2 * shown)

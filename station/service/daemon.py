@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, Protocol
 from station.config import Site, read_site
 from station.errors import ConfigError, StationError
 from station.readers.scan import suffixes
+from station.service import child
 from station.service.health import EARLIEST_S, Heart, clock_fault, need_room
 from station.service.inbox import Arrival, Inbox
 from station.service.jobs import Clockwork, Wake
@@ -65,11 +66,12 @@ def run(site_path: Path, *, make_worker: Callable[..., Takes] | None = None, pac
     Raises ConfigError where the site file cannot be used, NotReadyError where another process has the data
     folder, StoreError where that folder cannot be made.
     """
+    log_to_stderr()
     if make_worker is None:
+        child.prepare()  # the server of children loads beside this, what this loads
         from station.service.worker import Worker  # noqa: PLC0415 - a second of imports, which tests do without
 
         make_worker = Worker
-    log_to_stderr()
     faulthandler.enable()  # a watchdog's SIGABRT then tells where the loop hung
     daemon = Daemon(site_path, make_worker, pace or Pace())
     signal.signal(signal.SIGTERM, lambda *_: daemon.stop())

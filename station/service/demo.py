@@ -12,7 +12,7 @@ from rich.progress import Progress
 from rich.table import Table
 
 from station.archive.aggregate import Aggregates
-from station.archive.store import open_series
+from station.archive.opened import open_series
 from station.config import Site, read_site
 from station.quantities import Quality
 from station.service.journal import Entry, State

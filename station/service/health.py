@@ -175,8 +175,7 @@ def _queue(site: Site, journal: Journal) -> Status:
     running = in_use(site.station.data)
     unseen = "the service to look at it" if running else "the service, which is not running"
     waiting += [
-        {"scan": name, "state": "new", "for": unseen, "next_try": None}
-        for name in sorted(names - journal.names())
+        {"scan": name, "state": "new", "for": unseen, "next_try": None} for name in journal.unseen(names)
     ]
     faults = (inbox_fault, _room_fault(site), clock_fault(site.station.data, time.time()))
     return {"waiting": waiting, "set_aside": set_aside, "faults": [fault for fault in faults if fault]}

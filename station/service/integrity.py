@@ -15,6 +15,7 @@ import h5py
 import numpy as np
 
 from station.archive.layout import Series, strings
+from station.archive.made import settled
 from station.archive.reference import path_of
 from station.archive.store import Row, epochs, joined, rows, rows_in, sources, stored
 from station.archive.variables import VERDICTS
@@ -128,28 +129,38 @@ def quarantine(series: Series, names: Iterable[str]) -> None:
             raise StoreError(f"{path}: damaged, and cannot be put out of the way: {error}") from error
 
 
-def lost(site: Site, entries: Iterable[Entry], progress: Progress) -> list[str]:
-    """Return the names of journal rows whose epoch is nowhere: not itself, not joined, not replaced.
+def lost(site: Site, epochs: Mapping[str, str], progress: Progress) -> list[str]:
+    """Return the names of scans whose epoch is nowhere: not itself, not joined, not replaced.
 
-    Raises StoreError where a file of the store cannot be opened.
+    `epochs` are those the journal tells, by the name of the scan. Raises StoreError where a file of the store
+    cannot be opened.
     """
     series = series_of(site)
+    told = settled(series)
+    named = set() if told is None else {name.decode("ascii") for name in told.epoch_file.tolist()}
+    if all(Path(epoch).name in named for epoch in epochs.values()):
+        return []  # no file needs to be opened
     found: list[Row] = []
     for path in _sound(series, ()):
         progress()
         found += rows_in(path)
-    return [entry.name for entry in _missing(entries, found)]
+    return _missing(epochs, found)
 
 
-def unknown(site: Site, entries: Iterable[Entry], progress: Progress) -> list[Entry]:
-    """Return rows for epochs of the series that no journal row tells of: as the lost journal had them.
+def unknown(site: Site, epochs: Mapping[str, str], progress: Progress) -> list[Entry]:
+    """Return rows for epochs of the series that are not among those the journal tells: as it had them.
 
     Their size is unknown, so that the inbox shows them anew and they are told by their bytes.
     """
     series = series_of(site)
-    told = {Path(entry.epoch).name for entry in entries if entry.epoch}
+    told = {Path(epoch).name for epoch in epochs.values()}
     progress()
-    found = [row for row in rows(series) if row.epoch_file not in told]
+    named = settled(series)
+    if named is None:
+        found = [row for row in rows(series) if row.epoch_file not in told]
+    else:
+        names = named.epoch_file.tolist()
+        found = [named[at] for at, name in enumerate(names) if name.decode("ascii") not in told]
     return [_entry(site, one) for one in held(series, found)]
 
 
@@ -164,15 +175,15 @@ def prove(
         for name in found.damaged
     ]
     sound = [row for path in _sound(series, found.damaged) for row in rows_in(path)]
-    stored_rows = [entry for entry in entries if entry.epoch]
-    for entry in _missing(stored_rows, sound):
-        says = f"{entry.epoch}, the epoch of {entry.name}, is in no sound file: station reprocess rebuilds it"
+    epochs = {entry.name: entry.epoch for entry in entries if entry.epoch}
+    for name in _missing(epochs, sound):
+        says = f"{epochs[name]}, the epoch of {name}, is in no sound file: station reprocess rebuilds it"
         told.append(("fault", "epoch", says))
     if found.fresh:
         says = f"{len(found.fresh)} files without a checksum, readable: the service notes one when it starts"
         told.append(("warning", "file", says))
-    names = {Path(str(entry.epoch)).name for entry in stored_rows}
-    starts = {one.start for entry in stored_rows if (one := stored(Path(str(entry.epoch))))}
+    names = {Path(epoch).name for epoch in epochs.values()}
+    starts = {one.start for epoch in epochs.values() if (one := stored(Path(epoch)))}
     orphans = {row.epoch_file for row in sound if row.epoch_file not in names and row.start not in starts}
     for name in sorted(orphans):
         says = f"{name}: the journal does not know it: the service takes it in when it starts"
@@ -193,18 +204,18 @@ def _sound(series: Series, damaged: Iterable[str]) -> list[Path]:
     return [path for path in store_files(series) if path not in out and not is_reference(path)]
 
 
-def _missing(entries: Iterable[Entry], sound: Iterable[Row]) -> list[Entry]:
-    """Return the journal rows whose epoch is in no file, nor a newer revision of it."""
+def _missing(epochs: Mapping[str, str], sound: Iterable[Row]) -> list[str]:
+    """Return the names of scans whose epoch is in no file, nor a newer revision of it."""
     names: set[str] = set()
     newest: dict[datetime, int] = {}
     for row in sound:
         names.add(row.epoch_file)
         newest[row.start] = max(newest.get(row.start, 0), row.revision)
     missing = []
-    for entry in entries:
-        told = stored(Path(entry.epoch)) if entry.epoch else None
+    for name, epoch in epochs.items():
+        told = stored(Path(epoch))
         if told and told.path.name not in names and newest.get(told.start, 0) <= told.revision:
-            missing.append(entry)
+            missing.append(name)
     return missing
 
 

@@ -299,10 +299,17 @@ class Journal:
             for name, size, mtime_ns, state, next_s in found
         }
 
-    def names(self) -> set[str]:
-        """Return the name of every row."""
+    def unseen(self, names: Iterable[str]) -> list[str]:
+        """Return, sorted, the names that no row has."""
+        told = "SELECT value FROM json_each(?) WHERE value NOT IN (SELECT name FROM scan) ORDER BY value"
         with self._faults():
-            return {name for (name,) in self._rows.execute("SELECT name FROM scan")}
+            return [name for (name,) in self._rows.execute(told, (json.dumps(list(names)),))]
+
+    def epochs(self, state: State | None = None) -> dict[str, str]:
+        """Return the epoch of each scan that has one, or of those of one state, by the scan's name."""
+        told = "SELECT name, epoch FROM scan WHERE epoch IS NOT NULL AND state = coalesce(?, state)"
+        with self._faults():
+            return dict(self._rows.execute(f"{told} ORDER BY name", (state,)).fetchall())
 
     def usable(self) -> list[str]:
         """Return the scans stored with a good verdict, by their start."""

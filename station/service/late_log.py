@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-import netCDF4
+import h5py
 import numpy as np
 
+from station.archive.variables import FILL
 from station.config import Site
 from station.errors import StoreError
 from station.service.tasks import series_of
@@ -24,13 +25,13 @@ def late_log(site: Site) -> str:
     path = series_of(site).path
     names = ("log_lateness", "log_lateness_uncertainty")
     try:
-        with netCDF4.Dataset(path) as file:
-            if any(name not in file.variables for name in names):
+        with h5py.File(path, "r") as file:
+            if any(name not in file for name in names):
                 return ""
-            late_s, sigma_s = (np.ma.filled(file[name][-LOOKED_AT:], np.nan) for name in names)
+            late_s, sigma_s = (file[name][-LOOKED_AT:].astype(np.float64) for name in names)
     except (OSError, RuntimeError, IndexError, ValueError) as error:
         raise StoreError(f"{path}: cannot be read: {error}") from error
-    told = np.isfinite(late_s)
+    told = np.isfinite(late_s) & (late_s < FILL / 2)
     if np.count_nonzero(told) < FEWEST:
         return ""
     weight = 1 / (sigma_s[told] ** 2 + CLOCK_S**2)

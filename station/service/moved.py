@@ -7,10 +7,10 @@ from __future__ import annotations
 
 from datetime import UTC, datetime
 
-import netCDF4
+import h5py
 import numpy as np
 
-from station.archive.layout import Series
+from station.archive.layout import Series, strings
 from station.archive.reference import read_habits
 from station.archive.variables import VERDICTS
 from station.config import Site
@@ -63,19 +63,16 @@ def moved_by(site: Site, start_utc_s: float | None) -> tuple[str, str]:
 def _poses(series: Series) -> tuple[Floats, Floats]:
     """Read start (n,) and pose (n, 6) of the newest scans that are comparable."""
     try:
-        with netCDF4.Dataset(series.path) as file:
-            if "shared_parameter" not in file.variables:
+        with h5py.File(series.path, "r") as file:
+            if "shared_parameter" not in file:
                 return np.empty(0), np.empty((0, len(POSE)))
-            file.set_auto_mask(False)
-            rows = slice(max(file.dimensions["time"].size - LOOKED_AT, 0), None)
-            names = file["parameter_name"][:].tolist()
+            rows = slice(-LOOKED_AT, None)
+            names = strings(file["parameter_name"][:])
             place = [names.index(name) for name in POSE]
             pose = np.asarray(file["shared_parameter"][rows], dtype=np.float64)[:, place]
             start_s = np.asarray(file["time_bnds"][rows, 0], dtype=np.float64)
-            chosen: Bools = (file["adjustment"][rows] == "joint") & (
-                file["verdict"][rows] != VERDICTS.index("unusable")
-            )
-            sop = file["sop_id"][rows]
+            adjustment, sop = (np.array(strings(file[name][rows])) for name in ("adjustment", "sop_id"))
+            chosen: Bools = (adjustment == "joint") & (file["verdict"][rows] != VERDICTS.index("unusable"))
     except (OSError, RuntimeError, IndexError, ValueError) as error:
         raise StoreError(f"{series.path}: cannot be read: {error}") from error
     chosen &= np.all(np.abs(pose) < 1e3, axis=1)  # netCDF's fill is not

@@ -164,7 +164,8 @@ class _Redoing:
 
     def _plan(self, between_s: tuple[float, float]) -> Plan:
         entries = [entry for entry in self._journal.rows() if entry.epoch]
-        return self._worker.run(plan, entries, set(self._worker.run(lost, entries)), between_s)
+        gone = set(self._worker.run(lost, self._journal.epochs()))
+        return self._worker.run(plan, entries, gone, between_s)
 
     def _with_reference(self, found: Plan, between_s: tuple[float, float]) -> Plan:
         """Make the reference anew where it is stale; return what is stale then."""

@@ -47,15 +47,35 @@ def due_to_go(site: Site, entries: Iterable[Entry], kept: set[str]) -> list[str]
     return [name for _, name in sorted(found)[:MOST_AT_ONCE]]
 
 
-def retire(site: Site, entry: Entry, files: Mapping[str, str], progress: Progress) -> str:
-    """Move or delete a raw scan and its log; say what was done.
+def retire(
+    site: Site, entries: Iterable[Entry], files: Mapping[str, str], progress: Progress
+) -> list[tuple[str, str, str]]:
+    """Move or delete raw scans and their logs; return of each its name, what was done, and why not.
 
-    Raises ScanError where the scan is not the one that was stored or its epoch is not proved by its checksum
-    in `files`; NotReadyError where the folders cannot be written. Nothing is lost then.
+    `kept` are those whose bytes or epoch are not proved by their checksums, of the store in `files`. At one
+    that `waits`, as the folders cannot be written, it ends. A file that holds many epochs is read once.
+    """
+    told: list[tuple[str, str, str]] = []
+    proved: set[Path] = set()
+    for entry in entries:
+        try:
+            told.append((entry.name, _retire(site, entry, files, proved, progress), ""))
+        except ScanError as error:
+            told.append((entry.name, "kept", str(error)))
+        except NotReadyError as error:  # it would be so for the others too
+            return [*told, (entry.name, "waits", str(error))]
+    return told
+
+
+def _retire(site: Site, entry: Entry, files: Mapping[str, str], proved: set[Path], progress: Progress) -> str:
+    """Move or delete a raw scan and its log; say what was done. `proved` files of the store need no proof.
+
+    Raises ScanError where the scan is not the one that was stored or its epoch is not proved; NotReadyError
+    where the folders cannot be written. Nothing is lost then.
     """
     arrival = arrival_of(site, site.scans.inbox / entry.name)
     before = fingerprint(arrival.path)
-    _require_proved(site, arrival, entry, files, progress)
+    _require_proved(site, arrival, entry, files, proved, progress)
     going = [path for path in (arrival.log, arrival.path) if path is not None]  # the scan goes last
     archive = site.retention.archive
     try:
@@ -78,7 +98,12 @@ def retire(site: Site, entry: Entry, files: Mapping[str, str], progress: Progres
 
 
 def _require_proved(
-    site: Site, arrival: Arrival, entry: Entry, files: Mapping[str, str], progress: Progress
+    site: Site,
+    arrival: Arrival,
+    entry: Entry,
+    files: Mapping[str, str],
+    proved: set[Path],
+    progress: Progress,
 ) -> None:
     """Raise ScanError unless these very bytes are stored, in a file of the right checksum."""
     if sha256_of(arrival.path) != entry.sha256:
@@ -88,9 +113,12 @@ def _require_proved(
     progress()
     series = series_of(site)
     holder = _holder(series, entry)
+    if holder in proved:
+        return
     name = str(holder.relative_to(series.folder)) if holder else ""
     if holder is None or name not in files or sha256_of(holder) != files[name]:
         raise ScanError(f"its epoch {entry.epoch} is missing or damaged: kept (station check --store)")
+    proved.add(holder)
 
 
 def _holder(series: Series, entry: Entry) -> Path | None:

@@ -291,7 +291,8 @@ def _log_against_ground(
     if levelled is None or reference is None or levelled[0].log is None:
         return [], {}
     expected = sensor.expected(levelled[0].lines, levelled[0].log, levelled[1])
-    doubts, late = sensor.off_habit(expected), sensor.lateness(expected, reference.habits)
+    doubts = sensor.off_habit(expected)
+    late = sensor.lateness(expected, reference.habits, len(reference.scan_ids))
     if late is None:
         return doubts, {}
     return doubts + late.words(), {"log_lateness": late.late_s, "log_lateness_uncertainty": late.sigma_s}

@@ -240,14 +240,14 @@ class Worker:
 
     def _adopt(self) -> None:
         """Make rows for epochs that the journal does not know: it was lost, or older than the store."""
-        found = self._mending(unknown, self._journal.rows())
+        found = self._mending(unknown, self._journal.epochs())
         if found:
             log.warning("%s", logfmt(journal="made anew", epochs=len(found), reason="it knew not of them"))
         self._journal.adopt(found)
         self.run(restore_zeros)
 
     def _have_lost_done_again(self) -> None:
-        for name in self.run(lost, self._journal.rows(State.STORED)):
+        for name in self.run(lost, self._journal.epochs(State.STORED)):
             if (self._site.scans.inbox / name).is_file():
                 log.warning("%s", logfmt(scan=name, reason="its epoch is missing from the store: done again"))
                 self._journal.again([name])
@@ -296,20 +296,19 @@ class Worker:
         self._told_stale = count
 
     def _let_raw_scans_go(self) -> None:
-        """Move or delete raw scans as `[retention]` says, each proved by its own child."""
-        for name in due_to_go(self._site, self._journal.rows(State.STORED), self._kept_for_reference()):
-            if self._should_stop():
-                return
-            entry = self._journal.entry(name)
-            try:
-                done = self.run(retire, entry, self._journal.files())
-            except ScanError as error:
-                log.warning("%s", logfmt(scan=name, retention="kept", reason=error))
-            except NotReadyError as error:  # it would be so for the others too
-                log.warning("%s", logfmt(scan=name, retention="waits", reason=error))
-                return
-            else:
-                log.info("%s", logfmt(scan=name, retention=done))
+        """Move or delete raw scans as `[retention]` says."""
+        due = due_to_go(self._site, self._journal.rows(State.STORED), self._kept_for_reference())
+        entries = [entry for entry in map(self._journal.entry, due) if entry is not None]
+        if not entries or self._should_stop():
+            return
+        try:
+            told = self.run(retire, entries, self._journal.files())
+        except (ScanError, NotReadyError) as error:  # the child was lost, or the service is to stop
+            log.warning("%s", logfmt(retention="waits", reason=error))
+            return
+        for name, done, why in told:
+            says = {"reason": why} if why else {}
+            log.log(logging.WARNING if why else logging.INFO, "%s", logfmt(scan=name, retention=done, **says))
 
     def _kept_for_reference(self) -> set[str]:
         return set(scans_due(self._site, self._usable(), len(current(self._series))))

@@ -30,7 +30,7 @@ class Told:
 
 @pytest.fixture(autouse=True)
 def short_chunks(monkeypatch):
-    for module in (layout, building, sources, areas):
+    for module in (layout, building, areas):
         monkeypatch.setattr(module, "TIMES_TOGETHER", TOGETHER)
 
 
@@ -163,6 +163,22 @@ def test_what_else_a_series_says_is_brought_up_too(grown, epoch):
     build_series(dataclasses.replace(series, name="Kesselwandferner"))
     with h5py.File(series.path) as file:
         assert file.attrs["station_name"] == b"Kesselwandferner"
+
+
+def test_a_store_is_settled_until_a_file_comes_or_goes(grown, epoch):
+    series, update = grown
+    assert made.settled(series) is None
+    for hour in (1, 2):
+        written = store.write_epoch(series, epoch(hour, grid=SMALL))
+        assert made.settled(series) is None
+        update()
+        assert list(made.settled(series)) == rows(series)
+    os.utime(written.path)
+    assert made.settled(series) is None
+    update()
+    assert len(made.settled(series)) == 2
+    written.path.unlink()
+    assert made.settled(series) is None
 
 
 @pytest.mark.slow

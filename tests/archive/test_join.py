@@ -141,10 +141,10 @@ def test_a_joined_file_never_changes_under_its_name(filled, epoch):
         assert held.get(path.name, path.read_bytes()) == path.read_bytes()
 
 
-def test_progress_is_told_after_every_epoch(filled):
+def test_progress_is_told_while_a_file_is_copied(filled):
     told = []
     join(filled, DAY_AFTER, lambda: told.append(1))
-    assert len(told) == 5
+    assert len(told) > 5  # epochs
 
 
 def moved(epoch):

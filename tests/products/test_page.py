@@ -192,6 +192,17 @@ def test_thinned_by_age():
     assert len(kept) < 130
 
 
+def test_a_new_scan_is_the_only_one_to_be_drawn():
+    """Nothing is kept that was not: a map of an older epoch would be read from its joined month."""
+    first = datetime(2026, 8, 3, tzinfo=UTC)
+    starts = [first + timedelta(hours=hour) for hour in range(24 * 110)]
+    before = set(thinned(starts[: 24 * 70]))
+    for count in range(24 * 70 + 1, len(starts) + 1):
+        now = set(thinned(starts[:count]))
+        assert now - before == {count - 1}
+        before = now
+
+
 def test_years_of_scans_stay_under_the_weight(write, told, monkeypatch):
     """All that a browser loads at first, with the heaviest map there may be, after a year of hourly scans."""
     count, rng = 8760, np.random.default_rng(1)

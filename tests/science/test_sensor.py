@@ -21,6 +21,7 @@ SWAYS = replace(HABITS, fast_motion_rad=math.radians(0.003))
 WAVE_RAD = math.radians(0.035)
 ZERO = Cycle((0.0, WAVE_RAD, 0.0), (0.0, WAVE_RAD, 0.0))
 GROUND_RAD, NOISE_RAD = math.radians(0.0006), math.radians(0.007)
+MANY = 200  # scans of a reference
 STATE = slice(len(GLOBAL), len(GLOBAL) + OF.line_count)
 FELT = np.zeros((OF.line_count, len(GLOBAL) + OF.line_count + 2 * OF.refraction_count))
 FELT[:, 0], FELT[:, 1] = np.cos(OF.line_azimuth_rad), -np.sin(OF.line_azimuth_rad)
@@ -36,9 +37,9 @@ FAULTS = np.concatenate(
 
 
 class Scan:
-    """A truth drawn from the habits; what ground and log say of it."""
+    """A truth drawn from the habits; what the log says of it, and ground that leans as its scans left it."""
 
-    def __init__(self, seed, habits=HABITS):
+    def __init__(self, seed, habits=HABITS, reference_scans=MANY):
         self.random, self.habits = np.random.default_rng(seed), habits
         motion = prior.motion(habits, LINES)
         sigma = prior.globals_sigma(habits, weather_known=True)
@@ -48,7 +49,8 @@ class Scan:
         self.lean_rad = np.linalg.cholesky(seen + 1e-18 * np.eye(len(seen))) @ self.normal()
         self.lean_rad += FELT[:, :2] @ (habits.tilt_rad * self.random.standard_normal(2))
         jitter_rad = habits.line_motion_rad * self.normal()  # which no sensor feels
-        self.ground_rad = self.lean_rad + jitter_rad + GROUND_RAD * self.normal()
+        reference_rad = np.linalg.cholesky(motion / reference_scans) @ self.normal()
+        self.ground_rad = self.lean_rad + jitter_rad - reference_rad + GROUND_RAD * self.normal()
 
     def normal(self):
         return self.random.standard_normal(OF.line_count)
@@ -111,7 +113,7 @@ def test_a_log_within_its_habits_is_not_doubted():
         scan = Scan(seed)
         told = scan.told(scan.log())
         assert sensor.off_habit(told) == []
-        assert sensor.lateness(told, HABITS).words() == []
+        assert sensor.lateness(told, HABITS, MANY).words() == []
 
 
 def test_a_changed_wave_is_told_with_its_size():
@@ -136,7 +138,7 @@ def test_a_late_clock_is_told_where_the_scanner_sways(late_s):
     found = []
     for seed in range(4):
         scan = Scan(seed, SWAYS)
-        found.append(sensor.lateness(scan.told(scan.log(late_s)), SWAYS))
+        found.append(sensor.lateness(scan.told(scan.log(late_s)), SWAYS, MANY))
         if words := found[-1].words():
             assert ("late" in words[0].split(" (")[0]) == (late_s > 0)
     assert sum(bool(one.words()) for one in found) >= 3
@@ -150,15 +152,39 @@ def test_lateness_holds_its_sigma_where_nothing_was_known():
     for seed in range(24):
         scan = Scan(100 + seed, SWAYS if seed % 2 else HABITS)
         late_s = scan.random.uniform(-sensor.LATE_MOST_S, sensor.LATE_MOST_S)
-        one = sensor.lateness(scan.told(scan.log(late_s)), scan.habits)
+        one = sensor.lateness(scan.told(scan.log(late_s)), scan.habits, MANY)
         z.append((one.late_s - late_s) / one.sigma_s)
         sigma_s.append(one.sigma_s)
     assert 0.6 < np.sqrt(np.mean(np.square(z))) < 1.4
     assert np.median(sigma_s[1::2]) < 1.0 < np.median(sigma_s[::2])
 
 
+def test_a_reference_that_leans_itself_is_no_clock():
+    """A scan's own motion is in it, adjusted or not; taken for still, errors are half as large again."""
+    z, if_still = [], []
+    for seed in range(24):
+        scan = Scan(300 + seed, SWAYS, reference_scans=1)
+        late_s = scan.random.uniform(-3, 3)
+        told = scan.told(scan.log(late_s))
+        one, other = (sensor.lateness(told, SWAYS, scans) for scans in (1, 0))
+        z.append((one.late_s - late_s) / one.sigma_s)
+        if_still.append((other.late_s - late_s) / other.sigma_s)
+    assert 0.6 < np.sqrt(np.mean(np.square(z))) < 1.3
+    assert np.sqrt(np.mean(np.square(if_still))) > 1.4
+
+
+@pytest.mark.parametrize("late_s", [6.0, -6.0])
+def test_a_late_clock_is_told_by_a_reference_of_a_few_scans(late_s):
+    found = []
+    for seed in range(4):
+        scan = Scan(seed, SWAYS, reference_scans=8)
+        found.append(sensor.lateness(scan.told(scan.log(late_s)), SWAYS, 8))
+    assert sum(bool(one.words()) for one in found) >= 3
+    assert np.all(np.abs([(one.late_s - late_s) / one.sigma_s for one in found]) < 4)
+
+
 def test_a_log_of_few_lines_does_not_tell():
     scan = Scan(5)
     log = scan.log()
     short = LineLog(log.lean_rad, np.where(np.arange(OF.line_count) < 60, log.weight, 0.0), FAULTS)
-    assert sensor.lateness(sensor.expected(LINES, short, scan.adjusted(log)), HABITS) is None
+    assert sensor.lateness(sensor.expected(LINES, short, scan.adjusted(log)), HABITS, MANY) is None

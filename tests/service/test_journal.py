@@ -53,6 +53,17 @@ def test_a_new_scan_waits_and_ends_stored(journal):
     assert journal.others_stored("another.laz", 11) == {}
 
 
+def test_the_epochs_it_tells_and_the_names_it_does_not_know(journal):
+    journal.seen([(name, 10, 20, "") for name in ("waits.laz", "again.laz", NAME)])
+    for name in (NAME, "again.laz"):
+        store(journal, name, epoch=f"epochs/{name}.nc")
+    journal.again(["again.laz"])
+    every = {"again.laz": "epochs/again.laz.nc", NAME: f"epochs/{NAME}.nc"}
+    assert journal.epochs() == every
+    assert journal.epochs(State.STORED) == {NAME: f"epochs/{NAME}.nc"}
+    assert journal.unseen([NAME, "z.laz", "waits.laz", "odd 'name\".laz"]) == ["odd 'name\".laz", "z.laz"]
+
+
 def test_the_same_sight_again_changes_nothing(journal):
     journal.seen([(NAME, 10, 20, "")])
     store(journal)

@@ -6,6 +6,7 @@ import pytest
 
 from station.config import read_site
 from station.errors import ConfigError, NotReadyError, ScanError
+from station.service import retention
 from station.service.content import sha256_of
 from station.service.journal import Journal, State
 from station.service.retention import due_to_go, retire
@@ -38,7 +39,12 @@ def station(tmp_path, write_site):
 
 
 def let_go(site, journal):
-    return retire(site, journal.entry(NAME), journal.files(), lambda: None)
+    """What was done with the scan; raises what it says where that is nothing."""
+    ((name, done, why),) = retire(site, [journal.entry(NAME)], journal.files(), lambda: None)
+    assert name == NAME
+    if why:
+        raise {"kept": ScanError, "waits": NotReadyError}[done](why)
+    return done
 
 
 def everything(folder):
@@ -122,6 +128,31 @@ def test_an_inbox_that_may_not_be_written_says_what_to_do(station, monkeypatch):
     monkeypatch.setattr("os.access", lambda *_: False)
     with pytest.raises(NotReadyError, match="ReadWritePaths="):
         let_go(site, journal)
+
+
+def test_a_file_that_holds_many_epochs_is_read_once(station, monkeypatch):
+    """A month on a large grid is 20 GB; one scan that is kept does not keep the others."""
+    site, journal = station
+    names = ["251121_000001.laz", "251121_000002.laz", NAME]
+    for name in names[:2]:
+        (site.scans.inbox / name).write_bytes(name.encode())
+        journal.stored(
+            name,
+            sha256=sha256_of(site.scans.inbox / name),
+            verdict="good",
+            epoch=EPOCH,
+            start_utc_s=START_S,
+            revision=1,
+        )
+    (site.scans.inbox / names[0]).write_bytes(b"others")
+    read = []
+    monkeypatch.setattr(retention, "sha256_of", lambda path: read.append(path.name) or sha256_of(path))
+    entries = [journal.entry(name) for name in names]
+    told = retire(site, entries, journal.files(), lambda: None)
+    assert [(name, done) for name, done, _ in told] == list(
+        zip(names, ("kept", "moved", "moved"), strict=True)
+    )
+    assert read.count(EPOCH.rpartition("/")[2]) == 1
 
 
 def test_when_a_scan_is_due_to_go(station, write_site, monkeypatch):
