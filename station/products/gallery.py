@@ -22,10 +22,11 @@ from station.archive.store import Row
 from station.products.colours import round_up
 from station.products.look import Base, Look, base_of, look_at
 from station.products.maps import Caption, change_map, encoded, points_map, sigma_map
-from station.quantities import Grid
+from station.quantities import Floats, Grid
 
 ALL_FOR = timedelta(days=2)  # before the newest epoch; then the last map of each day …
 DAILY_FOR = timedelta(days=60)  # … and before that the last of each month
+DAY_S = 86_400.0
 MOST_DRAWN = 8  # at a time: an archive that was there before the page is shown bit by bit
 TOGETHER = 2  # pictures; to encode them takes most of the time
 GRACE_S = 3600.0  # a page that is open somewhere may still name a map that is kept no longer
@@ -94,7 +95,7 @@ def hang(
     told = json.dumps([style.station, style.width_px, limit_m, __version__])
     tag = hashlib.sha256(told.encode()).hexdigest()[:8]
     place = folder / "maps"
-    kept = [found[index] for index in thinned([one.start for one in found])]
+    kept = [found[index] for index in thinned(np.array([one.start.timestamp() for one in found]))]
     drawn, hung = 0, []
     for one in reversed(kept):
         row = one.row
@@ -124,21 +125,20 @@ def _names(name: str, *, last: bool) -> tuple[str, ...]:
     return (name, f"{stem}_sigma.webp", f"{stem}_points.webp") if last else (name,)
 
 
-def thinned(starts: list[datetime]) -> list[int]:
-    """Return which of some moments, in their order, are kept: fewer the older they are.
+def thinned(start_s: Floats) -> list[int]:
+    """Return which of some moments (n,) [s], in their order, are kept: fewer the older they are.
 
     Whole days grow too old for a map each: what is kept of a month was drawn as that of its day.
     """
-    newest = starts[-1]
-    kept: dict[object, int] = {}
-    for index, start in enumerate(starts):
-        if newest - start <= ALL_FOR:
-            kept[start] = index
-        elif newest.date() - start.date() <= DAILY_FOR:
-            kept[start.date()] = index
-        else:
-            kept[(start.year, start.month)] = index
-    return sorted(kept.values())
+    day = start_s // DAY_S
+    month = start_s.astype("datetime64[s]").astype("datetime64[M]").astype(np.int64)
+    young = start_s[-1] - start_s <= ALL_FOR.total_seconds()
+    daily = ~young & (day[-1] - day <= DAILY_FOR.days)
+    kept = [np.flatnonzero(young)]
+    for some, of in ((daily, day), (~young & ~daily, month)):
+        index = np.flatnonzero(some)
+        kept.append(index[np.diff(of[index], append=np.inf) != 0])
+    return [int(index) for index in np.sort(np.concatenate(kept))]
 
 
 def _draw(

@@ -16,7 +16,7 @@ import numpy as np
 from station import __version__
 from station.archive.layout import Series
 from station.archive.store import Named
-from station.products.gallery import Gallery, Measured, Style, hang, put
+from station.products.gallery import Gallery, Measured, Style, hang, put, thinned
 from station.products.look import Look
 from station.products.maps import ASSETS
 from station.products.record import AreaRecord, Record, read_areas, read_record
@@ -96,22 +96,23 @@ def _script(path: Path, name: str, value: object) -> None:
 
 
 def _measured(series: Series, record: Record, looks: dict[str, Look]) -> list[Measured]:
-    """Return the epochs that have a reference."""
+    """Return the epochs that have a reference: the first, and those of which there is a map."""
     rows = Named(series)
-    starts = (datetime.fromtimestamp(start_s, UTC) for start_s in record.start_s.tolist())
-    told = zip(starts, record.words["reference_version"], record.verdict, strict=True)
-    reasons, files = record.words["verdict_reason"], record.words["epoch_file"]
+    versions, reasons = record.words["reference_version"], record.words["verdict_reason"]
+    told = [at for at, version in enumerate(versions) if version]
+    if not told:
+        return []
+    kept = {0, *thinned(record.start_s[told])}
     return [
         Measured(
             rows,
             at,
-            start,
-            version,
-            "" if verdict == "good" else f"{verdict}: {reasons[at]}",
-            looks.get(files[at]),
+            datetime.fromtimestamp(float(record.start_s[at]), UTC),
+            versions[at],
+            "" if record.verdict[at] == "good" else f"{record.verdict[at]}: {reasons[at]}",
+            looks.get(record.words["epoch_file"][at]),
         )
-        for at, (start, version, verdict) in enumerate(told)
-        if version
+        for at in (told[index] for index in sorted(kept))
     ]
 
 

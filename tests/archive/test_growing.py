@@ -183,7 +183,7 @@ def test_a_store_is_settled_until_a_file_comes_or_goes(grown, epoch):
 
 @pytest.mark.slow
 def test_what_follows_a_scan_costs_little_more_after_a_year(tmp_path, monkeypatch):
-    """Fifteen times as many epochs, less than twice the CPU; measuring, which does not grow, is apart."""
+    """Fifteen times as many epochs, about the same CPU; measuring, which does not grow, is apart."""
     from benchmarks import growth
 
     monkeypatch.undo()
@@ -191,4 +191,4 @@ def test_what_follows_a_scan_costs_little_more_after_a_year(tmp_path, monkeypatc
     for epochs in (600, 8760):
         site = growth.station_of(tmp_path / str(epochs), growth.SMALL)
         taken.append(sum(growth.cost(site, growth.fill(site, epochs)).values()))
-    assert taken[1] < 1.8 * taken[0]
+    assert taken[1] < 1.35 * taken[0]

@@ -29,8 +29,9 @@ def stored(series, epoch):
     """Epochs in a joined day and by themselves; their eastern half is never seen, one has no terms."""
     for hour in (1, 2, 3, 5, 30, 31):
         made = epoch(hour, terms=hour != 30)
-        made.measurement.surface.change_m[:60, 10:20] = np.nan
-        made.measurement.surface.elevation_m[:] = np.nan  # a variable without any chunk
+        cells, number = made.measurement.cells, made.measurement.number
+        cells["change_m"][number[:60, 10:20]] = np.nan
+        cells["elevation_m"] = np.nan  # a variable without any chunk
         write_epoch(series, made)
     join_closed(series, datetime(2025, 11, 22, 12, tzinfo=UTC), lambda: None)
     build_series(series)
@@ -120,7 +121,7 @@ def test_an_epoch_among_many_is_read_as_quickly_as_the_first(tmp_path, series):
         lay_out(file, long, "a test", 1)
         define(file, row, long, 1)
     given = np.random.default_rng(1).normal(size=long.grid.shape).astype(np.float32)
-    write_rasters(path, [(row, given)])
+    write_rasters(path, [row], lambda rows: [given[rows]])
     with h5py.File(path, "r+") as file:
         variable = file[row.name]
         variable.resize(last + 1, axis=0)
