@@ -32,8 +32,9 @@ from station.science.shared import basis
 from station.service.content import sha256_of
 from station.service.integrity import store_files
 from station.service.journal import Entry, Journal, State
+from station.service.pictures import look_in_memory
 from station.service.show import show
-from station.service.tasks import areas_of, series_of
+from station.service.tasks import Outcome, areas_of, series_of
 from station.service.upkeep import publish
 
 YEAR = 8760  # hourly scans
@@ -278,16 +279,23 @@ def cost(site: Site, start: datetime) -> dict[str, float]:
     taken: dict[str, list[float]] = {}
     for one in range(ROUNDS + 1):
         begun = start + timedelta(hours=one)
-        store.write_epoch(series, epoch_of(site.grid_cells, begun))
+        epoch = epoch_of(site.grid_cells, begun)
+        written = store.write_epoch(series, epoch)
         steps: dict[str, Callable[[], object]] = {
             "publish_s": lambda: publish(site, lambda: None),
-            "show_s": lambda begun=begun: show(site, begun.timestamp(), lambda: None),
+            "show_s": lambda epoch=epoch, written=written: _shown(site, epoch, written),
         }
         for name, step in steps.items():
             began_s = time.process_time()
             step()
             taken.setdefault(name, []).append(time.process_time() - began_s)
     return {name: min(found[1:]) for name, found in taken.items()}
+
+
+def _shown(site: Site, epoch: store.Epoch, written: store.Stored) -> None:
+    series = series_of(site)
+    name, look = str(written.path.relative_to(series.folder)), look_in_memory(site, series, epoch)
+    show(site, Outcome(epoch.start_s, "", name, 1, "good", "", "1", {}, "", "", look), lambda: None)
 
 
 def reading(folder: Path) -> dict[str, float]:
