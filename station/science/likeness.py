@@ -54,10 +54,15 @@ def pattern(azimuth_rad: Reals, range_m: Reals, change: Floats) -> Floats:
 def likeness(one: Floats, other: Floats) -> float:
     """Tell how alike two patterns are: 1 the same, 0 nothing in common, -1 opposite.
 
-    Twice their product over the sum of their squares: half as large is not alike in full.
+    Twice their product over the sum of their squares: half as large is not alike in full. The mean does not
+    count: as large a snowfall need not lie where the one before lay.
     """
-    size = float(one @ one + other @ other)
-    return 2 * float(one @ other) / size if size > 0 else 0.0
+    both = np.stack([one, other])[:, (one != 0) | (other != 0)]
+    if not both.size:
+        return 0.0
+    both -= both.mean(axis=1, keepdims=True)
+    size = float(np.sum(both**2))
+    return 2 * float(both[0] @ both[1]) / size if size > 0 else 0.0
 
 
 def common_errors(one: Shared, other: Shared) -> Floats | None:
