@@ -199,9 +199,9 @@ class Calibration:
         self.slack_m2 = np.stack([told[name].values for name in SLACK], axis=1)
         row, column = np.nonzero(self.known)
         kept_out = ground.withheld(grid.x_m[column], grid.y_m[row])
-        tan_slope = np.hypot(*felt.globals_[3:5])
+        smooth = np.hypot(*felt.globals_[3:5]) < ground.MOVING_STEEPEST
         self.kind = [
-            ground.kinds((one[self.known] & Quality.STABLE_GROUND) > 0, kept_out, tan_slope, kept_out & False)
+            ground.kinds((one[self.known] & Quality.STABLE_GROUND) > 0, kept_out, smooth, kept_out & False)
             for one in result.quality
         ]
         if not result.joint and result.reference.shared is not None:
