@@ -17,8 +17,8 @@ from station.archive.aggregate import SLACK
 from station.archive.opened import open_series
 from station.archive.reference import read_reference
 from station.config import Site
-from station.quantities import Bools, Floats, Grid, Quality, Reference
-from station.science import ground, held, shared, terrain
+from station.quantities import Bools, ChangeErrors, Floats, Grid, Quality, Reference, Shared
+from station.science import ground, held, likeness, shared, terrain
 from station.science.view import View
 
 BOX_M = 100.0
@@ -194,12 +194,14 @@ class Calibration:
         self.range_m = result.geometry.range_m[self.known]
         self.covariance = told.shared_parameter_covariance.values.astype(np.float64)
         self.noise = told.shared_parameter_noise_variance.values.astype(np.float64)
+        self.change_errors = np.nan_to_num(told.change_errors.values.astype(np.float64))
+        self.change_pattern = np.nan_to_num(told.change_pattern.values.astype(np.float64))
         self.slack_m2 = np.stack([told[name].values for name in SLACK], axis=1)
         row, column = np.nonzero(self.known)
         kept_out = ground.withheld(grid.x_m[column], grid.y_m[row])
-        tan_slope = np.hypot(*felt.globals_[3:5])
+        smooth = np.hypot(*felt.globals_[3:5]) < ground.MOVING_STEEPEST
         self.kind = [
-            ground.kinds((one[self.known] & Quality.STABLE_GROUND) > 0, kept_out, tan_slope, kept_out & False)
+            ground.kinds((one[self.known] & Quality.STABLE_GROUND) > 0, kept_out, smooth, kept_out & False)
             for one in result.quality
         ]
         if not result.joint and result.reference.shared is not None:
@@ -216,7 +218,7 @@ class Calibration:
         share = np.asarray(weights.sum(axis=1)).ravel()
         weights = sparse.diags_array(1 / np.maximum(share, 1e-12)) @ weights
         g, lines = (weights @ self.design).toarray(), (weights @ self.lines).toarray()
-        squares, variance_m2 = weights.power(2), np.zeros(len(share))
+        squares, variance_m2, least_m2 = weights.power(2), np.zeros(len(share)), np.zeros(len(share))
         for one in epochs:
             random_m2, free = np.where(seen, self.random_m2[one], 0.0), np.ones(len(seen))
             covariance, noise = self.covariance[one], self.noise[one]
@@ -234,8 +236,20 @@ class Calibration:
             told_m2 = squares @ random_m2 + np.sum((g @ covariance) * g_rest, axis=1)
             told_m2 += (lines * lines_rest) @ own
             variance_m2 += np.maximum(told_m2, squares @ (random_m2 * free))
+            least_m2 += squares @ (random_m2 * free)
+        if other is not None and self.base is None:
+            common = likeness.common_errors(self._shared(epoch), self._shared(other))
+            variance_m2 = np.maximum(variance_m2 - 2 * np.sum((g @ common) * g, axis=1), least_m2)
         z = weights @ np.where(seen, error_m, 0.0) / np.sqrt(np.maximum(variance_m2, 1e-12))
         return np.where(share > 0, z, np.nan), share
+
+    def _shared(self, epoch: int) -> Shared:
+        """Return what the points of an epoch share."""
+        change = ChangeErrors(self.change_errors[epoch], self.change_pattern[epoch])
+        nothing = np.zeros(len(self.of.names))
+        return Shared(
+            self.of.names, self.of.units, nothing, self.covariance[epoch], self.noise[epoch], change
+        )
 
     def targets(self, scale: str) -> sparse.csr_array:
         """Weights (targets, cells) of one scale: cell, 10 m, 100 m, or the whole area; rock is left out."""

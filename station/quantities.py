@@ -152,11 +152,24 @@ class Setup:
 
 
 @dataclass(frozen=True)
+class ChangeErrors:
+    """What the change of the moving ground makes wrong in an estimate; scans after like change share it.
+
+    `modes` are errors of the parameters in their own units, one sigma each and independent of each other.
+    `pattern` is the change that was found, by sector round the scanner, in sigmas of what was allowed for.
+    """
+
+    modes: Floats  # (p, m)
+    pattern: Floats  # (s,)
+
+
+@dataclass(frozen=True)
 class Shared:
     """What all points of a scan have in common and nobody knows exactly (EQUATIONS 6.1).
 
     `estimate` and `covariance` are in the parameters' own units, given by `units`. `noise_variance` is what
     each group of scan lines has of its own beyond the parameter of its place; nought but for the lean.
+    `change` is a part of the covariance, that which other scans may have in common with this one.
     """
 
     names: tuple[str, ...]
@@ -164,6 +177,7 @@ class Shared:
     estimate: Floats  # (p,)
     covariance: Floats  # (p, p)
     noise_variance: Floats  # (p,)
+    change: ChangeErrors | None = None
 
     def __add__(self, other: Shared) -> Shared:
         """Return what a sum or difference of two independent surfaces leaves unknown."""

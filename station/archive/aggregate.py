@@ -12,9 +12,10 @@ from station.archive.layout import Series, strings
 from station.archive.reference import open_reference
 from station.archive.store import Row, rows
 from station.errors import StoreError
-from station.quantities import Bools, Floats, Grid, Quality, Reference, Shared
+from station.quantities import Bools, ChangeErrors, Floats, Grid, Quality, Reference, Shared
 from station.science import ground
 from station.science.held import share
+from station.science.likeness import common_errors
 from station.science.shared import (
     Basis,
     Sensitivities,
@@ -154,19 +155,27 @@ class Aggregates:
         random_m2: list[Floats],
         grown: float = 1.0,
     ) -> float:
-        """Variance of the weighted sum of the chosen cells (n,), over the epochs; the random part `grown`."""
-        total = 0.0
-        for one, own_m2 in zip(held, random_m2, strict=True):
-            unknown = one.unknown
+        """Variance of the weighted sum of the chosen cells (n,), over the epochs; the random part `grown`.
+
+        Of two epochs, what both have wrong goes off, but never what cells have of their own.
+        """
+        total, least, effects = 0.0, 0.0, []
+        for one, alone_m2 in zip(held, random_m2, strict=True):
+            unknown, own_m2 = one.unknown, grown * alone_m2
             if unknown is None:
-                total += grown * float(np.sum(weights**2 * own_m2))
+                total, least = (before + float(np.sum(weights**2 * own_m2)) for before in (total, least))
                 continue
             if len(held) == 1 and not one.adjusted:
                 unknown = against(unknown, one.reference.shared)
             felt = self.felt(one, chosen)
-            noise = self.held_share(one, chosen, felt, own_m2) if len(held) > 1 else None
-            total += aggregate_variance(weights, grown * own_m2, felt, unknown, noise)
-        return total
+            effects.append(felt.total(weights))
+            noise = self.held_share(one, chosen, felt, alone_m2) if len(held) > 1 else None
+            total += aggregate_variance(weights, own_m2, felt, unknown, noise)
+            least += float(np.sum(weights**2 * own_m2 * (1.0 if noise is None else 1 - noise)))
+        common = common_of(held)
+        if common is not None:
+            total -= 2 * float(effects[0] @ common @ effects[1])
+        return max(total, least)
 
     def held_share(self, one: Held, chosen: Bools, felt: Sensitivities, own_m2: Floats) -> Floats | None:
         """Share (n,) of the chosen cells' own noise that an epoch's estimate holds too; None if unknown.
@@ -258,13 +267,12 @@ class Aggregates:
                 return Held(change_m, random_m, None, scanner, reference, joint, row)
             file.set_auto_chartostring(False)
             names, units = (tuple(strings(np.ma.getdata(file[name][:]))) for name in PARAMETER)
-            estimate, covariance, noise = (
+            estimate, covariance, noise, *change = (
                 np.ma.filled(file[name][row.index].astype(np.float64), 0.0)  # what other epochs alone name
-                for name in (
-                    "shared_parameter", "shared_parameter_covariance", "shared_parameter_noise_variance"
-                )
-            )  # fmt: skip
-        unknown = by_names(self._basis(scanner)[0], Shared(names, units, estimate, covariance, noise))
+                for name in (*SHARED, *(CHANGE_ERRORS if set(CHANGE_ERRORS) <= set(file.variables) else ()))
+            )
+        found = Shared(names, units, estimate, covariance, noise, ChangeErrors(*change) if change else None)
+        unknown = by_names(self._basis(scanner)[0], found)
         return Held(change_m, random_m, unknown, scanner, reference, joint, row)
 
     def _basis(self, scanner: tuple[float, ...]) -> tuple[Basis, tuple[float, float, float]]:
@@ -277,7 +285,19 @@ class Aggregates:
 
 SCANNER = ("scanner_east", "scanner_north", "scanner_height", "scanner_axis_east", "scanner_axis_north")
 PARAMETER = ("parameter_name", "parameter_unit")
+SHARED = ("shared_parameter", "shared_parameter_covariance", "shared_parameter_noise_variance")
+CHANGE_ERRORS = ("change_errors", "change_pattern")  # as `ChangeErrors` has them
 SLACK = ("adjustment_slack_moving", "adjustment_slack_stable")
+
+
+def common_of(held: list[Held]) -> Floats | None:
+    """Covariance (p, p) between what two epochs have wrong; None where there is none, or of one epoch."""
+    one, other = held[0], held[-1]
+    if one is other or not (one.adjusted and other.adjusted) or one.unknown is None or other.unknown is None:
+        return None
+    if one.reference.version != other.reference.version:
+        return None
+    return common_errors(one.unknown, other.unknown)
 
 
 def seen_in_all(held: list[Held], cells: Bools) -> Bools:

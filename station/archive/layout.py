@@ -14,7 +14,7 @@ import numpy as np
 from pyproj import CRS
 
 from station import __version__
-from station.archive.variables import FILL, TEXT_LENGTH, Variable
+from station.archive.variables import CHANGE_LENGTH, FILL, TEXT_LENGTH, Variable
 from station.errors import StoreError
 from station.quantities import Grid
 
@@ -191,6 +191,9 @@ def _parameters(file: netCDF4.Dataset, names: tuple[str, ...], units: tuple[str,
         return
     file.createDimension("parameter", len(names))
     file.createDimension("parameter_2", len(names))
+    if "time" in file.dimensions:
+        for dim, length in CHANGE_LENGTH.items():
+            file.createDimension(dim, length)
     for name, values, long_name in (
         ("parameter_name", names, "name of the shared parameter"),
         ("parameter_unit", units, "unit of the shared parameter"),

@@ -136,7 +136,7 @@ def _point_all(file: Any, series: Series, held: list[Source], parameters: Parame
         layout.set_fill_value(np.array(FILL if row.dtype[0] == "f" else 0, row.dtype))
         for source, path in zip(held, paths, strict=True):
             if row.name in source.shapes:
-                key = (source.at, shape, source.shapes[row.name])
+                key = (source.at, row.dims, source.shapes[row.name])
                 if key not in known:
                     known[key] = list(_spaces(source, row, parameters, shape))
                 for here, origin in known[key]:
@@ -150,15 +150,14 @@ def _spaces(
     source: Source, row: Variable, parameters: Parameters, shape: tuple[int, ...]
 ) -> Iterator[tuple[Any, Any]]:
     """Yield what of a large variable lies where: in the series, and in the file."""
-    if row.is_raster:
-        pieces = [((source.at, 0, 0), (source.first, 0, 0), (source.count, *shape[1:]))]
-    else:
-        blocks = _blocks(_places(source, parameters))
-        pieces = [
-            ((source.at, at_1, at_2), (source.first, there_1, there_2), (source.count, size_1, size_2))
-            for (there_1, at_1, size_1), (there_2, at_2, size_2) in product(blocks, blocks)
-        ]
-    for at, there, size in pieces:
+    named = _blocks(_places(source, parameters))
+    blocks = [
+        named if dim.startswith("parameter") else [(0, 0, size)]
+        for dim, size in zip(row.dims[1:], shape[1:], strict=True)
+    ]
+    for (there_1, at_1, size_1), (there_2, at_2, size_2) in product(*blocks):
+        at, there = (source.at, at_1, at_2), (source.first, there_1, there_2)
+        size = source.count, size_1, size_2
         here, origin = (h5py.h5s.create_simple(one) for one in (shape, source.shapes[row.name]))
         here.select_hyperslab(at, size)
         origin.select_hyperslab(there, size)

@@ -323,6 +323,9 @@ def _write(file: netCDF4.Dataset, series: Series, epoch: Epoch, name: str) -> No
         define(file, BY_NAME["shared_parameter"], series, 1)[0] = shared.estimate
         define(file, BY_NAME["shared_parameter_covariance"], series, 1)[0] = shared.covariance
         define(file, BY_NAME["shared_parameter_noise_variance"], series, 1)[0] = shared.noise_variance
+        if shared.change is not None:
+            define(file, BY_NAME["change_errors"], series, 1)[0] = shared.change.modes
+            define(file, BY_NAME["change_pattern"], series, 1)[0] = shared.change.pattern
     _write_words(file, series, epoch, name)
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from station.quantities import Quality
+from station.science.likeness import MODES, SECTORS
 
 FILL = 9.96921e36  # netCDF's own fill for floats: NCO averages NaN to nothing
 VERDICTS = ("good", "degraded", "unusable")
@@ -161,6 +162,26 @@ VARIABLES: tuple[Variable, ...] = (
         None,
         comment="independent from group to group, of 0.2 degree each; units are squares of parameter_unit",
     ),
+    Variable(
+        "change_errors",
+        ("time", "parameter", "change_mode"),
+        "f4",
+        "errors of the shared parameters that the change of the moving ground makes",
+        None,
+        comment="part of shared_parameter_covariance, which scans after like change have in common;"
+        " a column is one standard deviation, independent of the others; units in parameter_unit",
+    ),
+    Variable(
+        "change_pattern",
+        ("time", "sector"),
+        "f4",
+        "change of the moving ground that the adjustment found, by sector round the scanner",
+        "1",
+        None,
+        3,
+        comment="over change_step; sectors of 15 degree clockwise from north, in each 12 rings of 500 m;"
+        " how alike those of two scans are says how far they have change_errors in common",
+    ),
     Variable("scan_id", TEXT, "S1", "name of the scan"),
     Variable(
         "verdict",
@@ -245,6 +266,7 @@ VARIABLES: tuple[Variable, ...] = (
 
 BY_NAME = {variable.name: variable for variable in VARIABLES}
 TEXT_LENGTH = {"text": 64, "sentence": 256}
+CHANGE_LENGTH = {"change_mode": MODES, "sector": SECTORS}
 TERMS = (
     "sigma_registration",
     "sigma_instrument",

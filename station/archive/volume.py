@@ -8,14 +8,14 @@ import numpy.typing as npt
 import shapely
 import xarray as xr
 
-from station.archive.aggregate import CHANGE, Aggregates, Held, cell_values, seen_in_all
+from station.archive.aggregate import CHANGE, Aggregates, Held, cell_values, common_of, seen_in_all
 from station.archive.store import Row
 from station.errors import StoreError
 from station.quantities import Bools, Floats, Grid, Scanner
 from station.science.points import shared_covariance, shot_covariance
 from station.science.shared import against, basis
 from station.science.voids import area_weights
-from station.science.volume import shared_contributions
+from station.science.volume import common_contributions, shared_contributions
 
 
 def cells_of(area: npt.ArrayLike | shapely.Geometry, grid: Grid) -> Bools:
@@ -82,7 +82,7 @@ class Volumes(Aggregates):
         self, held: list[Held], chosen: Bools, weights: Floats, random_m2: list[Floats]
     ) -> tuple[Floats, Floats]:
         """What each chosen cell (n,) adds to the variance of a weighted sum: its own, the shared."""
-        own, common = np.zeros(len(weights)), np.zeros(len(weights))
+        own, shared, felt_by = np.zeros(len(weights)), np.zeros(len(weights)), []
         for one, own_m2 in zip(held, random_m2, strict=True):
             own += weights**2 * own_m2
             unknown = one.unknown
@@ -92,8 +92,12 @@ class Volumes(Aggregates):
                 unknown = against(unknown, one.reference.shared)
             felt = self.felt(one, chosen)
             noise = self.held_share(one, chosen, felt, own_m2) if len(held) > 1 else None
-            common += shared_contributions(weights, felt, unknown, noise)
-        return own, common
+            felt_by.append(felt)
+            shared += shared_contributions(weights, felt, unknown, noise)
+        common = common_of(held)
+        if common is not None:
+            shared -= common_contributions(weights, (felt_by[0], felt_by[1]), common)
+        return own, shared
 
     def point_covariance(self, points_m: Floats, row: Row, scanner: Scanner) -> Floats:
         """Covariance (n, 3, 3) of points (n, 3) on the map in an epoch [m²]: shot, pose, lean, air.

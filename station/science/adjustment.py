@@ -15,6 +15,7 @@ import numpy as np
 from scipy import linalg, sparse
 
 from station.quantities import Bools, Floats, Reals, Shared
+from station.science import likeness
 from station.science.held import slacks
 from station.science.normals import (
     Beforehand,
@@ -26,8 +27,8 @@ from station.science.normals import (
     log_determinant,
     root_of,
 )
-from station.science.patches import CHI2_MEDIAN, Kind, Patches
-from station.science.shared import GLOBAL, Basis, Sensitivities, rows_at_lines
+from station.science.patches import CHI2_MEDIAN, STRETCH_M, Kind, Patches
+from station.science.shared import GLOBAL, LEAN_KNOT_RAD, Basis, Sensitivities, rows_at_lines
 
 ROUNDS = 8
 SETTLED_M = 0.0001  # a round that moves the patches by less is the last
@@ -136,7 +137,9 @@ def adjust(patches: Patches, assumed_rad: Floats, before: Beforehand, log: LineL
                 break
     assert solved is not None  # noqa: S101 - there is a first round
     reduced = solved.reduced
-    unknown = Unknown(of, reduced.own, reduced.felt, solved.whole())
+    pattern = _pattern(patches.some(moving), solved.change_m(field)[moving] / solved.step_m)
+    heights = normals.heights(len(of.names))
+    unknown = Unknown(of, reduced.own, reduced.felt, solved.whole(), solved.precision, heights, pattern)
     held_by = slacks(patches, weight, normals, unknown)
     return Adjustment(of, solved.by_line(of), unknown, solved.step_m, trust[~moving], held_by)
 
@@ -203,6 +206,12 @@ def _change_field(patches: Patches, moving: Bools) -> tuple[sparse.csr_array, _C
     return sparse.hstack([field, thin], format="csr"), changes
 
 
+def _pattern(patches: Patches, change: Floats) -> Floats:
+    """Return a change of patches (n,) by sector round the scanner."""
+    azimuth_rad = patches.felt.of.start_rad + LEAN_KNOT_RAD * patches.felt.passed
+    return likeness.pattern(azimuth_rad, (patches.stretch + 0.5) * STRETCH_M, change)
+
+
 def _thin_snow(patches: Patches, moving: Bools) -> sparse.csr_array:
     """Which stable patches (n, 2) may hold snow, and which may hold some."""
     tan_slope = np.hypot(*patches.felt.globals_[3:5])
@@ -224,10 +233,13 @@ class _Solved:
         """One sigma of the change between its knots."""
         return _step_m(self.place)
 
+    def change_m(self, field: sparse.csr_array) -> Floats:
+        """Change of the patches (n,)."""
+        return np.asarray(field @ self.estimate[len(self.estimate) - len(self.precision) :])
+
     def rise_m(self, field: sparse.csr_array, moving: Bools) -> float:
         """Mean change of the moving patches."""
-        change_m = field @ self.estimate[len(self.estimate) - len(self.precision) :]
-        return float(change_m[moving].mean()) if moving.any() else 0.0
+        return float(self.change_m(field)[moving].mean()) if moving.any() else 0.0
 
     def by_line(self, of: Basis) -> Floats:
         """State (u,) with the leans of the lines."""

@@ -6,12 +6,13 @@ line's own lean is taken out before and found again after. Source: EQUATIONS 6.3
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy import linalg, sparse
 
-from station.quantities import Floats, Shared
+from station.quantities import ChangeErrors, Floats, Shared
+from station.science import likeness
 from station.science.leans import KnownLeans, OwnLeans
 from station.science.shared import (
     GLOBAL,
@@ -133,6 +134,11 @@ class Normals:
         right = self._across @ (weight * self._wanted) - felt.T @ own.times(told[:, None])[:, 0]
         return Reduced(normal, right, own, felt, told)
 
+    def heights(self, state: int) -> Floats:
+        """Products of the effects of the first unknowns on heights (state, state), mean of the patches."""
+        seen = self._design[: self._patches, :state]
+        return np.asarray((seen.T @ seen).toarray() / max(self._patches, 1))
+
     def effect(self, estimate: Floats, own_rad: Floats) -> Floats:
         """Effect of the unknowns (m,) and the own leans of the lines on the patches (n,) [m]."""
         effect = self._design @ estimate + self._lean * own_rad[self._line]
@@ -162,12 +168,18 @@ def _design(felt: Sensitivities) -> sparse.csr_array:
 
 @dataclass(frozen=True)
 class Unknown:
-    """What an adjustment leaves unknown: own leans of the lines, given the other unknowns, and these."""
+    """What an adjustment leaves unknown: own leans of the lines, given the other unknowns, and these.
+
+    The last unknowns are the change of the moving ground; `pattern` is what was found of it.
+    """
 
     of: Basis
     own: KnownLeans
     felt: sparse.csr_array  # (lines, m) how the own leans go with the other unknowns
     whole: Factored  # (m, m)
+    change: Floats  # (k, k) precision of the change beforehand
+    heights: Floats  # (p, p) products of the effects of the state by knots on heights
+    pattern: Floats  # (sectors,)
 
     def by_line(self) -> Floats:
         """Covariance (u, u) of the state."""
@@ -207,7 +219,14 @@ class Unknown:
             "ij,ij->i", between.knots, 2 * beside - interpolated(of, at_knots)
         )
         left_rad2 += np.sum(self.whole.half((felt - interpolated(of, narrow)).T) ** 2, axis=0)
-        return condensed(of, rows_at_knots(of, estimate[:, None])[:, 0], covariance, left_rad2)
+        known = condensed(of, rows_at_knots(of, estimate[:, None])[:, 0], covariance, left_rad2)
+        return known if not len(self.change) else replace(known, change=self._change_errors(half))
+
+    def _change_errors(self, half: Floats) -> ChangeErrors:
+        """Return what of the covariance the change makes, of the half (m, p) of the state by knots."""
+        with_change = self.whole.last(half, len(self.change))
+        factor = np.tril(root_of(self.change.copy())).T @ with_change
+        return ChangeErrors(likeness.modes(factor, self.heights), self.pattern)
 
 
 class Factored:
@@ -228,6 +247,13 @@ class Factored:
         """Solution (n,)."""
         solved = linalg.cho_solve((self._root, True), right * self._scale, check_finite=False)
         return np.asarray(solved * self._scale)
+
+    def last(self, half: Floats, count: int) -> Floats:
+        """Return the last rows (count, k) of the solution that a half (n, k) belongs to."""
+        root, scale = self._root[-count:, -count:], self._scale[-count:, None]
+        return np.asarray(
+            linalg.solve_triangular(root, half[-count:], lower=True, trans="T", check_finite=False) * scale
+        )
 
     def inverse(self) -> Floats:
         """Inverse (n, n)."""

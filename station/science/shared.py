@@ -9,7 +9,7 @@ the covariance in an epoch anyone gets the uncertainty of a cell, a box, a volum
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import numpy as np
@@ -396,7 +396,12 @@ def by_names(of: Basis, unknown: Shared) -> Shared:
     covariance = np.zeros((len(of.names),) * 2)
     estimate[here], noise[here] = unknown.estimate[there], unknown.noise_variance[there]
     covariance[np.ix_(here, here)] = unknown.covariance[np.ix_(there, there)]
-    return Shared(of.names, of.units, estimate, covariance, noise)
+    change = unknown.change
+    if change is not None:
+        errors = np.zeros((len(of.names), change.modes.shape[1]))
+        errors[here] = change.modes[there]
+        change = replace(change, modes=errors)
+    return Shared(of.names, of.units, estimate, covariance, noise, change)
 
 
 def lines_from_knots(of: Basis, unknown: Floats) -> Floats:

@@ -235,18 +235,35 @@ def shared_contributions(
     return weights * (free_m2 - held * _shared_with(weights, felt, unknown))
 
 
+def common_contributions(
+    weights: Floats, felt: tuple[Sensitivities, Sensitivities], common: Floats
+) -> Floats:
+    """What each cell (n,) adds to a sum's variance by the errors that two epochs have in common.
+
+    `common` (p, p) is the covariance of the shared parameters of the one with those of the other, of which
+    cells feel what is in `felt`. It goes off the variance of the difference.
+    """
+    one, other = felt
+    there, back = common @ other.total(weights), common.T @ one.total(weights)
+    return weights * (_effect(there, one) + _effect(back, other))
+
+
 def _shared_with(weights: Floats, felt: Sensitivities, unknown: Shared) -> Floats:
     """Covariance (n,) of each height with a weighted sum of them, by what all share."""
+    left = leans_between(felt.of).left
+    own = left @ (line_variances(felt.of, unknown) * (felt.by_line(weights) @ left))
+    return _effect(unknown.covariance @ felt.total(weights), felt) + felt.lean * own[felt.line]
+
+
+def _effect(state: Floats, felt: Sensitivities) -> Floats:
+    """Effect of shared parameters (p,) on heights (n,)."""
     of = felt.of
-    back = unknown.covariance @ felt.total(weights)
-    lean, bend, aside = np.split(back[len(GLOBAL) :], [of.lean_count, of.lean_count + of.refraction_count])
+    lean, bend, aside = np.split(state[len(GLOBAL) :], [of.lean_count, of.lean_count + of.refraction_count])
     lean_before, lean_after, lean_share = felt.lean_knot()
     bend_before, bend_after, bend_share = felt.refraction_knot()
-    left = leans_between(of).left
-    own = left @ (line_variances(of, unknown) * (felt.by_line(weights) @ left))
     return np.asarray(
-        back[: len(GLOBAL)] @ felt.globals_
-        + felt.lean * (lean[lean_before] * (1 - lean_share) + lean[lean_after] * lean_share + own[felt.line])
+        state[: len(GLOBAL)] @ felt.globals_
+        + felt.lean * (lean[lean_before] * (1 - lean_share) + lean[lean_after] * lean_share)
         + felt.refraction * (bend[bend_before] * (1 - bend_share) + bend[bend_after] * bend_share)
         + felt.across * (aside[bend_before] * (1 - bend_share) + aside[bend_after] * bend_share)
     )

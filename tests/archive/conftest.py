@@ -5,7 +5,7 @@ import pytest
 
 from station.archive.layout import Series
 from station.archive.store import Epoch
-from station.quantities import Grid, Measurement, Shared
+from station.quantities import ChangeErrors, Grid, Measurement, Shared
 
 GRID = Grid(west_m=632000.0, north_m=5186000.0, cell_m=10.0, nx=150, ny=140)
 START_S = 1_763_683_200.0  # 2025-11-21 00:00 UTC
@@ -48,7 +48,14 @@ def make_epoch(hour, *, value=None, grid=GRID, terms=False):
         end_s=START_S + 3600 * hour + 900,
         scan_id=f"251121_{hour % 24:02d}0000",
         measurement=measured,
-        shared=Shared(names, ("rad", "rad", "m"), np.zeros(3), np.diag([1e-10, 2e-10, 1.6e-5]), np.zeros(3)),
+        shared=Shared(
+            names,
+            ("rad", "rad", "m"),
+            np.zeros(3),
+            np.diag([1e-10, 2e-10, 1.6e-5]),
+            np.zeros(3),
+            ChangeErrors(np.full((3, 32), hour * 1e-6), np.full(288, hour / 8)),
+        ),
         verdict="good",
         verdict_reason="",
         numbers={"platform_roll": 0.12, "air_temperature": -3.5, "point_total": 1234.0, "coverage": 0.5},

@@ -10,13 +10,13 @@ import xarray as xr
 
 import station
 from station.archive import store
-from station.archive.aggregate import Aggregates
+from station.archive.aggregate import Aggregates, common_of
 from station.archive.join import join_closed
 from station.archive.layout import Series
 from station.archive.reference import write_reference
 from station.archive.series import build_series
 from station.errors import StoreError
-from station.quantities import Grid, Habits, Measurement, Reference, Shared
+from station.quantities import ChangeErrors, Grid, Habits, Measurement, Reference, Shared
 from station.science import ground, prior, shared
 from station.science.adjustment import adjust
 from station.science.patches import Patches
@@ -295,6 +295,82 @@ def test_noise_that_is_in_the_estimate_too_goes_off_a_difference(filled):
             assert alone == pytest.approx(wanted(ds, counted, -1), rel=1e-4)
             volume = station.volume(filled.folder, weights > 0, -1, -2)
             assert float(volume.variance_share.sum()) == pytest.approx(1)
+
+
+def after_change(size, pattern, hour, *, version="1", adjustment="joint"):
+    """An epoch with one mode of errors by change, of a size, in a column of its own: modes have no order."""
+    told = drawn(20, 0.3)
+    mode = np.sqrt(np.diag(told.covariance)) * np.random.default_rng(21).normal(size=len(told.names)) * size
+    modes = np.zeros((len(mode), 32))
+    modes[:, hour % 32] = mode
+    whole = told.covariance + np.outer(mode, mode)
+    known = replace(told, covariance=whole, change=ChangeErrors(modes, pattern))
+    made = epoch(hour, adjustment, known)
+    return replace(made, provenance=made.provenance | {"reference_version": version})
+
+
+PATTERN = np.where(np.arange(288) % 5 == 0, np.random.default_rng(8).normal(size=288), 0.0)
+
+
+@pytest.mark.parametrize(("times", "alike"), [(1.0, 1.0), (0.5, 0.8), (-1.0, -1.0)])
+def test_what_like_change_makes_wrong_in_two_epochs_is_not_in_their_difference(filled, times, alike):
+    """By (s - t)² of errors s and t of one mode, as far as what was found of the change is alike."""
+    shape = np.where(PATTERN != 0, PATTERN - PATTERN[PATTERN != 0].mean(), 0.0)
+    sizes = {12: 3.0, 13: -2.0}  # a mode has no sign
+    for (hour, size), pattern in zip(sizes.items(), (shape, times * shape), strict=True):
+        store.write_epoch(filled, after_change(size, pattern, hour))
+    build_series(filled)
+    found, weights, shares = Aggregates(filled), np.zeros(GRID.shape), []
+    with station.open(filled.folder) as ds, xr.open_dataset(filled.folder / "reference.nc") as master:
+        before_m2 = master.reference_random_uncertainty.values.astype(float) ** 2
+        for weights, counted in boxes(ds, -2, -1):
+            total, effects = 0.0, []
+            for index, hour in ((-2, 12), (-1, 13)):
+                own_m2 = ds.elevation_change_random_uncertainty[index].values.astype(float) ** 2
+                total += wanted(ds, counted, index, random_m2=np.maximum(own_m2 - before_m2, 0))
+                felt = np.nan_to_num(counted).ravel() @ matrix(ds, index)[0]
+                effects.append(felt @ ds.change_errors[index].values.astype(float)[:, hour % 32])
+            told = found.variance(weights, found.row(-2), found.row(-1))
+            less = 2 * alike * abs(effects[0] * effects[1])
+            assert told == pytest.approx(total - less, rel=1e-3)
+            assert told == pytest.approx(found.variance(weights, found.row(-1), found.row(-2)))
+            shares.append(abs(less) / total)
+    assert max(shares) > 0.2
+    volume = station.volume(filled.folder, weights > 0, -1, -2)
+    assert float(volume.variance_share.sum()) == pytest.approx(1)
+    pair = found.variance(weights, found.row(-2), found.row(-1))
+    join_closed(filled, datetime(2025, 12, 31, tzinfo=UTC), lambda: None)
+    build_series(filled)
+    joined = Aggregates(filled)
+    assert joined.variance(weights, joined.row(-2), joined.row(-1)) == pytest.approx(pair)
+
+
+@pytest.mark.parametrize("change", [{"version": "2"}, {"adjustment": "none"}])
+def test_epochs_against_other_surfaces_have_no_change_in_common(filled, change):
+    write_reference(filled, replace(reference(), version="2"))
+    for hour, told in ((12, {}), (13, {}), (14, change)):
+        store.write_epoch(filled, after_change(3.0, PATTERN, hour, **told))
+    found = Aggregates(filled)
+    one, like, other = (found.read(found.row(at), np.ones(GRID.shape, bool)) for at in (-3, -2, -1))
+    assert common_of([one, like]) is not None
+    assert common_of([one, other]) is None
+    assert common_of([one]) is None
+
+
+def test_a_difference_is_never_surer_than_its_cells(filled):
+    """Whatever modes say: here they are far more than the covariance that they should be a part of."""
+    for hour in (12, 13):
+        told = after_change(3.0, PATTERN, hour)
+        change = ChangeErrors(50 * told.shared.change.modes, PATTERN)
+        store.write_epoch(filled, replace(told, shared=replace(told.shared, change=change)))
+    build_series(filled)
+    found = Aggregates(filled)
+    with station.open(filled.folder) as ds, xr.open_dataset(filled.folder / "reference.nc") as master:
+        before_m2 = master.reference_random_uncertainty.values.astype(float) ** 2
+        for weights, counted in boxes(ds, -2, -1):
+            own_m2 = ds.elevation_change_random_uncertainty[-2:].values.astype(float) ** 2 - before_m2
+            least_m2 = np.nansum(counted**2 * np.maximum(own_m2, 0))
+            assert found.variance(weights, found.row(-2), found.row(-1)) == pytest.approx(least_m2, rel=1e-4)
 
 
 def test_an_epoch_without_shared_parameters_is_random_alone(filled):

@@ -15,7 +15,7 @@ from station.archive.join import count_closed, join_closed, now_of, sweep
 from station.archive.series import build_series
 from station.archive.store import rows, sources
 from station.errors import StoreError
-from station.quantities import Shared
+from station.quantities import ChangeErrors, Shared
 
 DAY_AFTER = datetime(2025, 11, 23, 12, tzinfo=UTC)
 MONTH_AFTER = datetime(2026, 1, 5, tzinfo=UTC)
@@ -150,7 +150,8 @@ def test_progress_is_told_while_a_file_is_copied(filled):
 def moved(epoch):
     """The same scan from a scanner that was moved: other azimuths, so other shared parameters."""
     shared = Shared(("tilt_north", "lean_090.0", "range_bias"), ("rad", "rad", "m"), np.arange(3.0),
-                    np.arange(9.0).reshape(3, 3) * 1e-6, np.zeros(3))  # fmt: skip
+                    np.arange(9.0).reshape(3, 3) * 1e-6, np.zeros(3),
+                    ChangeErrors(np.arange(96.0).reshape(3, 32), np.arange(288.0)))  # fmt: skip
     return dataclasses.replace(epoch, shared=shared)
 
 
@@ -171,6 +172,11 @@ def test_epochs_before_and_after_a_move_stand_in_one_series_each_with_its_parame
         at = [names.index(name) for name in ("tilt_east", "tilt_north", "range_bias")]
         assert covariance[0, at, at].values == pytest.approx(np.diag([1e-10, 2e-10, 1.6e-5]))
         assert np.isnan(covariance[0, names.index("lean_090.0")]).all()
+        assert (told.change_errors[0, at].values == np.float32(told.change_pattern[0, 0] * 8e-6)).all()
+        at = [names.index(name) for name in ("tilt_north", "lean_090.0", "range_bias")]
+        assert (told.change_errors[-1, at].values == np.arange(96.0).reshape(3, 32)).all()
+        assert np.isnan(told.change_errors[-1, names.index("tilt_east")]).all()
+        assert told.change_pattern[-1].values.tolist() == list(range(288))
 
 
 def test_epochs_of_an_older_version_join_with_newer_ones(filled):
@@ -181,6 +187,7 @@ def test_epochs_of_an_older_version_join_with_newer_ones(filled):
             old = file["elevation"]
             kept, attributes, scales = old[:], dict(old.attrs), [file[dim] for dim in ("time", "y", "x")]
             del file["elevation"], file["stable_nmad"], file["lean_zero"], file["elevation_spread"]
+            del file["change_errors"], file["change_pattern"]
             new = file.create_dataset("elevation", data=kept, chunks=(1, 64, 64), maxshape=(None, 140, 150))
             for key in attributes.keys() - {"DIMENSION_LIST"}:
                 new.attrs[key] = attributes[key]
@@ -189,7 +196,9 @@ def test_epochs_of_an_older_version_join_with_newer_ones(filled):
     build_series(filled)
     told = values(filled)
     assert np.isnan(told.elevation_spread[:2]).all()
-    changed = ["elevation_spread"]
+    assert np.isnan(told.change_errors[:2]).all()
+    assert np.isnan(told.change_pattern[:2]).all()
+    changed = ["elevation_spread", "change_errors", "change_pattern"]
     assert told.drop_vars(changed).identical(before.drop_vars(changed))
     join(filled, DAY_AFTER)
     assert values(filled).identical(told)

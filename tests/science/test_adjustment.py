@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 from station.quantities import Habits
 from station.science import adjustment, prior, shared
 from station.science.adjustment import adjust
+from station.science.likeness import common_errors
 from station.science.normals import LineLog
 from station.science.patches import Kind, Patches
 from station.science.verdict import distrust
@@ -493,3 +494,68 @@ def test_what_is_known_beforehand_is_the_motion_line_by_line():
         seam = 15 if of.closed else 0  # lines about the place where the head begins and ends
         lines = slice(9 + seam, 9 + of.line_count - seam)
         assert apart[lines, lines].max() < 0.01
+
+
+RIDGE, GLACIER = ground(1, 40, within_deg=(0, 5)), ground(2, 900, steep=0.3)
+BOXES = [GLACIER.line // 50 == part for part in range(4)] + [np.ones(900, bool)]
+
+
+def changed(seed):
+    """Change of the glacier by 20 mm and between knots 4° and 240 m apart."""
+    knots = np.random.default_rng(seed).normal(0, 0.02, (13, 14))
+    u, v = (GLACIER.line + 0.5) / 20, (GLACIER.stretch + 0.5) / 3
+    i, j = u.astype(int), v.astype(int)
+    u, v = u - i, v - j
+    beside = (1 - u) * ((1 - v) * knots[i, j] + v * knots[i, j + 1])
+    return beside + u * ((1 - v) * knots[i + 1, j] + v * knots[i + 1, j + 1]) + knots[-1, -1]
+
+
+def of_glacier(seed, change_m):
+    """What an adjustment leaves wrong of means over the glacier, and what is known of it."""
+    rng = np.random.default_rng(seed)
+    _, root = prior_of(OF)
+    state = root @ rng.normal(size=len(root))
+    still, moved = (one.matrix() @ state + rng.normal(0, 0.01, len(one.line)) for one in (RIDGE, GLACIER))
+    seen = together(RIDGE.patches(still), GLACIER.patches(moved + change_m, kind=Kind.MOVING))
+    found = adjust(seen, STILL, known_before(OF), None)
+    error_m = GLACIER.matrix() @ state - found.effect(GLACIER.felt())
+    return np.array([error_m[box].mean() for box in BOXES]), found.shared()
+
+
+def spread(draws, change_of):
+    """Spread of errors over sigma of differences of two scans: both apart, and with what they have alike."""
+    felt = GLACIER.felt()
+    effect = np.array([felt.total(box / box.sum()) for box in BOXES])
+    apart, alike = [], []
+    for draw in range(draws):
+        (one_m, one), (other_m, other) = (
+            of_glacier(2 * draw + n, change_m) for n, change_m in enumerate(change_of(draw))
+        )
+        variance_m2 = sum(
+            np.array(
+                [shared.aggregate_variance(box / box.sum(), np.zeros(900), felt, known) for box in BOXES]
+            )
+            for known in (one, other)
+        )
+        common_m2 = np.sum((effect @ common_errors(one, other)) * effect, axis=1)
+        apart.append((one_m - other_m) / np.sqrt(variance_m2))
+        alike.append((one_m - other_m) / np.sqrt(variance_m2 - 2 * common_m2))
+    return np.std(apart), np.std(alike)
+
+
+def test_the_same_change_in_two_scans_is_not_in_the_sigma_of_their_difference():
+    apart, alike = spread(25, lambda seed: (changed(seed), 0.9 * changed(seed)))
+    assert apart < 0.65
+    assert 1.25 * apart < alike < 1.2
+
+
+def test_opposite_change_in_two_scans_is_more_so():
+    apart, alike = spread(25, lambda seed: (changed(seed), -changed(seed)))
+    assert apart > 1.2
+    assert 0.8 < alike < 1.2
+
+
+def test_as_much_change_elsewhere_stays_in_it():
+    apart, alike = spread(25, lambda seed: (changed(seed), changed(seed + 1000)))
+    assert 0.8 < apart < 1.2
+    assert 0.8 < alike < 1.2
