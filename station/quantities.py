@@ -217,6 +217,7 @@ class Quality(IntFlag):
     CHANGE_SIGNIFICANT = 16  # at the 95 % level
 
 
+LAID_TOGETHER = 32  # rows: so many stay in the cache
 MEASURED = np.dtype(
     [
         ("elevation_m", np.float32),
@@ -256,19 +257,25 @@ class Measurement:
     def laid(self, *names: str, rows: slice = slice(None)) -> list[NDArray[Any]]:
         """Lay columns out on some rows of the grid, or all: NaN, or nought, where there is nothing."""
         number = self.number[rows]
-        there = np.flatnonzero(number >= 0)
-        number_there = number.reshape(-1)[there]
-        cells = self.cells.take(number_there)  # at once: it is the cells that have to be waited for
-        rasters = []
-        for name in names:
-            if name in (self.cells.dtype.names or ()):
-                values = cells[name]
-            else:
-                values = (self.quality if name == "quality" else self.terms[name]).take(number_there)
-            raster = np.full(number.shape, np.nan if values.dtype.kind == "f" else 0, values.dtype)
-            raster.reshape(-1)[there] = values
-            rasters.append(raster)
+        rasters = [self._empty(name, number.shape) for name in names]
+        for first in range(0, len(number), LAID_TOGETHER):
+            part = slice(first, first + LAID_TOGETHER)
+            there = np.flatnonzero(number[part] >= 0)
+            chosen = number[part].reshape(-1)[there]
+            cells = self.cells.take(chosen)  # at once: it is the cells that have to be waited for
+            for name, raster in zip(names, rasters, strict=True):
+                column = self._beside(name)
+                raster[part].reshape(-1)[there] = cells[name] if column is None else column.take(chosen)
         return rasters
+
+    def _empty(self, name: str, shape: tuple[int, ...]) -> NDArray[Any]:
+        column = self._beside(name)
+        dtype = self.cells.dtype[name] if column is None else column.dtype
+        return np.full(shape, np.nan if dtype.kind == "f" else 0, dtype)
+
+    def _beside(self, name: str) -> NDArray[Any] | None:
+        """Return a column that is not among the cells."""
+        return self.quality if name == "quality" else self.terms.get(name)
 
 
 @dataclass(frozen=True)

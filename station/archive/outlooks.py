@@ -129,6 +129,10 @@ class _Plain:
     def __getitem__(self, rows: slice) -> Array:
         """Return some rows."""
         first, stop, step = rows.indices(self._shape[0])
+        if step > 1:  # part by part: whole they would be the most that a scan needs
+            inner = self._edges[(self._edges > first) & (self._edges < stop)].tolist()
+            parts = pairwise([first, *inner, stop])
+            return np.concatenate([self[begin:end][-(begin - first) % step :: step] for begin, end in parts])
         values = np.empty((stop - first) * self._row_bytes, np.uint8)
         try:
             read = os.preadv(self._kept.descriptor, [values.data], self._at + first * self._row_bytes)
@@ -140,8 +144,7 @@ class _Plain:
             begin, end = (int(row - first) * self._row_bytes for row in self._edges[number : number + 2])
             if end <= len(values) and _crc(values[begin:end]) != self._crc[number]:
                 raise _damaged(self._path)
-        told = values.view(self._dtype).reshape(-1, *self._shape[1:])
-        return told if step == 1 else told[::step].copy()
+        return values.view(self._dtype).reshape(-1, *self._shape[1:])
 
     def __array__(self, dtype: Any = None, copy: bool | None = None) -> Array:  # noqa: ANN401, FBT001 - numpy's
         """Return all of it."""

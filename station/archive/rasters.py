@@ -7,9 +7,9 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from functools import cached_property, lru_cache
+from functools import cached_property, lru_cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -23,13 +23,13 @@ from station.archive.variables import FILL, Variable
 from station.errors import StoreError
 
 LEVEL = 1
-TOGETHER = 2  # chunks deflated or inflated at once
+TOGETHER = 2  # rasters deflated at once, of one band
 KEPT_BANDS = 2  # rows of chunks that are kept unpacked: of a band of cells and what is around it
 
 Array = np.ndarray[Any, Any]
 
 
-def write_rasters(path: Path, rows: Sequence[Variable], band: Callable[[slice], Sequence[Array]]) -> None:
+def write_rasters(path: Path, rows: Sequence[Variable], band: Callable[[slice], Iterable[Array]]) -> None:
     """Write rasters into the variables that a file has for them, as the first time.
 
     `band` gives some rows (r, nx) of each of them, NaN as fill. Chunks without any value are left unwritten.
@@ -42,18 +42,15 @@ def write_rasters(path: Path, rows: Sequence[Variable], band: Callable[[slice], 
         ny = held[0].shape[-2]
         *_, height, width = chunk = held[0].get_create_plist().get_chunk()
 
-        def deflated(top: int) -> list[dict[int, bytes]]:
-            told = zip(rows, band(slice(top, min(top + height, ny))), strict=True)
-            return [_deflated(row, (height, width), values) for row, values in told]
-
-        tops = range(0, ny, height)
-        for top, packed in zip(tops, pool.map(deflated, tops), strict=True):
+        for top in range(0, ny, height):
+            values = band(slice(top, min(top + height, ny)))
+            packed = pool.map(partial(_deflated, (height, width)), rows, values)
             for dataset, chunks in zip(held, packed, strict=True):
                 for left, one in chunks.items():
                     dataset.write_direct_chunk((0, top, left)[-len(chunk) :], one)
 
 
-def _deflated(row: Variable, size: tuple[int, int], band: Array) -> dict[int, bytes]:
+def _deflated(size: tuple[int, int], row: Variable, band: Array) -> dict[int, bytes]:
     """Return the chunks of a band of a raster that hold something, by their first column."""
     packed = {
         left: _packed(row, band[:, left : left + size[1]], size) for left in range(0, band.shape[1], size[1])

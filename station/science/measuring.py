@@ -27,7 +27,7 @@ from station.science.shared import Sensitivities
 from station.science.view import View
 
 BAND_ROWS = 64  # looked at together for the cells beyond the reference
-TOGETHER = 100_000  # of these that are judged together
+TOGETHER = 30_000  # of these that are judged together
 FEW_POINTS = 3
 KEPT_M = 2.0**-10  # of an elevation, which a float32 holds exactly up to 16 km; the store keeps as much
 
