@@ -1,10 +1,11 @@
-"""A scan of the largest station: its memory does not grow with its points, nor its time beyond decoding."""
+"""A scan of the largest station: its memory goes with the cells seen, its time hardly beyond decoding."""
 
 import pytest
 
 from benchmarks.large import decoded, large_station, measured, prepared
 
-MOST_GB = 0.9
+MOST_GB = 0.65
+GROWTH = 1.15  # forty times the points see some two million more cells, whose sums take 24 bytes each
 POINTS = (1_440_000, 14_400_000, 57_600_000)
 
 
@@ -13,7 +14,7 @@ def test_memory_is_bounded_by_the_grid_not_by_the_points(tmp_path):
     """4,000 x 5,000 cells, with the reference and the adjustment."""
     peaks_gb = [measured(prepared(tmp_path, points)).peak_gb for points in POINTS]
     assert max(peaks_gb) <= MOST_GB
-    assert max(peaks_gb) <= 1.1 * min(peaks_gb)
+    assert max(peaks_gb) <= GROWTH * min(peaks_gb)
 
 
 def test_a_small_one_of_its_kind_is_adjusted_and_good(tmp_path):
