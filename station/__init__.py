@@ -39,7 +39,8 @@ def variance(
 
     `weights` (y, x), rows from north to south, nought outside: 1/n in n cells for a mean, a cell's size for a
     volume. An epoch is its place in the series or a time (the nearest is taken). What all cells of a scan
-    share is in it, at every scale. Raises StoreError where there is no series or no reference yet.
+    share is in it, at every scale. Raises StoreError where there is no series or no reference yet, ValueError
+    where the weights are not on its grid.
     Source: EQUATIONS 6.2.
     """
     import numpy as np  # noqa: PLC0415

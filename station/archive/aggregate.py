@@ -257,7 +257,9 @@ class Aggregates:
         return cell_sensitivities(of, part, position_m, around, gradient, cells[rows, columns])
 
     def read(self, row: Row, cells: Bools) -> Held:
-        """Read what an epoch keeps of the chosen cells (ny, nx)."""
+        """Read what an epoch keeps of the chosen cells (ny, nx); raise ValueError on another grid."""
+        if cells.shape != self._series.grid.shape:
+            raise ValueError(f"given {cells.shape} rows and columns, the grid has {self._series.grid.shape}")
         with netCDF4.Dataset(row.path) as file:
             reference = self.reference(str(file["reference_version"][row.index]))
             change_m, random_m = (cell_values(file[name], row.index, cells) for name in (CHANGE, RANDOM))

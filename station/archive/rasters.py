@@ -41,7 +41,6 @@ def write_rasters(path: Path, rows: Sequence[Variable], band: Callable[[slice], 
                 dataset.set_extent((1, *dataset.shape[1:]))
         ny = held[0].shape[-2]
         *_, height, width = chunk = held[0].get_create_plist().get_chunk()
-
         for top in range(0, ny, height):
             values = band(slice(top, min(top + height, ny)))
             packed = pool.map(partial(_deflated, (height, width)), rows, values)
@@ -66,9 +65,7 @@ def _packed(row: Variable, values: Array, size: tuple[int, int]) -> bytes | None
             steps = values.dtype.type(2.0 ** math.ceil(row.digits * math.log2(10)))  # netCDF4's own rounding
             values = np.rint(steps * values)
             values /= steps
-        values = np.fmin(
-            values, values.dtype.type(fill)
-        )  # NaN is the fill: ten times as fast as to ask for it
+        values = np.fmin(values, values.dtype.type(fill))  # of NaN: ten times as fast as to ask for it
         if values.min() == values.dtype.type(fill):
             return None
     tile = values.astype(row.dtype)

@@ -11,9 +11,9 @@ import h5py
 import numpy as np
 from isal import isal_zlib
 
-NEVER_WRITTEN = (
-    "storage is not allocated"  # says the library of a chunk; where it says it otherwise, it reads
-)
+# Says the library of a chunk that was never written; where it says it otherwise, the library reads it.
+NEVER_WRITTEN = "storage is not allocated"
+ALL = slice(None), slice(None)
 FILTERS = (h5py.h5z.FILTER_SHUFFLE, h5py.h5z.FILTER_DEFLATE)
 
 Array = np.ndarray[Any, Any]
@@ -28,9 +28,6 @@ def places(dataset: Any) -> dict[tuple[int, ...], tuple[int, int]]:  # noqa: ANN
 
     dataset.id.chunk_iter(note)
     return found
-
-
-ALL = slice(None), slice(None)
 
 
 def unpacked(

@@ -631,3 +631,10 @@ def test_coarsened_cells_are_means_of_their_points(filled):
     assert looked_at > 5
     with pytest.raises(ValueError, match="do not fit"):
         station.coarsened(filled.folder, JOINT, 10_000)
+
+
+def test_weights_on_another_grid_are_refused(filled):
+    """One cell, or columns for rows, would else read as a sum of nothing that is perfectly sure."""
+    for weights in (np.ones((1, 1)), np.ones(GRID.shape).T, np.ones(GRID.nx * GRID.ny)):
+        with pytest.raises(ValueError, match="rows and columns, the grid has"):
+            station.variance(filled.folder, weights, JOINT)
