@@ -90,7 +90,7 @@ class Station:
     pid: int | None = None
     starts: int = 0
     logged: int = 0  # characters of the log before this start
-    kills: int = 0
+    killed: int = 0  # deaths before this start
     steps: Path | None = None
     period_s: float = 5.0
     clock: Path | None = None  # file that says by how much the service's clock is off
@@ -104,8 +104,10 @@ class Station:
         assert self.pid is None
         self.starts += 1
         self.logged = len(self.log())
+        self.killed = self.kills
         self.steps = self.folder / f"steps.{self.starts}"
-        plan = {"steps": str(self.steps), "died": str(self.folder / "died"), **plan}
+        plan = {"steps": str(self.steps), "died": str(self.died), **plan}
+        self.died.mkdir(exist_ok=True)
         orders = {"FAULTS_PLAN": json.dumps(plan)}
         site, log = str(self.folder / "site.toml"), str(self.folder / "log")
         if self.warm is not None:
@@ -122,26 +124,25 @@ class Station:
         self.pid = self.popen.pid
 
     def is_alive(self):
-        """Tell whether the service still runs; count the kills it died of."""
+        """Tell whether the service still runs."""
         if self.pid is None:
             return False
         if not self._has_ended(0):
             return True
-        self._ended()
+        self.pid = self.popen = None
         return False
 
     def wait(self, within_s=PATIENCE_S):
         """Wait for the service to end."""
         assert self._has_ended(within_s), self.log()
-        self._ended()
+        self.pid = self.popen = None
 
     def end(self):
         """Ask the service to end; it must say so, unless one of its kills came first."""
-        kills = self.kills
         with suppress(ProcessLookupError):
             os.kill(self.pid, signal.SIGTERM)
         self.wait()
-        assert self.log().endswith("service=stopped\n") or self.kills > kills, self.log()[-2000:]
+        assert self.log().endswith("service=stopped\n") or self.kills > self.killed, self.log()[-2000:]
 
     def close(self):
         """Leave nothing running."""
@@ -164,12 +165,6 @@ class Station:
             return bool(select.select([watched], [], [], within_s)[0])
         finally:
             os.close(watched)
-
-    def _ended(self):
-        for claim in self.folder.glob("steps.*.*"):
-            self.kills += 1
-            claim.unlink()
-        self.pid = self.popen = None
 
     def processes(self):
         """Return the service and all it has started."""
@@ -194,6 +189,17 @@ class Station:
         return self.steps.stat().st_size // RECORD if self.steps.exists() else 0
 
     # ---- its world
+
+    @property
+    def died(self):
+        """Folder of the boundaries where someone died, or the disk was full."""
+        return self.folder / "died"
+
+    @property
+    def kills(self):
+        """Deaths so far; a full disk is none."""
+        named = [path.name for path in self.died.glob("*") if not path.name.startswith("full ")]
+        return len(named) + len(list(self.folder.glob("steps.*.kill*")))
 
     @property
     def inbox(self):

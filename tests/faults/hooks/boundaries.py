@@ -5,9 +5,9 @@ service is started by its command, by `warm.py` where it is forked. `FAULTS_PLAN
 
     steps     file; each boundary that any process crosses appends a record of 96 bytes to it
     kills     [[step, delay_s, whom], ...]: at that step or the first after it, so much later
-    once      whom to kill at every boundary that is not yet named in the file `died`; "full": nobody dies,
+    once      whom to kill at every boundary that has no file in the folder `died` yet; "full": nobody dies,
               but the disk is full there
-    died      file with the labels of boundaries where that has been
+    died      folder with an empty file for each boundary where that has been
 
 `whom`: "child" (that decodes), "service" (its child must end by itself), "both" at once. A boundary is the
 moment before and the moment after each fsync, rename, link, new folder, deletion and commit.
@@ -130,20 +130,19 @@ def _cross(label, full=None):
             threading.Thread(target=_kill, args=(whom, delay_s, claim), daemon=True).start()
         else:
             _kill(whom, 0.0, claim)
-    if plan.get("once") and label not in _lines(plan["died"]):
-        _write(plan["died"], f"{label}\n".encode())
-        if plan["once"] == "full" and label.split(" ", 2)[2]:  # without its data folder no service starts
-            raise full or OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), label)
-        if plan["once"] != "full":
-            _kill(plan["once"], 0.0, f"{plan['steps']}.once{step}")
+    if not plan.get("once"):
+        return
+    claim = os.path.join(plan["died"], f"{plan['once']} {label}".replace("/", "|"))  # noqa: PTH118 - is quick
+    if plan["once"] != "full":
+        _kill(plan["once"], 0.0, claim)
+    elif _is_first(claim) and label.split(" ", 2)[2]:  # without its data folder no service starts
+        raise full or OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), label)
 
 
 def _kill(whom, delay_s, claim):
     time.sleep(delay_s)
-    try:
-        os.close(os.open(claim, os.O_CREAT | os.O_EXCL | os.O_WRONLY))
-    except FileExistsError:
-        return  # another process was quicker
+    if not _is_first(claim):
+        return
     if whom == "child" and multiprocessing.parent_process() is not None:
         os.kill(os.getpid(), signal.SIGKILL)
     os.kill(_state["service"], signal.SIGKILL)
@@ -162,14 +161,10 @@ def _record(path, label):
         os.close(steps)
 
 
-def _lines(path):
+def _is_first(claim):
+    """Claim a death for this process; False where it or another was quicker."""
     try:
-        return Path(path).read_text(encoding="utf-8").splitlines()
-    except FileNotFoundError:
-        return []
-
-
-def _write(path, line):
-    told = os.open(path, _append, 0o666)
-    os.write(told, line)
-    os.close(told)
+        os.close(os.open(claim, os.O_CREAT | os.O_EXCL | os.O_WRONLY))
+    except FileExistsError:
+        return False
+    return True
