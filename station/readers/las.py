@@ -7,8 +7,9 @@ over any odd letter in a record that nobody needs.
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from functools import partial
 from io import BufferedReader
 from pathlib import Path
 from typing import BinaryIO, ClassVar, Self
@@ -20,6 +21,7 @@ from numpy.typing import NDArray
 
 from station.errors import NotReadyError, ScanError
 from station.quantities import Floats, HeadTrack, Shots
+from station.readers.ahead import Room, filled
 from station.readers.las_layout import Layout, read_layout
 from station.readers.scan import WEEK_S, ScanHeader, foreign_code
 
@@ -89,12 +91,18 @@ class LasScan:
         timed = self.time_range_s() is not None
         check = _Check(self._layout, self._range_max_m)
         together = BLOCKS_AT_ONCE * size
-        room = np.empty(together * self._layout.record_bytes, np.uint8)
-        with self._points(BRIGHT if brightness else NEEDED, all_cores=True) as points:
-            for first in range(0, self._layout.count, together):
-                records = points.read(min(together, self._layout.count - first), room)
-                for start in range(0, len(records), size):
-                    yield check.shots(records[start : start + size], timed=timed, brightness=brightness)
+        counts = [min(together, self._layout.count - at) for at in range(0, self._layout.count, together)]
+        lengths = [count * self._layout.record_bytes for count in counts]
+        for room in filled(partial(self._filling, BRIGHT if brightness else NEEDED), lengths):
+            records = np.frombuffer(room, self._layout.record)
+            for start in range(0, len(records), size):
+                yield check.shots(records[start : start + size], timed=timed, brightness=brightness)
+
+    @contextmanager
+    def _filling(self, layers: DecompressionSelection) -> Iterator[Callable[[Room], None]]:
+        """Open the points; give what decodes as many of the next as a room holds."""
+        with self._points(layers, all_cores=True) as points:
+            yield points.fill
 
     def time_range_s(self) -> tuple[float, float] | None:
         """Give the earliest and latest time stamp [s], from the chunks' starts and the end of the file.
@@ -186,17 +194,21 @@ class _Points:
             else:
                 self._decompressor.seek(number)
 
-    def read(self, count: int, room: NDArray[np.uint8] | None = None) -> Records:
-        """Decode the next `count` records, into `room` if given; they must be there."""
-        length = count * self._layout.record_bytes
-        raw = np.empty(length, np.uint8) if room is None else room[:length]
+    def read(self, count: int) -> Records:
+        """Decode the next `count` records; they must be there."""
+        room = np.empty(count * self._layout.record_bytes, np.uint8)
+        self.fill(room)
+        return room.view(self._layout.record)
+
+    def fill(self, room: Room) -> None:
+        """Decode the next records into a room; as many as it holds must be there."""
+        count = len(room) // self._layout.record_bytes
         with foreign_code(f"corrupt after point {self.at:,}"):
             if self._decompressor is not None:
-                self._decompressor.decompress_many(raw)
-            elif self._file.readinto(raw.data) != length:
+                self._decompressor.decompress_many(room)
+            elif self._file.readinto(room.data) != len(room):
                 raise ScanError(f"cut off: ends before point {self.at + count:,} of {self._layout.count:,}")
         self.at += count
-        return np.frombuffer(raw, dtype=self._layout.record)
 
 
 class _Check:
