@@ -29,17 +29,13 @@ Opened = Callable[[], AbstractContextManager[Callable[[Room], None]]]  # gives w
 def filled(opened: Opened, lengths: Sequence[int]) -> Iterator[Room]:
     """Give rooms of some lengths [bytes], filled one after the other; each holds until the next is asked for.
 
-    They are filled ahead, by a fork of this process, unless one is all there is or this process has threads,
-    which a fork would leave behind with their locks held. Raises what `opened` and filling raise; where a
-    decoder kills the fork, it kills this process too, as if it had run here.
+    They are filled ahead, from the call on, by a fork of this process; not so where one is all there is, or
+    where this process has threads, which a fork would leave behind with their locks held. Raises what
+    `opened` and filling raise; where a decoder kills the fork, it kills this process too, as if it had run
+    here.
     """
     if len(lengths) < ROOMS or len(list(Path("/proc/self/task").iterdir())) > 1:
-        room = np.empty(max(lengths, default=0), np.uint8)
-        with opened() as fill:
-            for length in lengths:
-                fill(room[:length])
-                yield room[:length]
-        return
+        return _in_turn(opened, lengths)
     rooms = np.frombuffer(mmap.mmap(-1, ROOMS * max(lengths)), np.uint8).reshape(ROOMS, -1)
     here, there = Pipe()
     pid = os.fork()
@@ -47,6 +43,18 @@ def filled(opened: Opened, lengths: Sequence[int]) -> Iterator[Room]:
         here.close()
         _fill(opened, lengths, rooms, there)
     there.close()
+    return _from_beside(lengths, rooms, here, pid)
+
+
+def _in_turn(opened: Opened, lengths: Sequence[int]) -> Iterator[Room]:
+    room = np.empty(max(lengths, default=0), np.uint8)
+    with opened() as fill:
+        for length in lengths:
+            fill(room[:length])
+            yield room[:length]
+
+
+def _from_beside(lengths: Sequence[int], rooms: Room, here: Connection, pid: int) -> Iterator[Room]:
     lost = False
     try:
         for number, length in enumerate(lengths):

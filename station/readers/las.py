@@ -84,17 +84,19 @@ class LasScan:
     def blocks(self, size: int = 50_000, *, brightness: bool = True) -> Iterator[Shots]:
         """Give all echoes in the order of the file, `size` at a time; memory does not grow with the file.
 
-        Without `brightness` an eighth of the decoding is saved.
-        Raises ScanError where fewer points are there than the header counts, or one lies outside the header's
-        box, farther than `range_max_m`, or has no finite time.
+        They are decoded from the call on, if that can be done beside. Without `brightness` an eighth of the
+        decoding is saved. Raises ScanError where fewer points are there than the header counts, or one lies
+        outside the header's box, farther than `range_max_m`, or has no finite time.
         """
-        timed = self.time_range_s() is not None
+        together, width, count = BLOCKS_AT_ONCE * size, self._layout.record_bytes, self._layout.count
+        lengths = [min(together, count - first) * width for first in range(0, count, together)]
+        rooms = filled(partial(self._filling, BRIGHT if brightness else NEEDED), lengths)
+        return self._shots(rooms, size, timed=self.time_range_s() is not None, brightness=brightness)
+
+    def _shots(self, rooms: Iterator[Room], size: int, *, timed: bool, brightness: bool) -> Iterator[Shots]:
         check = _Check(self._layout, self._range_max_m)
-        together = BLOCKS_AT_ONCE * size
-        counts = [min(together, self._layout.count - at) for at in range(0, self._layout.count, together)]
-        lengths = [count * self._layout.record_bytes for count in counts]
-        for room in filled(partial(self._filling, BRIGHT if brightness else NEEDED), lengths):
-            records = np.frombuffer(room, self._layout.record)
+        for room in rooms:
+            records = room.view(self._layout.record)
             for start in range(0, len(records), size):
                 yield check.shots(records[start : start + size], timed=timed, brightness=brightness)
 

@@ -214,8 +214,9 @@ def _measure(
         )
         outlook = outlook_of(site, gathered.setup, reference) if reference else None
         progress()
+        blocks = reader.blocks(brightness=site.adjusts)  # which come from now on
         gridder = gridder_for(gathered.setup, outlook)
-        survey(gridder, reader.blocks(brightness=site.adjusts), gathered.pose, progress)
+        survey(gridder, blocks, gathered.pose, progress)
     if gridder.is_empty():
         raise ScanError("no point falls on the grid: wrong scans.frame, SOP, CRS or units?")
     progress()
