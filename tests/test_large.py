@@ -18,9 +18,9 @@ def test_memory_is_bounded_by_the_grid_not_by_the_points(tmp_path):
 
 
 def test_a_small_one_of_its_kind_is_adjusted_and_good(tmp_path):
-    site = prepared(tmp_path, 90_000, size=0.08)
-    taken = measured(site)  # raises where it is of no use
-    assert taken.points == pytest.approx(90_000, rel=0.02)
+    site = prepared(tmp_path, 250_000, size=0.08)
+    taken = measured(site)  # decodes ahead; raises where it is of no use
+    assert taken.points == pytest.approx(250_000, rel=0.02)
     scan = max((site.parent / "inbox").glob("*.laz"))
     assert decoded(scan).points == taken.points
-    assert large_station(tmp_path, 90_000, size=0.08) == site  # and not made again
+    assert large_station(tmp_path, 250_000, size=0.08) == site  # and not made again
