@@ -88,10 +88,11 @@ class LasScan:
         decoding is saved. Raises ScanError where fewer points are there than the header counts, or one lies
         outside the header's box, farther than `range_max_m`, or has no finite time.
         """
+        timed = self.time_range_s() is not None
         together, width, count = BLOCKS_AT_ONCE * size, self._layout.record_bytes, self._layout.count
         lengths = [min(together, count - first) * width for first in range(0, count, together)]
         rooms = filled(partial(self._filling, BRIGHT if brightness else NEEDED), lengths)
-        return self._shots(rooms, size, timed=self.time_range_s() is not None, brightness=brightness)
+        return self._shots(rooms, size, timed=timed, brightness=brightness)
 
     def _shots(self, rooms: Iterator[Room], size: int, *, timed: bool, brightness: bool) -> Iterator[Shots]:
         check = _Check(self._layout, self._range_max_m)
