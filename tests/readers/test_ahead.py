@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from station.readers.las import LasScan
+from station.service.child import SURROUNDINGS
 
 # A fork takes a process without threads, which that of the tests need not be.
 BEGIN = """
@@ -38,7 +39,7 @@ def beside():
 
 def run(script, *args):
     command = [sys.executable, "-c", BEGIN + textwrap.dedent(script), *map(str, args)]
-    environment = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)}
+    environment = os.environ | SURROUNDINGS | {"PYTHONPATH": os.pathsep.join(sys.path)}
     return subprocess.run(command, capture_output=True, timeout=60, check=False, env=environment)
 
 
