@@ -18,7 +18,7 @@ from station.archive.opened import open_series
 from station.archive.reference import read_reference
 from station.config import Site
 from station.quantities import Bools, ChangeErrors, Floats, Grid, Quality, Reference, Shared
-from station.science import ground, held, likeness, shared, terrain
+from station.science import calibration, ground, held, likeness, shared, terrain
 from station.science.view import View
 
 BOX_M = 100.0
@@ -186,7 +186,7 @@ class Calibration:
             result.gradient,
             self.known,
         )
-        self.design, self.lines = _matrices(felt)
+        self.design, self.lines = calibration.matrices(felt)
         self.of = felt.of
         self.error_m = result.error_m[:, self.known]
         self.random_m2 = result.random_m[:, self.known].astype(np.float64) ** 2
@@ -329,29 +329,3 @@ def _rows(chosen: list[np.ndarray], cells: int) -> sparse.csr_array:
     row = np.repeat(np.arange(len(chosen)), size)
     column = np.concatenate(chosen) if chosen else np.empty(0, int)
     return sparse.csr_array((values, (row, column)), shape=(len(chosen), int(cells)))
-
-
-def _matrices(felt: shared.Sensitivities) -> tuple[sparse.csr_array, sparse.csr_array]:
-    """Effect of the parameters (n, p) and of the lines' own lean (n, lines) on heights."""
-    of, count = felt.of, len(felt)
-    rows, columns, values = [], [], []
-    for number, effect in enumerate(felt.globals_):
-        rows.append(np.arange(count))
-        columns.append(np.full(count, number))
-        values.append(effect)
-    first = len(shared.GLOBAL)
-    for effect, knots, start in (
-        (felt.lean, felt.lean_knot(), first),
-        (felt.refraction, felt.refraction_knot(), first + of.lean_count),
-        (felt.across, felt.refraction_knot(), first + of.lean_count + of.refraction_count),
-    ):
-        before, after, share = knots
-        rows += [np.arange(count)] * 2
-        columns += [start + before, start + after]
-        values += [effect * (1 - share), effect * share]
-    total = first + of.lean_count + 2 * of.refraction_count
-    design = sparse.csr_array(
-        (np.concatenate(values), (np.concatenate(rows), np.concatenate(columns))), shape=(count, total)
-    )
-    lines = sparse.csr_array((felt.lean, (np.arange(count), felt.line)), shape=(count, of.line_count))
-    return design, lines

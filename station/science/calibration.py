@@ -126,7 +126,7 @@ class Felt:
 
     def __init__(self, felt: Sensitivities) -> None:
         self._of = felt.of
-        self._design, self._lines = _matrices(felt)
+        self._design, self._lines = matrices(felt)
 
     def sums(self, weights: sparse.csr_array) -> Sums:
         """Return weighted sums (m, n) of the cells."""
@@ -170,7 +170,7 @@ def differences(first: Ints, second: Ints, count: int) -> sparse.csr_array:
     return sparse.csr_array((values, place), shape=(len(first), count))
 
 
-def _matrices(felt: Sensitivities) -> tuple[sparse.csr_array, sparse.csr_array]:
+def matrices(felt: Sensitivities) -> tuple[sparse.csr_array, sparse.csr_array]:
     """Effect of the parameters (n, p) and of the lines' own lean (n, lines) on heights."""
     of, count = felt.of, len(felt)
     cells, first = np.arange(count), len(GLOBAL)
