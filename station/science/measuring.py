@@ -49,10 +49,10 @@ def measured(gridder: Gridder, outlook: Outlook | None, judge: Judge) -> Measure
     if outlook is not None:
         for first, whole in outlook.sectors():
             sums = gridder.sums(first, first + len(whole))
-            seen = sums.count > 0
-            made.clear(first + np.flatnonzero(~seen))
+            made.clear(first + np.flatnonzero(sums.count == 0))
+            seen = np.flatnonzero(sums.count)  # which is four times as fast to choose by as a mask
             sector, sums = whole.some(seen), sums.some(seen)
-            made.put(first + np.flatnonzero(seen), sums, judge.known(sector, sums, outlook))
+            made.put(first + seen, sums, judge.known(sector, sums, outlook))
     for fringe in _fringes(gridder, setup, outlook):
         made.put(fringe.number, fringe.sums, judge.beyond(fringe, gridder.datum_m))
     return Measurement(setup.grid, gridder.number, made.cells, made.quality, made.terms)
@@ -168,7 +168,7 @@ class _Made:
             cells[name][~enough] = np.nan
         cells["spread_m"], cells["count"] = sums.spread(), sums.count
         _as_one(self.cells)[number] = _as_one(cells)
-        self.quality[number[enough]] = told.flags[enough]
+        self.quality[number] = np.where(enough, told.flags, 0)
         for name, values in told.terms.items():
             self.terms[name][number[enough]] = values[enough]
 

@@ -72,7 +72,7 @@ class Sector:
         """Return how many cells there are."""
         return len(self.cell)
 
-    def some(self, chosen: Bools | slice) -> Sector:
+    def some(self, chosen: Ints | slice) -> Sector:
         """Return the chosen cells."""
         return Sector(*(getattr(self, one.name)[chosen] for one in fields(self)))
 

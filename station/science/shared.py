@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from functools import lru_cache
+from functools import cached_property, lru_cache
 
 import numpy as np
 
@@ -163,12 +163,12 @@ class Sensitivities:
         """Return how many cells there are."""
         return len(self.lean)
 
-    @property
+    @cached_property
     def line(self) -> Ints:
         """Group of scan lines (n,) that each cell lies in."""
         return (self.passed * LINES_A_KNOT).astype(np.int64)
 
-    @property
+    @cached_property
     def across(self) -> Reals:
         """Effect of a turn about the direction in which the head looks (n,), per rad.
 
