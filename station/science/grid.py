@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 if TYPE_CHECKING:
-    from station.quantities import Bools, Floats, Floats32, Grid, Ints, Ints32
+    from station.quantities import Floats, Floats32, Grid, Ints, Ints32
     from station.science.terrain import Ground
 
 # Sums are whole numbers, of 2^-20 m (and m²), so that the order in which points come cannot matter.
@@ -31,17 +31,12 @@ class Sums:
     residual: Ints
     square: Ints
 
-    @classmethod
-    def of(cls, parts: list[Sums]) -> Sums:
-        """Take those of some cells (n,) together."""
-        return cls(*(np.concatenate([getattr(part, one.name) for part in parts]) for one in fields(cls)))
-
     @property
     def count(self) -> Ints32:
         """Points in each cell (ny, nx)."""
         return (self.tally >> BITS).astype(np.int32)
 
-    def some(self, chosen: Bools | Ints) -> Sums:
+    def some(self, chosen: Ints) -> Sums:
         """Return those of the chosen cells (n,)."""
         return Sums(self.tally[chosen], self.residual[chosen], self.square[chosen])
 

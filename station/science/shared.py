@@ -234,10 +234,10 @@ class Sensitivities:
             return self._variance_between(int(before[0]), unknown)
         order = np.argsort(before, kind="stable")
         bounds = np.searchsorted(before[order], np.arange(self.of.intervals + 1))
-        variance_m2 = np.zeros_like(self.lean)
+        ordered, variance_m2 = self.some(order), np.zeros_like(self.lean)
         for knot in np.flatnonzero(np.diff(bounds)).tolist():
-            cells = order[bounds[knot] : bounds[knot + 1]]
-            variance_m2[cells] = self.some(cells).variance(unknown)
+            cells = slice(bounds[knot], bounds[knot + 1])
+            variance_m2[order[cells]] = ordered.some(cells)._variance_between(knot, unknown)
         return variance_m2
 
     def _variance_between(self, knot: int, unknown: Shared) -> Reals:
