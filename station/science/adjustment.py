@@ -100,7 +100,7 @@ class Adjustment:
 
 def turned(felt: Sensitivities, assumed_rad: Floats) -> Reals:
     """Effect on heights (n,) [m] of lines turned about east, north and up by (3, lines)."""
-    east, north, up = assumed_rad.astype(felt.lean.dtype)[:, felt.line]
+    east, north, up = assumed_rad.astype(felt.lean.dtype).take(felt.line, axis=1)
     return np.asarray(felt.globals_[0] * east + felt.globals_[1] * north - felt.globals_[2] * up)
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 if TYPE_CHECKING:
-    from station.quantities import Bools, Floats, Floats32, Grid, Ints, Ints32
+    from station.quantities import Floats, Floats32, Grid, Ints, Ints32
     from station.science.terrain import Ground
 
 # Sums are whole numbers, of 2^-20 m (and m²), so that the order in which points come cannot matter.
@@ -31,17 +31,12 @@ class Sums:
     residual: Ints
     square: Ints
 
-    @classmethod
-    def of(cls, parts: list[Sums]) -> Sums:
-        """Take those of some cells (n,) together."""
-        return cls(*(np.concatenate([getattr(part, one.name) for part in parts]) for one in fields(cls)))
-
     @property
     def count(self) -> Ints32:
         """Points in each cell (ny, nx)."""
         return (self.tally >> BITS).astype(np.int32)
 
-    def some(self, chosen: Bools) -> Sums:
+    def some(self, chosen: Ints) -> Sums:
         """Return those of the chosen cells (n,)."""
         return Sums(self.tally[chosen], self.residual[chosen], self.square[chosen])
 
@@ -50,10 +45,8 @@ class Sums:
 
         Source: Hartzell et al. (2015), Eq. 11, of residuals (EQUATIONS 6.5).
         """
-        count = self.count
-        mean_m = np.full(count.shape, np.nan)
-        np.divide(self.residual, count * QUANTUM, out=mean_m, where=count > 0)
-        return mean_m
+        with np.errstate(invalid="ignore"):
+            return np.asarray(self.residual / (self.count * QUANTUM))
 
     def intensity(self) -> Floats32:
         """Mean brightness of each cell (ny, nx), 0-1, NaN in empty cells and in scans that do not tell."""
@@ -66,10 +59,11 @@ class Sums:
     def spread(self) -> Floats32:
         """Standard deviation of the points in each cell (ny, nx) [m], NaN for fewer than two."""
         spread_m = np.full(self.tally.shape, np.nan, np.float32)
-        several = self.tally >= 2 * ONE
-        count = (self.tally[several] >> BITS).astype(np.float64)
-        centred = self.square[several] / QUANTUM - (self.residual[several] / QUANTUM) ** 2 / count
-        spread_m[several] = np.sqrt(np.maximum(centred, 0.0) / (count - 1))
+        several = np.flatnonzero(self.tally >= 2 * ONE)
+        count = (self.tally.take(several) >> BITS).astype(np.float64)
+        mean_square = (self.residual.take(several) / QUANTUM) ** 2 / count
+        centred = self.square.take(several) / QUANTUM - mean_square
+        spread_m.reshape(-1)[several] = np.sqrt(np.maximum(centred, 0.0) / (count - 1))
         return spread_m
 
 

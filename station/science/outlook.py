@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from station.quantities import UPRIGHT, Bools, Floats, Floats32, Grid, Ints, Ints32, Reals, Reference, Scanner
 from station.science import ground, shared, terrain
 from station.science.shared import Basis, Sensitivities
-from station.science.terrain import Ground, smooth_gradient
+from station.science.terrain import Cells, Ground, smooth_gradient
 from station.science.view import View
 
 BAND_ROWS = 128  # looked at together: what a store chunk is high
@@ -72,7 +72,7 @@ class Sector:
         """Return how many cells there are."""
         return len(self.cell)
 
-    def some(self, chosen: Bools | slice) -> Sector:
+    def some(self, chosen: Ints | slice) -> Sector:
         """Return the chosen cells."""
         return Sector(*(getattr(self, one.name)[chosen] for one in fields(self)))
 
@@ -205,15 +205,10 @@ def look(
     return Outlook(reference, of, position_m, below.datum_m, below.rise_m, number, bounds, one_in, cells)
 
 
-def gradients(
-    around_m: Reals, cell_m: float, rows: slice, seen: Bools | tuple[Ints, Ints]
-) -> tuple[Floats, Floats]:
+def gradients(around_m: Reals, cell_m: float, rows: slice, chosen: Cells) -> tuple[Floats, Floats]:
     """Rise per metre eastward and northward (n,) of a smoothed surface in the chosen cells of some rows."""
-    east, north = (
-        np.nan_to_num(gradient[seen].astype(np.float64))
-        for gradient in smooth_gradient(around_m, cell_m, rows=rows)
-    )
-    return east, north
+    east, north = smooth_gradient(around_m, cell_m, rows=rows, chosen=chosen)
+    return np.nan_to_num(east.astype(np.float64)), np.nan_to_num(north.astype(np.float64))
 
 
 def _cells(
@@ -237,7 +232,7 @@ def _cells(
         np.nan,
     )
     inner = slice(rows.start - first, rows.stop - first)
-    east, north = gradients(around_m, grid.cell_m, inner, known)
+    east, north = gradients(around_m, grid.cell_m, inner, (row, column))
     x_m, y_m, height_m = grid.x_m[column], grid.y_m[rows][row], below.cell_means(rows)[known]
     trait = np.where(stable[known], Trait.STABLE, 0) | np.where(ground.withheld(x_m, y_m), Trait.WITHHELD, 0)
     trait |= np.where(np.hypot(east, north) < ground.MOVING_STEEPEST, Trait.SMOOTH, 0)

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from functools import lru_cache
+from functools import cached_property, lru_cache
 
 import numpy as np
 
@@ -163,12 +163,12 @@ class Sensitivities:
         """Return how many cells there are."""
         return len(self.lean)
 
-    @property
+    @cached_property
     def line(self) -> Ints:
         """Group of scan lines (n,) that each cell lies in."""
         return (self.passed * LINES_A_KNOT).astype(np.int64)
 
-    @property
+    @cached_property
     def across(self) -> Reals:
         """Effect of a turn about the direction in which the head looks (n,), per rad.
 
@@ -234,10 +234,10 @@ class Sensitivities:
             return self._variance_between(int(before[0]), unknown)
         order = np.argsort(before, kind="stable")
         bounds = np.searchsorted(before[order], np.arange(self.of.intervals + 1))
-        variance_m2 = np.zeros_like(self.lean)
+        ordered, variance_m2 = self.some(order), np.zeros_like(self.lean)
         for knot in np.flatnonzero(np.diff(bounds)).tolist():
-            cells = order[bounds[knot] : bounds[knot + 1]]
-            variance_m2[cells] = self.some(cells).variance(unknown)
+            cells = slice(bounds[knot], bounds[knot + 1])
+            variance_m2[order[cells]] = ordered.some(cells)._variance_between(knot, unknown)
         return variance_m2
 
     def _variance_between(self, knot: int, unknown: Shared) -> Reals:

@@ -14,6 +14,8 @@ ALL = slice(None)
 BAND_ROWS = 128  # looked at together: what a store chunk is high
 TOGETHER = 200_000  # cells
 
+Cells = tuple[Ints, Ints]  # rows and columns (n,)
+
 
 def normal(slope_rad: Floats, aspect_rad: Floats) -> Floats:
     """Unit normal (n, 3) (east, north, up); aspect is the downslope direction, clockwise from north.
@@ -25,54 +27,67 @@ def normal(slope_rad: Floats, aspect_rad: Floats) -> Floats:
 
 
 def smooth_gradient(
-    elevation_m: Floats | Floats32, cell_m: float, cells: float = 1.5, rows: slice = ALL
+    elevation_m: Floats | Floats32,
+    cell_m: float,
+    cells: float = 1.5,
+    rows: slice = ALL,
+    chosen: Cells | None = None,
 ) -> tuple[Floats32, Floats32]:
     """Rise per metre eastward and northward (ny, nx) of a surface smoothed over `cells` (one sigma).
 
     NaN in the surface is passed over (normalised convolution of the differences); NaN where nothing is near.
-    Of `rows` only, if they are told.
+    Of `rows` only, if they are told, and of these in the `chosen` cells (n,).
     """
     east, north = (np.full(elevation_m.shape, np.nan, np.float32) for _ in range(2))
     east[:, 1:-1] = (elevation_m[:, 2:] - elevation_m[:, :-2]) / (2 * cell_m)
     north[1:-1] = (elevation_m[:-2] - elevation_m[2:]) / (2 * cell_m)
-    return smooth(east, cells, rows), smooth(north, cells, rows)
+    return smooth(east, cells, rows, chosen), smooth(north, cells, rows, chosen)
 
 
-def smooth(values: Floats | Floats32, cells: float, rows: slice = ALL) -> Floats32:
+def smooth(
+    values: Floats | Floats32, cells: float, rows: slice = ALL, chosen: Cells | None = None
+) -> Floats32:
     """Values (ny, nx) under a Gaussian of `cells` (one sigma), NaN passed over; NaN where nothing is near.
 
-    Of `rows` only, if they are told.
+    Of `rows` only, if they are told, and of these in the `chosen` cells (n,).
     """
     known = np.isfinite(values)
-    weight = _under_gaussian(known.astype(np.float32), cells, rows)
-    total = _under_gaussian(
-        np.where(known, values, np.float32(0)).astype(np.float32, copy=False), cells, rows
-    )
+    weight = _under_gaussian(known.astype(np.float32), cells, rows, chosen)
+    valued = np.where(known, values, np.float32(0)).astype(np.float32, copy=False)
+    total = _under_gaussian(valued, cells, rows, chosen)
     total[weight <= 1e-3] = np.nan
     total /= np.maximum(weight, 1e-3, out=weight)
     return total
 
 
-def _under_gaussian(values: Floats32, cells: float, rows: slice) -> Floats32:
-    """Rows of values (ny, nx) under a Gaussian cut off at two sigma; beyond the border is nought.
+def _under_gaussian(values: Floats32, cells: float, rows: slice, chosen: Cells | None) -> Floats32:
+    """Rows of values (ny, nx), or cells, under a Gaussian cut off at two sigma; beyond the border is nought.
 
     By whole arrays: `ndimage.gaussian_filter` goes through them line by line, which takes twice as long.
     """
     reach = int(2 * cells + 0.5)
     share = np.exp(-0.5 * (np.arange(reach + 1) / cells) ** 2)
     share = (share / (share[0] + 2 * share[1:].sum())).astype(np.float32)
-    for axis, wanted in enumerate((rows, ALL)):
-        start, stop, step = wanted.indices(values.shape[axis])
-        margin = ((0, 0),) * axis + ((reach, reach),) + ((0, 0),) * (1 - axis)
-        around = np.pad(values, margin)
-        here = [(ALL,) * axis + (slice(start + at, stop + at, step),) for at in range(2 * reach + 1)]
-        values = around[here[reach]] * share[0]
-        beside = np.empty_like(values)
-        for apart in range(1, reach + 1):
-            np.add(around[here[reach - apart]], around[here[reach + apart]], out=beside)
-            beside *= share[apart]
-            values += beside
-    return values
+    (start, stop, step), wide = rows.indices(len(values)), values.shape[1]
+    apart = range(2 * reach + 1)
+    around = np.pad(values, reach)
+    down = _weighted([around[start + at : stop + at : step] for at in apart], share)
+    if chosen is None:
+        return _weighted([down[:, at : at + wide] for at in apart], share)
+    first = chosen[0] * down.shape[1] + chosen[1]
+    return _weighted([down.reshape(-1).take(first + at) for at in apart], share)
+
+
+def _weighted(beside: list[Floats32], share: Floats32) -> Floats32:
+    """Add up what lies side by side, by the share of the middle one and of those so far apart from it."""
+    reach = len(share) - 1
+    total: Floats32 = beside[reach] * share[0]
+    both = np.empty_like(total)
+    for apart in range(1, reach + 1):
+        np.add(beside[reach - apart], beside[reach + apart], out=both)
+        both *= share[apart]
+        total += both
+    return total
 
 
 @dataclass(frozen=True)
