@@ -6,6 +6,7 @@ with row 0 in the north.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from enum import IntFlag
 from math import radians
@@ -230,6 +231,10 @@ MEASURED = np.dtype(
 )
 
 
+def _as_it_is(_name: str, column: NDArray[Any]) -> NDArray[Any]:
+    return column
+
+
 @dataclass(frozen=True)
 class Measurement:
     """What a scan says of the surface, and how sure that is, cell by cell; all (n,).
@@ -254,10 +259,18 @@ class Measurement:
             cells[name] = rasters.pop(name).ravel()
         return cls(grid, number, cells, quality.ravel(), {name: one.ravel() for name, one in rasters.items()})
 
-    def laid(self, *names: str, rows: slice = slice(None)) -> list[NDArray[Any]]:
-        """Lay columns out on some rows of the grid, or all: NaN, or nought, where there is nothing."""
+    def laid(
+        self,
+        *names: str,
+        rows: slice = slice(None),
+        made: Callable[[str, NDArray[Any]], NDArray[Any]] = _as_it_is,
+    ) -> list[NDArray[Any]]:
+        """Lay columns out on some rows of the grid, or all: NaN, or nought, where there is nothing.
+
+        `made` turns the values of a column into what is laid out, NaN or nought for nothing too.
+        """
         number = self.number[rows]
-        rasters = [self._empty(name, number.shape) for name in names]
+        rasters = [np.full(number.shape, made(name, self._nothing(name))) for name in names]
         for first in range(0, len(number), LAID_TOGETHER):
             part = slice(first, first + LAID_TOGETHER)
             there = np.flatnonzero(number[part] >= 0)
@@ -265,13 +278,15 @@ class Measurement:
             cells = self.cells.take(chosen)  # at once: it is the cells that have to be waited for
             for name, raster in zip(names, rasters, strict=True):
                 column = self._beside(name)
-                raster[part].reshape(-1)[there] = cells[name] if column is None else column.take(chosen)
+                values = cells[name] if column is None else column.take(chosen)
+                raster[part].reshape(-1)[there] = made(name, values)
         return rasters
 
-    def _empty(self, name: str, shape: tuple[int, ...]) -> NDArray[Any]:
+    def _nothing(self, name: str) -> NDArray[Any]:
+        """Return what stands for nothing in a column (1,)."""
         column = self._beside(name)
         dtype = self.cells.dtype[name] if column is None else column.dtype
-        return np.full(shape, np.nan if dtype.kind == "f" else 0, dtype)
+        return np.array([np.nan if dtype.kind == "f" else 0], dtype)
 
     def _beside(self, name: str) -> NDArray[Any] | None:
         """Return a column that is not among the cells."""

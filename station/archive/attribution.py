@@ -12,7 +12,7 @@ import numpy as np
 
 from station.archive.aggregate import Aggregates
 from station.archive.layout import Series, define, lay_out, written_whole
-from station.archive.rasters import write_rasters
+from station.archive.rasters import rounded, write_rasters
 from station.archive.store import Row, said
 from station.archive.variables import Variable
 from station.errors import StoreError
@@ -137,7 +137,7 @@ class Attribution:
                 file.setncattr("epoch_file", self.row.epoch_file)
                 for row in ROWS:
                     define(file, row, self.series, 1)
-            write_rasters(beside, ROWS, lambda rows: [maps[row.name][rows] for row in ROWS])
+            write_rasters(beside, ROWS, lambda rows: [rounded(row, maps[row.name][rows]) for row in ROWS])
 
 
 def attribute(series: Series, epoch: int | str) -> Attribution:

@@ -24,6 +24,7 @@ from station.errors import StoreError
 
 LEVEL = 1
 TOGETHER = 2  # rasters deflated at once, of one band
+BESIDE = 8  # chunks that are shuffled together
 KEPT_BANDS = 2  # rows of chunks that are kept unpacked: of a band of cells and what is around it
 
 Array = np.ndarray[Any, Any]
@@ -32,7 +33,7 @@ Array = np.ndarray[Any, Any]
 def write_rasters(path: Path, rows: Sequence[Variable], band: Callable[[slice], Iterable[Array]]) -> None:
     """Write rasters into the variables that a file has for them, as the first time.
 
-    `band` gives some rows (r, nx) of each of them, NaN as fill. Chunks without any value are left unwritten.
+    `band` gives some rows (r, nx) of each of them, as `rounded`. Chunks without any value are left unwritten.
     """
     with h5py.File(path, "r+") as file, ThreadPoolExecutor(TOGETHER) as pool:
         held = [h5py.h5d.open(file.id, row.name.encode()) for row in rows]
@@ -43,38 +44,39 @@ def write_rasters(path: Path, rows: Sequence[Variable], band: Callable[[slice], 
         *_, height, width = chunk = held[0].get_create_plist().get_chunk()
         for top in range(0, ny, height):
             values = band(slice(top, min(top + height, ny)))
-            packed = pool.map(partial(_deflated, (height, width)), rows, values)
+            packed = pool.map(partial(_deflated, (height, width)), values)
             for dataset, chunks in zip(held, packed, strict=True):
                 for left, one in chunks.items():
                     dataset.write_direct_chunk((0, top, left)[-len(chunk) :], one)
 
 
-def _deflated(size: tuple[int, int], row: Variable, band: Array) -> dict[int, bytes]:
-    """Return the chunks of a band of a raster that hold something, by their first column."""
-    packed = {
-        left: _packed(row, band[:, left : left + size[1]], size) for left in range(0, band.shape[1], size[1])
-    }
-    return {left: chunk for left, chunk in packed.items() if chunk is not None}
-
-
-def _packed(row: Variable, values: Array, size: tuple[int, int]) -> bytes | None:
-    """Return a chunk as it stands in the file, None where it holds nothing."""
-    fill = FILL if row.dtype[0] == "f" else 0
+def rounded(row: Variable, values: Array) -> Array:
+    """Return values of a variable as the file holds them: rounded, and fill for NaN."""
     if row.dtype[0] == "f":
         if row.digits is not None:
             steps = values.dtype.type(2.0 ** math.ceil(row.digits * math.log2(10)))  # netCDF4's own rounding
             values = np.rint(steps * values)
             values /= steps
-        values = np.fmin(values, values.dtype.type(fill))  # of NaN: ten times as fast as to ask for it
-        if values.min() == values.dtype.type(fill):
-            return None
-    tile = values.astype(row.dtype)
-    if tile.shape != size:
-        whole = np.full(size, fill, row.dtype)
-        whole[: tile.shape[0], : tile.shape[1]] = tile
-        tile = whole
-    shuffled = tile.reshape(-1, 1).view(np.uint8).T
-    return isal_zlib.compress(np.ascontiguousarray(shuffled), LEVEL)
+        values = np.fmin(values, values.dtype.type(FILL))  # of NaN: ten times as fast as to ask for it
+    return values.astype(row.dtype, copy=False)
+
+
+def _deflated(size: tuple[int, int], band: Array) -> dict[int, bytes]:
+    """Return the chunks of a band of a raster that hold something, by their first column."""
+    height, width = size
+    fill = band.dtype.type(FILL if band.dtype.kind == "f" else 0)
+    packed = {}
+    for first in range(0, band.shape[1], BESIDE * width):
+        part = band[:, first : first + BESIDE * width]
+        count = -(-part.shape[1] // width)
+        whole = np.full((height, count * width), fill)
+        whole[: part.shape[0], : part.shape[1]] = part
+        holds = whole.min(axis=0).reshape(count, width).min(axis=1) < FILL
+        by_byte = whole.view(np.uint8).reshape(height, count, width, -1).transpose(1, 3, 0, 2)
+        shuffled = np.ascontiguousarray(by_byte)
+        for at in np.flatnonzero(holds).tolist():
+            packed[first + at * width] = isal_zlib.compress(shuffled[at], LEVEL)
+    return packed
 
 
 def _around(chosen: Any) -> slice:  # noqa: ANN401 - numpy has no type for it

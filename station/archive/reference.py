@@ -13,7 +13,7 @@ import netCDF4
 import numpy as np
 
 from station.archive.layout import Series, define, lay_out, strings, written_whole
-from station.archive.rasters import Raster, write_rasters
+from station.archive.rasters import Raster, rounded, write_rasters
 from station.archive.variables import FILL, Variable
 from station.errors import StoreError
 from station.quantities import Floats32, Habits, Reference, Shared
@@ -137,7 +137,8 @@ def write_reference(series: Series, reference: Reference, lineage: Lineage | Non
     with written_whole(kept) as beside:
         with netCDF4.Dataset(beside, "w", clobber=False) as file:
             _write(file, series, reference, lineage)
-        write_rasters(beside, [row for row in _ROWS if row.is_raster], lambda rows: _band(reference, rows))
+        rasters = [row for row in _ROWS if row.is_raster]
+        write_rasters(beside, rasters, lambda rows: map(rounded, rasters, _band(reference, rows)))
     _name_newest(series, kept)
 
 

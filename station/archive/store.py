@@ -17,7 +17,7 @@ import numpy as np
 from isal.igzip_lib import IsalError
 
 from station.archive.layout import Series, define, lay_out, strings, text, written_whole
-from station.archive.rasters import write_rasters
+from station.archive.rasters import rounded, write_rasters
 from station.archive.tiles import column
 from station.archive.variables import BY_NAME, TERMS, TEXT_LENGTH, VARIABLES, VERDICTS
 from station.errors import StoreError
@@ -95,8 +95,14 @@ def write_epoch(series: Series, epoch: Epoch, newer_than: int = 0) -> Stored:
         with netCDF4.Dataset(beside, "w", clobber=False) as file:
             _write(file, series, epoch, path.name)
         columns = _columns(epoch.measurement)
-        rows = [BY_NAME[name] for name in columns]
-        write_rasters(beside, rows, lambda band: epoch.measurement.laid(*columns.values(), rows=band))
+        rows = {column: BY_NAME[name] for name, column in columns.items()}
+        write_rasters(
+            beside,
+            list(rows.values()),
+            lambda band: epoch.measurement.laid(
+                *rows, rows=band, made=lambda column, values: rounded(rows[column], values)
+            ),
+        )
     return Stored(path, start, revision)
 
 

@@ -237,7 +237,7 @@ class Sensitivities:
         ordered, variance_m2 = self.some(order), np.zeros_like(self.lean)
         for knot in np.flatnonzero(np.diff(bounds)).tolist():
             cells = slice(bounds[knot], bounds[knot + 1])
-            variance_m2[order[cells]] = ordered.some(cells)._variance_between(knot, unknown)
+            variance_m2[order[cells]] = ordered.some(cells).variance(unknown)
         return variance_m2
 
     def _variance_between(self, knot: int, unknown: Shared) -> Reals:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from station.archive.layout import Series, define, lay_out
-from station.archive.rasters import Raster, write_rasters
+from station.archive.rasters import Raster, rounded, write_rasters
 from station.archive.variables import BY_NAME, FILL
 from station.errors import StoreError
 from station.quantities import Grid
@@ -44,7 +44,9 @@ def written(path, way):
 
 
 def put(path, rasters):
-    write_rasters(path, list(rasters), lambda rows: [raster[rows] for raster in rasters.values()])
+    write_rasters(
+        path, list(rasters), lambda rows: [rounded(row, raster[rows]) for row, raster in rasters.items()]
+    )
 
 
 def test_the_library_reads_what_it_would_have_written_itself(tmp_path):

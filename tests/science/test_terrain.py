@@ -58,6 +58,8 @@ def test_smoothing_is_a_normalised_gaussian_also_of_some_rows():
             terrain.smooth_gradient(values, 2.0, rows=rows), terrain.smooth_gradient(values, 2.0), strict=True
         ):
             assert np.array_equal(part, whole[rows], equal_nan=True)
+        chosen = np.nonzero(rng.uniform(size=told[rows].shape) < 0.2)
+        assert np.array_equal(terrain.smooth(values, 1.5, rows, chosen), told[rows][chosen], equal_nan=True)
 
 
 def test_ground_is_bilinear_between_centres_and_goes_on_to_the_edge():
