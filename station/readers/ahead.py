@@ -30,15 +30,18 @@ def filled(opened: Opened, lengths: Sequence[int]) -> Iterator[Room]:
     """Give rooms of some lengths [bytes], filled one after the other; each holds until the next is asked for.
 
     They are filled ahead, from the call on, by a fork of this process; not so where one is all there is, or
-    where this process has threads, which a fork would leave behind with their locks held. Raises what
-    `opened` and filling raise; where a decoder kills the fork, it kills this process too, as if it had run
-    here.
+    where this process has threads, which a fork would leave behind with their locks held, or where the system
+    grants no further process. Raises what `opened` and filling raise; where a decoder kills the fork, it
+    kills this process too, as if it had run here.
     """
     if len(lengths) < ROOMS or len(list(Path("/proc/self/task").iterdir())) > 1:
         return _in_turn(opened, lengths)
-    rooms = np.frombuffer(mmap.mmap(-1, ROOMS * max(lengths)), np.uint8).reshape(ROOMS, -1)
-    here, there = Pipe()
-    pid = os.fork()
+    try:
+        rooms = np.frombuffer(mmap.mmap(-1, ROOMS * max(lengths)), np.uint8).reshape(ROOMS, -1)
+        here, there = Pipe()
+        pid = os.fork()
+    except OSError:  # too many processes or too little memory at the moment are not the scan's fault
+        return _in_turn(opened, lengths)
     if not pid:
         here.close()
         _fill(opened, lengths, rooms, there)
@@ -93,8 +96,8 @@ def _fill(opened: Opened, lengths: Sequence[int], rooms: Room, there: Connection
 
 def _end(pid: int) -> int:
     """Make sure that a child has ended; return its wait status."""
-    os.kill(pid, signal.SIGKILL)
     try:
+        os.kill(pid, signal.SIGKILL)
         return os.waitpid(pid, 0)[1]
-    except ChildProcessError:  # this process does not want to know of its children
+    except (ProcessLookupError, ChildProcessError):  # this process does not want to know of its children
         return 0

@@ -150,3 +150,29 @@ def test_a_process_with_threads_does_without():
         """
     done = run(script)
     assert done.returncode == 0, done.stderr.decode()
+
+
+def test_where_no_process_is_granted_it_does_without():
+    script = """
+        def at_third():
+            pass
+        def refused():
+            raise BlockingIOError(11, "Resource temporarily unavailable")
+        os.fork = refused
+        assert [room[0] for room in filled(beside, [10] * 3)] == [1, 2, 3]
+        """
+    done = run(script)
+    assert done.returncode == 0, done.stderr.decode()
+
+
+def test_a_process_that_ignores_its_children_reads_all_the_same():
+    script = """
+        def at_third():
+            pass
+        signal.signal(signal.SIGCHLD, signal.SIG_IGN)
+        for room in filled(beside, [10] * 3):
+            time.sleep(0.05)  # the other is through, and gone, before the last is read
+        assert room[0] == 3
+        """
+    done = run(script)
+    assert done.returncode == 0, done.stderr.decode()
