@@ -19,6 +19,7 @@ from station.scanners import SCANNERS
 Positive = Annotated[float, Field(gt=0)]
 NotNegative = Annotated[float, Field(ge=0)]
 Arm = Annotated[float, Field(ge=-2, le=2)]
+Place = Annotated[float, Field(ge=-1e8, le=1e8)]  # metres on a map; no map of the Earth is larger
 
 
 def _in_utc(moment: datetime) -> datetime:
@@ -128,17 +129,17 @@ class MapSection(Section):
 class Bounds(Section):
     """Outer edges of the grid in the map CRS."""
 
-    west: float
-    south: float
-    east: float
-    north: float
+    west: Place
+    south: Place
+    east: Place
+    north: Place
 
 
 class GridSection(Section):
     """The fixed raster."""
 
     bounds_m: Bounds
-    cell_m: Positive = 1.0
+    cell_m: Annotated[float, Field(ge=0.001)] = 1.0
     min_points: Annotated[int, Field(ge=1)] = 1
 
     @model_validator(mode="after")

@@ -63,7 +63,9 @@ def test_all_faults_at_once_with_the_nearest_right_key(tmp_path):
         (("[grid]", "[areas]\n[grid]"), "areas.file: missing"),
         (("[grid]", '[map]\npop = "pop.dat"\n[grid]'), "say which with map.crs"),
         (("east = 10.0", "east = -10.0"), "at least one cell_m beyond"),
-        (("cell_m = 0.5", "cell_m = 0.0001"), "too many"),
+        (("cell_m = 0.5", "cell_m = 0.001"), "too many"),
+        (("cell_m = 0.5", "cell_m = 1e-320"), "grid.cell_m"),
+        (("east = 10.0", "east = 1e300"), "grid.bounds_m.east"),
         (("cell_m = 0.5", "cell_m = nan"), "grid.cell_m"),
     ],
 )
