@@ -73,7 +73,9 @@ class ScannerSection(Section):
 
     @model_validator(mode="before")
     @classmethod
-    def _fill_from_model(cls, given: dict[str, Any]) -> dict[str, Any]:
+    def _fill_from_model(cls, given: Any) -> Any:  # noqa: ANN401 - whatever the file holds
+        if not isinstance(given, dict) or not isinstance(given.get("model", ""), str):
+            return given  # pydantic says of what type they must be
         model = given.get("model", "riegl-vz-6000")
         known = SCANNERS.get(model, {})
         missing = set(SCANNERS["riegl-vz-6000"]) - set(given)

@@ -54,6 +54,8 @@ def test_all_faults_at_once_with_the_nearest_right_key(tmp_path):
         (("[station]", "[station"), "not valid TOML"),
         (('frame = "map"', 'frame = "scanner"'), "needs an"),
         (("[grid]", '[scanner]\nmodel = "vz"\n[grid]'), "take one of riegl-vz-6000"),
+        (("[grid]", "[scanner]\nmodel = []\n[grid]"), "scanner.model: .* string"),
+        (("[station]", "scanner = 5\n[station]"), "scanner: .* dictionary"),
         (("[grid]", '[reference]\nscans = "there.tif"\n[grid]'), "no such file"),
         (("[grid]", '[adjustment]\nstable = "there.geojson"\n[grid]'), r"adjustment.stable: no such file"),
         (("[grid]", '[adjustment]\nmethod = "best"\n[grid]'), "adjustment.method"),
