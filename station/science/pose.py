@@ -83,13 +83,12 @@ class Frame:
     """The way from the upright scanner frame to the map.
 
     First the rigid `to_local` (4, 4) into a frame whose z axis is up at the scanner, whose origin is the
-    scanner; then a polynomial in (x, y, z) / `reach_m` with `powers` (m, 3) and `coefficients` (m, 3) that
-    gives easting, northing and height beyond `position_m` [m]. No polynomial: the local frame is the map.
+    scanner; then a polynomial in x, y and z [m] with `powers` (m, 3) and `coefficients` (m, 3) that gives
+    easting, northing and height beyond `position_m` [m]. No polynomial: the local frame is the map.
     """
 
     position_m: tuple[float, float, float]
     to_local: Floats
-    reach_m: float
     powers: Ints
     coefficients: Floats
 
@@ -98,14 +97,13 @@ class Frame:
         if len(self.powers) == 0:
             east_m, north_m, height_m = self.position_m
             return local_m[0] + east_m, local_m[1] + north_m, local_m[2] + height_m
-        x, y, z = (values / self.reach_m for values in local_m)
         linear = self.powers.sum(axis=1) == 1
-        whole = _monomials(x, y, z, self.powers[linear])
-        mapped_m = self._sum(whole, linear, [np.full_like(x, origin) for origin in self.position_m])
+        whole = _monomials(*local_m, self.powers[linear])
+        mapped_m = self._sum(whole, linear, [np.full_like(local_m[0], origin) for origin in self.position_m])
         # What bends is metres: 24 bits hold it to a micrometre, at half the cost.
-        singles = x.astype(np.float32), y.astype(np.float32), z.astype(np.float32)
-        single = _monomials(*singles, self.powers[~linear])
-        bent_m = self._sum(single, ~linear, [np.zeros(len(x), np.float32) for _ in range(3)])
+        x, y, z = (axis_m.astype(np.float32) for axis_m in local_m)
+        single = _monomials(x, y, z, self.powers[~linear])
+        bent_m = self._sum(single, ~linear, [np.zeros_like(x) for _ in range(3)])
         return mapped_m[0] + bent_m[0], mapped_m[1] + bent_m[1], mapped_m[2] + bent_m[2]
 
     def _sum(self, monomials: Monomials[Axis], chosen: Bools, total_m: list[Axis]) -> list[Axis]:
@@ -150,7 +148,7 @@ def frame_in_local_map(sop: Floats) -> Frame:
     to_local = sop.copy()
     to_local[:3, 3] = 0.0
     east_m, north_m, height_m = (float(v) for v in sop[:3, 3])
-    return Frame((east_m, north_m, height_m), to_local, 1.0, np.empty((0, 3), np.int64), np.empty((0, 3)))
+    return Frame((east_m, north_m, height_m), to_local, np.empty((0, 3), np.int64), np.empty((0, 3)))
 
 
 def frame_by_pop(sop: Floats, pop: Floats, crs: str, reach_m: float) -> Frame:
@@ -232,6 +230,7 @@ def _frame(upright: Floats, to_local: Floats, crs: str, reach_m: float) -> Frame
     design = np.stack([monomials[i, j, k] for i, j, k in powers.tolist()], axis=-1)
     coefficients = np.linalg.lstsq(design, mapped_m - position_m, rcond=None)[0]
     coefficients[np.abs(coefficients) < 5e-5] = 0.0
+    coefficients /= reach_m ** powers.sum(axis=1, keepdims=True).astype(np.float64)
     used = np.any(coefficients != 0.0, axis=1)
     east_m, north_m, height_m = (float(v) for v in position_m)
-    return Frame((east_m, north_m, height_m), to_local, reach_m, powers[used], coefficients[used])
+    return Frame((east_m, north_m, height_m), to_local, powers[used], coefficients[used])

@@ -53,6 +53,7 @@ SURROUNDINGS = {
 _TICK_S = 0.2
 _GONE_WITH_ITS_SERVER = 255  # what multiprocessing reports where the fork server died
 _NOT_STARTED = ("not started", None)
+_ALONE = 1  # how a child ends whose parent is gone; nobody is left to see it
 # A scan that needs too much meets RLIMIT_AS; the kernel kills where the machine or the unit has less.
 _FROM_OUTSIDE = {signal.SIGKILL, signal.SIGTERM, signal.SIGINT, signal.SIGHUP}
 
@@ -210,17 +211,25 @@ def _work(there: Connection, task: Callable[..., object], args: tuple[object, ..
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
     limit = _mapped() + memory
     resource.setrlimit(resource.RLIMIT_AS, (limit, limit))
-    there.send(("progress", None))  # from here on a death is the task's own
+    _say(there, "progress", None)  # from here on a death is the task's own
     try:
-        there.send(("returned", task(*args, _teller(there))))
+        _say(there, "returned", task(*args, _teller(there)))
     except StationError as error:
-        there.send(("refused", type(error)(str(error))))
+        _say(there, "refused", type(error)(str(error)))
     except MemoryError:
-        there.send(("memory", None))
+        _say(there, "memory", None)
     except Exception:  # noqa: BLE001 - goes to the parent whole, which raises it
-        there.send(("bug", traceback.format_exc()))
+        _say(there, "bug", traceback.format_exc())
     except BaseException as panic:  # noqa: BLE001 - lazrs panics past Exception
-        there.send(("panicked", f"{type(panic).__name__}: {panic}"))
+        _say(there, "panicked", f"{type(panic).__name__}: {panic}")
+
+
+def _say(there: Connection, kind: str, value: object) -> None:
+    """Tell the parent; where it is gone, end: the work was for it, and nobody is to read of it in the log."""
+    try:
+        there.send((kind, value))
+    except BrokenPipeError:
+        os._exit(_ALONE)
 
 
 def _teller(there: Connection) -> Callable[[], None]:
@@ -231,7 +240,7 @@ def _teller(there: Connection) -> Callable[[], None]:
         nonlocal told_s
         if (now_s := time.monotonic()) >= told_s + _TICK_S:
             told_s = now_s
-            there.send(("progress", None))
+            _say(there, "progress", None)
 
     return progress
 
@@ -250,7 +259,7 @@ def _end_with_the_parent() -> None:
     flags = fcntl.fcntl(parent.sentinel, fcntl.F_GETFL)
     fcntl.fcntl(parent.sentinel, fcntl.F_SETFL, flags | os.O_ASYNC)
     if multiprocessing.connection.wait([parent.sentinel], 0):  # it went before the kernel was asked
-        raise RuntimeError("the parent is gone")
+        os._exit(_ALONE)
 
 
 def _mapped() -> int:

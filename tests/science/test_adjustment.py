@@ -203,7 +203,9 @@ def dense(design, residual_m, variance_m2, covariance):
 
 
 @pytest.mark.parametrize("with_log", [False, True], ids=["no log", "log"])
-@pytest.mark.parametrize("of", [OF, ROUND], ids=["sector", "all round"])
+@pytest.mark.parametrize(
+    "of", [pytest.param(OF, id="sector"), pytest.param(ROUND, id="all round", marks=pytest.mark.slow)]
+)
 def test_estimate_and_covariance_are_those_of_dense_least_squares(of, with_log, monkeypatch):
     monkeypatch.setattr(adjustment, "ROUNDS", 1)  # weights as they are at first
     rng = np.random.default_rng(1)

@@ -45,6 +45,7 @@ def lived_through(site, scans):
     return told
 
 
+@pytest.mark.slow
 def test_the_alarm_of_an_avalanche(tmp_path, credentials, webhook):
     """In the third hour; two scans must show it."""
     credentials(hook=webhook.url)

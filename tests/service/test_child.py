@@ -180,6 +180,31 @@ def test_a_child_dies_with_a_service_that_is_killed(tmp_path):
     wait_for(lambda: not is_alive(orphan))
 
 
+GONE = """
+import multiprocessing, os
+from station.service import child
+ours, theirs = os.pipe()
+os.close(theirs)
+class Parent:
+    sentinel = ours
+multiprocessing.parent_process = Parent
+here, there = multiprocessing.Pipe()
+here.close()
+"""
+
+
+@pytest.mark.parametrize("step", ["_end_with_the_parent()", "_say(there, 'progress', None)"])
+def test_a_child_that_finds_its_parent_gone_ends_without_a_traceback(step):
+    """It would stand in the journal after every power cut, and look like a bug."""
+    done = subprocess.run(
+        [sys.executable, "-c", f"{GONE}child.{step}\nprint('went on')"],
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert (done.returncode, done.stdout, done.stderr) == (1, "", "")
+
+
 def is_alive(pid):
     try:
         return "Z" not in Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()[0]
