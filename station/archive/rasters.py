@@ -43,8 +43,7 @@ def write_rasters(path: Path, rows: Sequence[Variable], band: Callable[[slice], 
         ny = held[0].shape[-2]
         *_, height, width = chunk = held[0].get_create_plist().get_chunk()
         for top in range(0, ny, height):
-            values = band(slice(top, min(top + height, ny)))
-            packed = pool.map(partial(_deflated, (height, width)), values)
+            packed = pool.map(partial(_deflated, (height, width)), band(slice(top, min(top + height, ny))))
             for dataset, chunks in zip(held, packed, strict=True):
                 for left, one in chunks.items():
                     dataset.write_direct_chunk((0, top, left)[-len(chunk) :], one)

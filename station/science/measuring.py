@@ -73,49 +73,68 @@ class _Fringe:
         """Take some together."""
         return cls(*(np.concatenate([getattr(part, one.name) for part in parts]) for one in fields(cls)))
 
+    def split(self) -> Iterator[_Fringe]:
+        """Give as many at a time as are judged together."""
+        for first in range(0, len(self.cell), TOGETHER):
+            yield _Fringe(*(getattr(self, one.name)[first : first + TOGETHER] for one in fields(self)))
+
 
 def _fringes(gridder: Gridder, setup: Setup, outlook: Outlook | None) -> Iterator[_Fringe]:
-    """Give the cells beyond the reference, many at a time."""
-    found_m = _heights(gridder, setup.min_points)
+    """Give the cells beyond the reference, so many at a time that what is worked out stays in the cache."""
+    heights = _Heights(gridder, outlook, setup.min_points)
     parts: list[_Fringe] = []
     for top in range(0, setup.grid.ny, BAND_ROWS):
         rows = slice(top, min(top + BAND_ROWS, setup.grid.ny))
-        parts.append(_fringe(gridder, setup, outlook, rows, found_m))
+        parts.append(_fringe(gridder, setup, heights, rows))
         if sum(len(part.cell) for part in parts) > TOGETHER or rows.stop == setup.grid.ny:
-            yield _Fringe.of(parts)
+            yield from _Fringe.of(parts).split()
             parts = []
 
 
-def _heights(gridder: Gridder, min_points: int) -> Floats32:
-    """Heights above the datum (m,) of the cells beyond the reference, before their sums give way."""
-    found_m = np.empty(gridder.taken - gridder.known, np.float32)
-    for first in range(0, len(found_m), TOGETHER):
-        part = slice(first, min(first + TOGETHER, len(found_m)))
-        sums = gridder.sums(gridder.known + part.start, gridder.known + part.stop)
-        found_m[part] = np.where(sums.count >= min_points, sums.mean_residual(), np.nan)
-    return found_m
-
-
-def _fringe(
-    gridder: Gridder, setup: Setup, outlook: Outlook | None, rows: slice, found_m: Floats32
-) -> _Fringe:
-    """Return the cells of some rows that no reference knows; `found_m` (m,) are the heights of all such."""
-    around = slice(max(rows.start - MARGIN_ROWS, 0), rows.stop + MARGIN_ROWS)
-    inner = slice(rows.start - around.start, rows.stop - around.start)
-    numbers = gridder.number[around]
-    beyond = np.flatnonzero(numbers >= gridder.known)
-    first, end = np.searchsorted(beyond, (inner.start * setup.grid.nx, inner.stop * setup.grid.nx))
-    number, cell = numbers.reshape(-1)[beyond], beyond[first:end]
+def _fringe(gridder: Gridder, setup: Setup, heights: _Heights, rows: slice) -> _Fringe:
+    """Return the cells of some rows that no reference knows."""
+    numbers = gridder.number[rows].reshape(-1)
+    cell = np.flatnonzero(numbers >= gridder.known)
     east, north = np.zeros((2, len(cell)))
-    if setup.position_m is not None and len(cell):
-        around_m = np.full(numbers.shape, np.nan, np.float32)
+    if setup.position_m is not None:
+        around_m, inner = heights.around(rows)
+        if len(cell):
+            seen = np.divmod(cell, setup.grid.nx)
+            east, north = gradients(around_m, setup.grid.cell_m, inner, seen)
+    return _Fringe(numbers[cell], rows.start * setup.grid.nx + cell, east, north)
+
+
+class _Heights:
+    """Heights above the datum row by row, read from the sums of cells before these give way."""
+
+    def __init__(self, gridder: Gridder, outlook: Outlook | None, min_points: int) -> None:
+        self._gridder, self._outlook, self._min_points = gridder, outlook, min_points
+        self._rows = slice(0, 0)
+        self._height_m = np.empty((0, gridder.grid.nx), np.float32)
+
+    def around(self, rows: slice) -> tuple[Floats32, slice]:
+        """Return heights of some rows and those next to them (r, nx), NaN where empty; which are the rows.
+
+        Each time farther south: sums of what was asked for are not looked at again.
+        """
+        wanted = slice(max(rows.start - MARGIN_ROWS, 0), min(rows.stop + MARGIN_ROWS, self._gridder.grid.ny))
+        held_m = self._height_m[wanted.start - self._rows.start :]
+        self._height_m = np.concatenate([held_m, self._read(slice(self._rows.stop, wanted.stop))])
+        self._rows = wanted
+        return self._height_m, slice(rows.start - wanted.start, rows.stop - wanted.start)
+
+    def _read(self, rows: slice) -> Floats32:
+        gridder, outlook = self._gridder, self._outlook
+        numbers = gridder.number[rows]
+        height_m = np.full(numbers.shape, np.nan, np.float32)
+        beyond = np.flatnonzero(numbers >= gridder.known)
+        sums = gridder.at(numbers.reshape(-1)[beyond])
+        enough = sums.count >= self._min_points
+        height_m.reshape(-1)[beyond] = np.where(enough, sums.mean_residual(), np.nan)
         if outlook is not None:  # what it knows of the cells beside is better
-            better_m = outlook.rise_m[around] + np.float32(outlook.datum_m - gridder.datum_m)
-            np.copyto(around_m, better_m, where=numbers.view(np.uint32) < np.uint32(gridder.known))
-        around_m.reshape(-1)[beyond] = found_m[number - gridder.known]
-        seen = np.divmod(cell - inner.start * setup.grid.nx, setup.grid.nx)
-        east, north = gradients(around_m, setup.grid.cell_m, inner, seen)
-    return _Fringe(number[first:end], around.start * setup.grid.nx + cell, east, north)
+            better_m = outlook.rise_m[rows] + np.float32(outlook.datum_m - gridder.datum_m)
+            np.copyto(height_m, better_m, where=numbers.view(np.uint32) < np.uint32(gridder.known))
+        return height_m
 
 
 @dataclass(frozen=True)

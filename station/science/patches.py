@@ -8,7 +8,7 @@ from enum import IntEnum
 
 import numpy as np
 
-from station.quantities import Bools, Floats, Ints
+from station.quantities import Bools, Floats, Floats32, Ints, Ints32
 from station.science.shared import GLOBAL, LINES_A_KNOT, Basis, Sensitivities
 
 STRETCH_M = 80.0  # of range, that one patch takes together
@@ -73,7 +73,7 @@ def collect(of: Basis, bands: Iterable[Cells], reach_m: float) -> Patches:
     a_kind = of.line_count * stretches
     size = a_kind * Kind.UNUSED
     sums = np.zeros((len(GLOBAL) + 3, size))
-    held: list[tuple[Ints, Floats, Floats]] = []
+    held: list[tuple[Ints32, Floats32, Floats32]] = []
     one_in = (1, 1)
     for cells in bands:
         used, one_in = cells.kind != Kind.UNUSED, cells.one_in
@@ -90,6 +90,7 @@ def collect(of: Basis, bands: Iterable[Cells], reach_m: float) -> Patches:
     if not held:
         held.append((np.empty(0, np.int32), np.empty(0, np.float32), np.empty(0, np.float32)))
     key, residual_m, weight = (np.concatenate(parts) for parts in zip(*held, strict=True))
+    held.clear()  # of many cells it is the most that is held here
     there = np.flatnonzero(sums[-1])
     mean_m, variance_m2, count = (values[there] for values in _robust_means(key, residual_m, weight, size))
     effects = sums[:-1, there] / sums[-1, there]
@@ -99,7 +100,9 @@ def collect(of: Basis, bands: Iterable[Cells], reach_m: float) -> Patches:
     return Patches(felt, place % stretches, there // a_kind, mean_m, variance_m2, count, one_in)
 
 
-def _robust_means(key: Ints, residual_m: Floats, weight: Floats, size: int) -> tuple[Floats, Floats, Floats]:
+def _robust_means(
+    key: Ints32, residual_m: Floats32, weight: Floats32, size: int
+) -> tuple[Floats, Floats, Floats]:
     """Mean, its random variance and the number of cells by patch (size,), after Cauchy's weights."""
     trusted = weight
     scale2 = 1.0
@@ -107,10 +110,10 @@ def _robust_means(key: Ints, residual_m: Floats, weight: Floats, size: int) -> t
     for _ in range(ROUNDS):
         mass = np.bincount(key, trusted, size)
         centre_m = np.bincount(key, trusted * residual_m, size) / np.maximum(mass, 1e-100)
-        apart = (residual_m - centre_m[key]) ** 2 * weight
+        apart = (residual_m - centre_m.astype(np.float32)[key]) ** 2 * weight
         if len(apart):
             scale2 = max(float(np.median(apart)) / CHI2_MEDIAN, 1.0)
-        trusted = weight / (1 + apart / (CAUCHY**2 * scale2))
+        trusted = weight / (1 + apart / np.float32(CAUCHY**2 * scale2))
     mass = np.maximum(np.bincount(key, trusted, size), 1e-100)
     variance_m2 = scale2 * np.bincount(key, trusted**2 / weight, size) / mass**2
     return centre_m, variance_m2, np.bincount(key, minlength=size).astype(np.float64)

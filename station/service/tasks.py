@@ -43,6 +43,7 @@ from station.science.adjustment import Adjustment
 from station.science.grid import Gridder
 from station.science.outlook import Outlook
 from station.science.terrain import nodes_for
+from station.service.child import give_back
 from station.service.content import held_still, sha256_of
 from station.service.gather import Gathered, gather
 from station.service.inbox import Arrival
@@ -159,6 +160,7 @@ def process(
         epoch = _measure(
             site, arrival, scan_sha256, reference, progress, rehearsal=False, wait_for_weather=young
         )
+    give_back()
     written = _same_as(series, epoch) or store.write_epoch(series, epoch, newer_than=past.revision)
     return Outcome(
         start_utc_s=epoch.start_s,
@@ -226,13 +228,14 @@ def _measure(
     if levelled is not None and levelled[1].refused > MOST_REFUSED:
         levelled = None
     unknown = levelled[1].shared() if levelled is not None else gathered.unknown
+    doubts, late = _log_against_ground(levelled, reference)
+    give_back()
     measured = measure(gridder, gathered.setup, unknown, outlook, levelled)
     progress()
     numbers = _numbers(measured, gathered, reader.header.point_count)
     if levelled is not None and outlook is not None:
         numbers |= stable_figures(measured, outlook) | {"change_step": levelled[1].change_step_m}
         numbers |= dict(zip(SLACK, levelled[1].slack_m2, strict=True))
-    doubts, late = _log_against_ground(levelled, reference)
     word, reason = verdict.judge(
         flag,
         [*gathered.lacking, *doubts],
