@@ -9,6 +9,7 @@ import netCDF4
 import numpy as np
 
 from station.archive.layout import Series, strings
+from station.archive.rasters import around
 from station.archive.reference import open_reference
 from station.archive.store import Row, rows
 from station.errors import StoreError
@@ -69,6 +70,7 @@ class Aggregates:
         self._series = series
         self._references: dict[str | None, Reference] = {}
         self._felt: tuple[Held, Bools, Sensitivities] | None = None  # the last, asked for again by the median
+        self._unknown: tuple[Row, Shared] | None = None  # of the last epoch, whose areas come one by one
 
     def reference(self, version: str | None = None) -> Reference:
         """Return a surface that change is measured from, the newest or a version.
@@ -111,12 +113,12 @@ class Aggregates:
         """
         held = self._held(cells, row, other)
         chosen = seen_in_all(held, cells)
-        seen = chosen[cells]
+        box = _box(cells, 0)
+        seen = chosen[box][cells[box]]
         if not seen.any():
             return AreaChange(np.nan, np.nan, np.nan, np.nan, 0.0)
         change_m = held[0].change_m[seen] - (0.0 if other is None else held[1].change_m[seen])
         random_m2 = self._random(held, chosen, seen)
-        box = _box(cells, 0)
         around_m, noise_m2 = np.full(cells[box].shape, np.nan), np.zeros(cells[box].shape)
         around_m[chosen[box]], noise_m2[chosen[box]] = change_m, np.sum(random_m2, axis=0)
         weights, reach = area_weights(cells[box], chosen[box])
@@ -265,17 +267,24 @@ class Aggregates:
             change_m, random_m = (cell_values(file[name], row.index, cells) for name in (CHANGE, RANDOM))
             scanner = tuple(float(np.ma.filled(file[name][row.index], np.nan)) for name in SCANNER)
             joint = str(file["adjustment"][row.index]) == "joint"
-            if "parameter_name" not in file.variables or not np.isfinite(scanner).all():
-                return Held(change_m, random_m, None, scanner, reference, joint, row)
+            unknown = self._unknown_in(file, row, scanner)
+        return Held(change_m, random_m, unknown, scanner, reference, joint, row)
+
+    def _unknown_in(self, file: netCDF4.Dataset, row: Row, scanner: tuple[float, ...]) -> Shared | None:
+        """Read what the cells of an epoch share, the same for any of them; None where it does not say."""
+        if "parameter_name" not in file.variables or not np.isfinite(scanner).all():
+            return None
+        if self._unknown is None or self._unknown[0] != row:
             file.set_auto_chartostring(False)
             names, units = (tuple(strings(np.ma.getdata(file[name][:]))) for name in PARAMETER)
             estimate, covariance, noise, *change = (
                 np.ma.filled(file[name][row.index].astype(np.float64), 0.0)  # what other epochs alone name
                 for name in (*SHARED, *(CHANGE_ERRORS if set(CHANGE_ERRORS) <= set(file.variables) else ()))
             )
-        found = Shared(names, units, estimate, covariance, noise, ChangeErrors(*change) if change else None)
-        unknown = by_names(self._basis(scanner)[0], found)
-        return Held(change_m, random_m, unknown, scanner, reference, joint, row)
+            change_errors = ChangeErrors(*change) if change else None
+            found = Shared(names, units, estimate, covariance, noise, change_errors)
+            self._unknown = row, by_names(self._basis(scanner)[0], found)
+        return self._unknown[1]
 
     def _basis(self, scanner: tuple[float, ...]) -> tuple[Basis, tuple[float, float, float]]:
         """Return the parameters of a scanner and where it stood."""
@@ -304,8 +313,8 @@ def common_of(held: list[Held]) -> Floats | None:
 
 def seen_in_all(held: list[Held], cells: Bools) -> Bools:
     """Tell which of the cells (ny, nx) have a change in every epoch, and a reference."""
-    chosen = cells.copy()
-    chosen[cells] = np.logical_and.reduce(
+    chosen, box = np.zeros(cells.shape, np.bool_), _box(cells, 0)
+    chosen[box][cells[box]] = np.logical_and.reduce(
         [np.isfinite(one.change_m) & np.isfinite(one.reference.elevation_m[cells]) for one in held]
     )
     return chosen
@@ -322,10 +331,8 @@ def cell_values(variable: Any, index: int, cells: Bools) -> Floats:  # noqa: ANN
 
 def _box(cells: Bools, margin: int) -> tuple[slice, slice]:
     """Rows and columns that hold the chosen cells (ny, nx), and so many beyond."""
-    rows, columns = (np.flatnonzero(cells.any(axis=axis)) for axis in (1, 0))
-    if not len(rows):
-        return slice(0, 1), slice(0, 1)
+    rows, columns = around(cells)
     return (
-        slice(max(rows[0] - margin, 0), rows[-1] + 1 + margin),
-        slice(max(columns[0] - margin, 0), columns[-1] + 1 + margin),
+        slice(max(rows.start - margin, 0), rows.stop + margin),
+        slice(max(columns.start - margin, 0), columns.stop + margin),
     )

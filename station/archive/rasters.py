@@ -78,7 +78,13 @@ def _deflated(size: tuple[int, int], band: Array) -> dict[int, bytes]:
     return packed
 
 
-def _around(chosen: Any) -> slice:  # noqa: ANN401 - numpy has no type for it
+def around(cells: Array) -> tuple[slice, slice]:
+    """Return the rows and columns that hold the chosen cells (ny, nx); the first where there is none."""
+    rows = _span(np.asarray(cells.any(axis=1)))
+    return rows, _span(np.asarray(cells[rows].any(axis=0)))  # of a few rows, for along columns it takes long
+
+
+def _span(chosen: Array) -> slice:
     """Return where the chosen (n,) lie, and the first where there is none."""
     there = np.flatnonzero(chosen)
     return slice(int(there[0]), int(there[-1]) + 1) if len(there) else slice(0, 1)
@@ -138,7 +144,7 @@ class Raster:
     def __getitem__(self, rows: slice | tuple[slice, slice] | Array) -> Array:
         """Return some rows (r, nx), of some columns, or the chosen cells (n,) of a mask (ny, nx)."""
         if isinstance(rows, np.ndarray):
-            box = _around(rows.any(axis=1)), _around(rows.any(axis=0))
+            box = around(rows)
             return np.asarray(self[box][rows[box]])
         rows, columns = rows if isinstance(rows, tuple) else (rows, slice(None))
         (first, stop, step), (left, right, _) = rows.indices(self.shape[0]), columns.indices(self.shape[1])
