@@ -9,7 +9,7 @@ import pytest
 
 from station.pipeline import Pose, Told, gridder_for, level, measure, on_reference, outlook_on, survey
 from station.quantities import Air, Grid, Habits, Quality, Reference, Scanner, Setup, Shots, Tilt
-from station.science import budget, outlook
+from station.science import budget, measuring, outlook
 from station.science.air import air_correction
 from station.science.grid import Stack
 from station.science.inclination import LEVEL
@@ -205,6 +205,24 @@ def test_blocks_and_order_change_nothing():
         one, other = (getattr(measured, name) for measured in made)
         assert np.array_equal(one, other, equal_nan=True), name
     assert np.array_equal(made[0].uncertainty_m, made[1].uncertainty_m, equal_nan=True)
+
+
+@pytest.mark.parametrize("rows", [7, 149, 297, 299])
+def test_bands_change_nothing(rows, monkeypatch):
+    """Cells beyond a reference that knows every other block: their slopes need rows of the bands beside."""
+    known = truth()
+    row, column = np.indices(GRID.shape)
+    surface_m = np.where((row // 20 + column // 20) % 2, np.nan, known.elevation_m)
+    shots = shots_at(*spots(60_000, 3), seed=3)
+    made = []
+    for height in (measuring.BAND_ROWS, rows):
+        monkeypatch.setattr(measuring, "BAND_ROWS", height)
+        made.append(scanned(shots, Reference.given(GRID, "some", surface_m))[0])
+    beyond = (made[0].quality & Quality.OUTSIDE_REFERENCE) > 0
+    assert beyond.mean() > 0.2
+    for name in ("elevation_m", "change_m", "uncertainty_m", "quality"):
+        one, other = (getattr(measured, name) for measured in made)
+        assert np.array_equal(one, other, equal_nan=True), name
 
 
 def test_a_real_change_is_found_and_flagged():

@@ -230,7 +230,7 @@ def _say(there: Connection, kind: str, value: object) -> None:
     """Tell the parent; where it is gone, end: the work was for it, and nobody is to read of it in the log."""
     try:
         there.send((kind, value))
-    except BrokenPipeError:
+    except ConnectionError:
         os._exit(_ALONE)
 
 
