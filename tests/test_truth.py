@@ -107,6 +107,7 @@ def test_filtered_inclination_takes_two_thirds_of_the_drift_away(tmp_path):
     assert rms_m[1] > 0.1
 
 
+@pytest.mark.slow
 def test_sigma_holds_what_the_log_cannot_know(tmp_path):
     """Filtered log alone, all errors on: the error is within two sigma in 90 % of boxes."""
     simulate(tmp_path / "station", CALM)

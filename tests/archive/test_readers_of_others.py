@@ -205,7 +205,7 @@ def replaced_again_and_again(series):
         writer.wait()
 
 
-@pytest.mark.parametrize("engine", ["netcdf4", "h5netcdf"])
+@pytest.mark.parametrize("engine", ["netcdf4", pytest.param("h5netcdf", marks=pytest.mark.slow)])
 def test_xarray_while_the_series_is_replaced(built, series, engine):
     with replaced_again_and_again(series):
         for _ in range(6):

@@ -209,7 +209,7 @@ def stated(put, under, cells, on):
         yield measure, math.sqrt(full_m6), math.sqrt(volume.independent_variance(told, own_m2))
 
 
-@pytest.mark.parametrize("on", [True, False])
+@pytest.mark.parametrize("on", [True, pytest.param(False, marks=pytest.mark.slow)])
 def test_sigma_against_simulated_scans(scene, on):
     ground, under = scene
     cells = np.zeros(FIELD.shape, bool)
