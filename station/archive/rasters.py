@@ -151,6 +151,7 @@ class Raster:
         height = self._size[0]
         bands = range(first - first % height, stop, height)
         held = [self._band(top, left, right)[max(first - top, 0) : stop - top] for top in bands]
+        held = held or [self._band(0, left, right)[:0]]  # no rows, asked for where a band begins
         return (held[0] if len(held) == 1 else np.concatenate(held))[::step]
 
     def __array__(self, dtype: Any = None, copy: bool | None = None) -> Array:  # noqa: ANN401, FBT001 - numpy's

@@ -119,10 +119,9 @@ class _Heights:
         """
         wanted = slice(max(rows.start - MARGIN_ROWS, 0), min(rows.stop + MARGIN_ROWS, self._gridder.grid.ny))
         held_m = self._height_m[wanted.start - self._rows.start :]
-        if wanted.stop > self._rows.stop:
-            held_m = np.concatenate([held_m, self._read(slice(self._rows.stop, wanted.stop))])
-        self._rows, self._height_m = wanted, held_m
-        return held_m, slice(rows.start - wanted.start, rows.stop - wanted.start)
+        self._height_m = np.concatenate([held_m, self._read(slice(self._rows.stop, wanted.stop))])
+        self._rows = wanted
+        return self._height_m, slice(rows.start - wanted.start, rows.stop - wanted.start)
 
     def _read(self, rows: slice) -> Floats32:
         gridder, outlook = self._gridder, self._outlook

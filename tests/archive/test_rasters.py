@@ -80,7 +80,7 @@ def test_rows_are_those_of_the_whole(tmp_path):
     assert np.array_equal(np.asarray(raster), given, equal_nan=True)
     chosen = np.zeros(GRID.shape, bool)
     nothing, chosen[125:140, 7:150:3] = chosen.copy(), True
-    rows = slice(0, 10), slice(120, 260), slice(290, 400), slice(5, 290, 3)
+    rows = slice(0, 10), slice(120, 260), slice(290, 400), slice(5, 290, 3), slice(128, 128), slice(300, 300)
     boxes = (
         (slice(120, 130), slice(5, 140)),
         (slice(131, 300), slice(128, 210)),
