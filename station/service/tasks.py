@@ -223,6 +223,7 @@ def _measure(
         raise ScanError("no point falls on the grid: wrong scans.frame, SOP, CRS or units?")
     progress()
     levelled = levelled_to(site, gridder, gathered, outlook)
+    give_back()
     flag = flag_of(site, start.timestamp(), end.timestamp())
     found = levelled[1] if levelled else None
     if levelled is not None and levelled[1].refused > MOST_REFUSED:
