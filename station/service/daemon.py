@@ -151,7 +151,7 @@ class Daemon:
             self._metrics.write()
         if Wake.JOINED in self._due:
             self._due.discard(Wake.JOINED)
-            worker.note_joined()
+            self._spared(Wake.JOINED, worker.note_joined)
         self._looked_s = time.monotonic()
         listing = inbox.look()
         self._note_new(listing.new)
@@ -172,7 +172,7 @@ class Daemon:
         except StationError:
             self._is_recovered = False  # it may have been broken off between file and journal
             raise
-        except Exception as bug:  # the one place: a bug that one scan wakes must not keep the others out
+        except Exception as bug:  # one that a scan wakes must not keep the others out
             log.exception(logfmt(scan=arrival.name, verdict="later", reason="a bug: please report it"))
             self._opened_journal().later(arrival.name, f"a bug: {type(bug).__name__}: {bug}"[:500])
 
@@ -181,7 +181,17 @@ class Daemon:
         for wake, tidy in ((Wake.JOIN, worker.begin_joining), (Wake.SWEEP, worker.sweep)):
             if wake in self._due and not self._is_stopping():
                 self._due.discard(wake)
-                tidy()
+                self._spared(wake, tidy)
+
+    @staticmethod
+    def _spared(what: Wake, tidy: Callable[[], None]) -> None:
+        """Do what no scan waits for: a bug there must not keep the scans out."""
+        try:
+            tidy()
+        except StationError:
+            raise
+        except Exception:
+            log.exception(logfmt(failed=what.name.lower(), reason="a bug: please report it"))
 
     # ---- opening, reloading
 

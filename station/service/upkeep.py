@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping
+from contextlib import suppress
 from datetime import UTC, datetime
 from pathlib import Path
 
@@ -76,7 +77,8 @@ def join_beside(
     progress: Progress,
 ) -> Checksums:
     """Do as `join_epochs`, and let the scans that are taken meanwhile go first."""
-    os.nice(LEAST_URGENT)
+    with suppress(OSError):  # where that is forbidden it is as urgent as they are
+        os.nice(LEAST_URGENT)
     return join_epochs(site, known, progress, in_backlog=in_backlog)
 
 

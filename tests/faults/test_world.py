@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import ctypes.util
 import os
 import shutil
 import stat
 import subprocess
+import sys
 import tempfile
 from pathlib import Path
 
@@ -206,3 +208,22 @@ def test_a_clock_that_jumps(make, quiet, dice):
         harness.nap(dice.uniform(0.0, 0.4))
     station.clock.write_text("0")
     finish(station, quiet())
+
+
+# ---- its unit
+
+
+def test_the_unit_leaves_the_service_the_system_calls_it_needs(make, quiet, request):
+    """Also for what is not of every scan: a closed day is joined by a process that is less urgent."""
+    unit = request.config.rootpath / "systemd/station@.service"
+    if shutil.which("systemd-analyze") is None or ctypes.util.find_library("seccomp") is None:
+        pytest.skip("systemd-analyze or libseccomp is not installed (Debian: systemd)")
+    station = make(cold=True)
+    station.before = [sys.executable, str(Path(harness.__file__).with_name("confined.py")), str(unit)]
+    station.drop(*ALL)
+    station.finish(*ALL)
+    station.start()  # which joins what is closed
+    joined = station.folder / "data/days/2025/07"
+    station.await_(lambda: joined.exists() or "Error" in station.log())
+    finish(station, quiet())
+    assert joined.exists()

@@ -34,6 +34,8 @@ class FakeWorker:
 
     def begin_joining(self):
         self.say("join")
+        if (self.site.station.data / "bug").exists():
+            raise ZeroDivisionError("division by zero")
 
     def note_joined(self):
         pass

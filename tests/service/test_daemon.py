@@ -178,6 +178,19 @@ def test_bad_scans_and_bugs_take_nothing_down(write_site, start):
     assert "ZeroDivisionError" in service.log()
 
 
+def test_a_bug_in_what_no_scan_waits_for_is_told_and_survived(write_site, start):
+    path = write_site(settle_s=0.0)
+    (path.parent / "data").mkdir(exist_ok=True)
+    (path.parent / "data" / "bug").touch()
+    service = start(path)
+    wait_for(lambda: "sweep" in did(path))
+    assert did(path) == ["recover", "join", "sweep"]
+    assert 'failed=join reason="a bug: please report it"' in service.log()
+    drop(path, FIRST)
+    wait_for(lambda: stored(path) == [FIRST])
+    assert service.end() == 0
+
+
 def test_sigterm_lets_the_scan_be_done_or_gives_it_up_after_the_grace(write_site, start):
     path = write_site(settle_s=0.0)
     drop(path, "slow.laz")
