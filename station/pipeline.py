@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
@@ -105,6 +105,12 @@ class Told:
     assumed_rad: Floats
     log: LineLog | None
     weather_known: bool
+
+    def against(self, reference: Shared | None) -> Told:
+        """Return the same of what a scan differs by from a reference, of which this is not known."""
+        if reference is None or self.log is None:
+            return self
+        return replace(self, log=self.log.against(self.of, reference))
 
 
 def level(gridder: Gridder, setup: Setup, told: Told, outlook: Outlook) -> Adjustment:

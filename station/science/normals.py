@@ -24,6 +24,7 @@ from station.science.shared import (
     lines_from_knots,
     rows_at_knots,
     rows_at_lines,
+    tilt_along,
 )
 
 
@@ -33,7 +34,27 @@ class LineLog:
 
     lean_rad: Floats  # (lines,) along the line of sight
     weight: Floats  # (lines,) 1 / rad², nought where there is none
-    faults: Floats  # (lines, f) effect of one sigma of each of its common errors [rad]
+    faults: Floats  # (lines, f) effect of one sigma of each common error of its sensor [rad]
+    apart: Floats | None = None  # (lines, k) the same of the lean of what the scan is measured from
+
+    @property
+    def common(self) -> Floats:
+        """Effect of one sigma of each common error (lines, f + k) [rad]."""
+        return self.faults if self.apart is None else np.hstack([self.faults, self.apart])
+
+    def against(self, of: Basis, reference: Shared) -> LineLog:
+        """Return the same for the lean against a reference, whose own lean the sensor does not feel.
+
+        That is taken as independent of the difference, as where scans may lean by much more; of its patterns
+        those count that exceed the noise of the log.
+        """
+        leaning = np.r_[:2, len(GLOBAL) : len(GLOBAL) + of.lean_count]
+        felt = np.hstack([tilt_along(of.line_azimuth_rad), interpolated(of, np.eye(of.lean_count))])
+        values, vectors = np.linalg.eigh(reference.covariance[np.ix_(leaning, leaning)])
+        effects = felt @ (vectors * np.sqrt(np.maximum(values, 0.0)))
+        patterns, sizes, _ = linalg.svd(effects, full_matrices=False)
+        seen = sizes**2 * self.weight.max(initial=0.0) > 1
+        return replace(self, apart=patterns[:, seen] * sizes[seen])
 
 
 @dataclass(frozen=True)
@@ -79,7 +100,7 @@ class Reduced:
 
 
 class Normals:
-    """Normal equations of the state by knots, the log's own faults and the change: m unknowns.
+    """Normal equations of the state by knots, the common errors of the log and the change: m unknowns.
 
     Each line's own lean is an unknown too, which is taken out at once.
     """
@@ -96,9 +117,9 @@ class Normals:
         seen, state = _design(felt), len(before.knots)
         self._patches = len(felt)
         self._lean, self._line, self._wanted = felt.lean, felt.line, wanted_m
-        faults = 0 if log is None else log.faults.shape[1]
-        self.size = state + faults
-        self._design = sparse.hstack([seen, sparse.csr_array((len(felt), faults)), field], format="csr")
+        common = 0 if log is None else log.common.shape[1]
+        self.size = state + common
+        self._design = sparse.hstack([seen, sparse.csr_array((len(felt), common)), field], format="csr")
         self._log_weight = np.empty(0)
         if log is not None:
             self._add(log, interpolated(of, np.eye(of.lean_count)), of.line_azimuth_rad)
@@ -114,9 +135,9 @@ class Normals:
     def _add(self, log: LineLog, knots: Floats, azimuth_rad: Floats) -> None:
         """Add what the log says of each line, as further observations."""
         felt = np.zeros((len(knots), self._design.shape[1]))
-        felt[:, 0], felt[:, 1] = np.cos(azimuth_rad), -np.sin(azimuth_rad)
+        felt[:, :2] = tilt_along(azimuth_rad)
         felt[:, len(GLOBAL) : len(GLOBAL) + knots.shape[1]] = knots
-        felt[:, self.size - log.faults.shape[1] : self.size] = log.faults
+        felt[:, self.size - log.common.shape[1] : self.size] = log.common
         self._design = sparse.vstack([self._design, sparse.csr_array(felt)], format="csr")
         self._lean = np.concatenate([self._lean, np.ones(len(knots))])
         self._line = np.concatenate([self._line, np.arange(len(knots))])

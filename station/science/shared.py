@@ -375,14 +375,22 @@ def interpolated(of: Basis, at_knots: Floats) -> Floats:
     return np.asarray(at_knots[before] * (1 - share) + at_knots[(before + 1) % of.lean_count] * share)
 
 
-def against(unknown: Shared, common: Shared | None) -> Shared:
-    """Return what a scan leaves unknown against a reference that does not know `common` itself.
+def tilt_along(azimuth_rad: Floats) -> Floats:
+    """Lean along lines of sight (lines, 2) for a tilt of one about east, and about north."""
+    return np.stack([np.cos(azimuth_rad), -np.sin(azimuth_rad)], axis=-1)
 
-    A scanner that has been moved feels other parameters; then the reference counts as unsure as the scan.
+
+def against(unknown: Shared, common: Shared | None) -> Shared:
+    """Return what a scan leaves unknown against a reference that does not know `common` itself."""
+    return unknown if common is None else unknown + as_felt(common, unknown)
+
+
+def as_felt(common: Shared, unknown: Shared) -> Shared:
+    """Return what a reference does not know itself by the parameters of a scan that leaves `unknown`.
+
+    A scanner that has been moved feels others; then the reference counts as unsure as the scan.
     """
-    if common is None:
-        return unknown
-    return unknown + (common if common.names == unknown.names else unknown)
+    return common if common.names == unknown.names else unknown
 
 
 def by_names(of: Basis, unknown: Shared) -> Shared:

@@ -42,6 +42,7 @@ from station.science import ground, sensor, verdict
 from station.science.adjustment import Adjustment
 from station.science.grid import Gridder
 from station.science.outlook import Outlook
+from station.science.shared import as_felt
 from station.science.terrain import nodes_for
 from station.service.child import give_back
 from station.service.content import held_still, sha256_of
@@ -286,7 +287,10 @@ def levelled_to(
     """Adjust a scan to the reference, where the site asks for it and there is one to adjust to."""
     if not site.adjusts or gathered.told is None or outlook is None:
         return None
-    return gathered.told, level(gridder, gathered.setup, gathered.told, outlook)
+    told, common = gathered.told, outlook.reference.shared
+    if common is not None and gathered.unknown is not None:
+        told = told.against(as_felt(common, gathered.unknown))
+    return told, level(gridder, gathered.setup, told, outlook)
 
 
 def _log_against_ground(
