@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
@@ -106,19 +106,16 @@ class Told:
     log: LineLog | None
     weather_known: bool
 
-    def against(self, reference: Shared | None) -> Told:
-        """Return the same of what a scan differs by from a reference, of which this is not known."""
-        if reference is None or self.log is None:
-            return self
-        return replace(self, log=self.log.against(self.of, reference))
-
 
 def level(gridder: Gridder, setup: Setup, told: Told, outlook: Outlook) -> Adjustment:
     """Estimate the state of the scanner from a scan on its grid."""
     habits, before = outlook.reference.habits, outlook.reference.shared
     state = prior.beforehand(told.of, told.lines, habits, weather_known=told.weather_known)
     patches = collect(told.of, _cells(gridder, outlook), setup.scanner.range_max_m)
-    return adjust(patches, told.assumed_rad, state.against(before), told.log)
+    log = told.log
+    if log is not None and before is not None:
+        log = log.against(told.of, state.of_reference(before))
+    return adjust(patches, told.assumed_rad, state.against(before), log)
 
 
 def _cells(gridder: Gridder, outlook: Outlook) -> Iterator[Cells]:

@@ -15,7 +15,6 @@ from station.quantities import Bools, Floats, Habits
 from station.science.adjustment import Adjustment
 from station.science.normals import LineLog
 from station.science.prior import BIASES, Lines, motion
-from station.science.shared import GLOBAL, tilt_along
 
 CHANCE = 1e-5  # that a log within its habits looks as far off
 SEEN = 1e-3  # least share of the best seen combination of faults
@@ -51,40 +50,36 @@ class Lateness:
 class Expected:
     """What a log says (lines,), in the order of time, against what the ground alone expects of it.
 
-    `precision` (lines, lines) is the inverse covariance of the difference, the log's common errors included;
-    `by_noise` (lines,) the difference over the covariance of these and the log's noise alone.
+    `precision` (lines, lines) is the inverse covariance of the difference, the log's faults included;
+    `by_noise` (lines,) the difference over the covariance of log noise and faults alone.
     """
 
     lines: Lines
     log_rad: Floats
-    faults: Floats  # (lines, f) effect of one sigma of each of the sensor's [rad]
+    faults: Floats  # (lines, f) effect of one sigma of each [rad]
     ground_rad: Floats
     precision: Floats
     by_noise: Floats
 
 
 def expected(lines: Lines, log: LineLog, found: Adjustment) -> Expected:
-    """Take the log out of an adjustment again.
+    """Take the log out of an adjustment again that was held to it.
 
-    With x, C adjusted, R the covariance of noise and faults and r = log - H x, the difference to the estimate
-    without the log is R (R - H C Hᵀ)⁻¹ r: the formula of leave-one-out residuals, for all lines at once.
+    With m, K what the log should have said and the covariance of that, R the covariance of noise and faults
+    and r = log - m, the difference to what is expected without the log is R (R - K)⁻¹ r: the formula of
+    leave-one-out residuals, for all lines at once.
     """
     order = np.argsort(lines.time_s)
     order = order[log.weight[order] > 0]
-    state = len(GLOBAL) + order
-    azimuth_rad = found.of.line_azimuth_rad[order]
-    tilt = tilt_along(azimuth_rad)
-    covariance = found.covariance
-    across = tilt @ covariance[:2, state]
-    known = covariance[np.ix_(state, state)] + across + across.T + tilt @ covariance[:2, :2] @ tilt.T
-    left = log.lean_rad[order] - tilt @ found.estimate[:2] - found.estimate[state]
-    weight, common = log.weight[order], log.common[order]
-    weighted = weight[:, None] * common
-    inner = np.linalg.cholesky(np.eye(common.shape[1]) + common.T @ weighted)
-    together = linalg.solve_triangular(inner, weighted.T, lower=True).T
+    known = found.unknown.along_sight(log)[np.ix_(order, order)]
+    left = log.lean_rad[order] - found.logged_rad[order]
+    weight, faults = log.weight[order], log.faults[order]
+    weighted = weight[:, None] * faults
+    inner = np.linalg.cholesky(np.eye(faults.shape[1]) + faults.T @ weighted)
+    common = linalg.solve_triangular(inner, weighted.T, lower=True).T
 
     def over_noise(values: Floats) -> Floats:
-        return np.asarray((weight * values.T).T - together @ (together.T @ values))
+        return np.asarray((weight * values.T).T - common @ (common.T @ values))
 
     precision = over_noise(np.eye(len(order)) - over_noise(known).T)
     by_noise = over_noise(left)
@@ -92,7 +87,7 @@ def expected(lines: Lines, log: LineLog, found: Adjustment) -> Expected:
     return Expected(
         Lines(lines.azimuth_rad[order], lines.time_s[order]),
         log.lean_rad[order],
-        log.faults[order],
+        faults,
         log.lean_rad[order] - linalg.cho_solve(factor, by_noise),
         precision,
         by_noise,

@@ -381,16 +381,13 @@ def tilt_along(azimuth_rad: Floats) -> Floats:
 
 
 def against(unknown: Shared, common: Shared | None) -> Shared:
-    """Return what a scan leaves unknown against a reference that does not know `common` itself."""
-    return unknown if common is None else unknown + as_felt(common, unknown)
+    """Return what a scan leaves unknown against a reference that does not know `common` itself.
 
-
-def as_felt(common: Shared, unknown: Shared) -> Shared:
-    """Return what a reference does not know itself by the parameters of a scan that leaves `unknown`.
-
-    A scanner that has been moved feels others; then the reference counts as unsure as the scan.
+    A scanner that has been moved feels other parameters; then the reference counts as unsure as the scan.
     """
-    return common if common.names == unknown.names else unknown
+    if common is None:
+        return unknown
+    return unknown + (common if common.names == unknown.names else unknown)
 
 
 def by_names(of: Basis, unknown: Shared) -> Shared:

@@ -42,7 +42,6 @@ from station.science import ground, sensor, verdict
 from station.science.adjustment import Adjustment
 from station.science.grid import Gridder
 from station.science.outlook import Outlook
-from station.science.shared import as_felt
 from station.science.terrain import nodes_for
 from station.service.child import give_back
 from station.service.content import held_still, sha256_of
@@ -287,19 +286,16 @@ def levelled_to(
     """Adjust a scan to the reference, where the site asks for it and there is one to adjust to."""
     if not site.adjusts or gathered.told is None or outlook is None:
         return None
-    told, common = gathered.told, outlook.reference.shared
-    if common is not None and gathered.unknown is not None:
-        told = told.against(as_felt(common, gathered.unknown))
-    return told, level(gridder, gathered.setup, told, outlook)
+    return gathered.told, level(gridder, gathered.setup, gathered.told, outlook)
 
 
 def _log_against_ground(
     levelled: tuple[Told, Adjustment] | None, reference: Reference | None
 ) -> tuple[list[str], dict[str, float]]:
     """Say what the ground has against a scan's log, and how late that is as the store keeps it."""
-    if levelled is None or reference is None or levelled[0].log is None:
+    if levelled is None or reference is None or (log := levelled[1].log) is None:
         return [], {}
-    expected = sensor.expected(levelled[0].lines, levelled[0].log, levelled[1])
+    expected = sensor.expected(levelled[0].lines, log, levelled[1])
     doubts = sensor.off_habit(expected)
     late = sensor.lateness(expected, reference.habits, len(reference.scan_ids))
     if late is None:
