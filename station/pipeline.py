@@ -112,7 +112,10 @@ def level(gridder: Gridder, setup: Setup, told: Told, outlook: Outlook) -> Adjus
     habits, before = outlook.reference.habits, outlook.reference.shared
     state = prior.beforehand(told.of, told.lines, habits, weather_known=told.weather_known)
     patches = collect(told.of, _cells(gridder, outlook), setup.scanner.range_max_m)
-    return adjust(patches, told.assumed_rad, state.against(before), told.log)
+    log = told.log
+    if log is not None and before is not None:
+        log = log.against(told.of, state.of_reference(before))
+    return adjust(patches, told.assumed_rad, state.against(before), log)
 
 
 def _cells(gridder: Gridder, outlook: Outlook) -> Iterator[Cells]:

@@ -28,7 +28,14 @@ from station.science.normals import (
     root_of,
 )
 from station.science.patches import CHI2_MEDIAN, STRETCH_M, Kind, Patches
-from station.science.shared import GLOBAL, LEAN_KNOT_RAD, Basis, Sensitivities, rows_at_lines
+from station.science.shared import (
+    GLOBAL,
+    LEAN_KNOT_RAD,
+    Basis,
+    Sensitivities,
+    rows_at_lines,
+    tilt_along,
+)
 
 ROUNDS = 8
 SETTLED_M = 0.0001  # a round that moves the patches by less is the last
@@ -60,7 +67,8 @@ class Adjustment:
 
     `change_step_m` is one sigma of the change between its knots that the moving ground shows;
     `stable_weight` (patches,) how far each stable patch was trusted; `slack_m2` how loosely moving and stable
-    cells hold it (see `held`).
+    cells hold it (see `held`); `log` is what was held to it, `logged_rad` (lines,) what that should have said
+    but for its own faults.
     """
 
     of: Basis
@@ -69,6 +77,8 @@ class Adjustment:
     change_step_m: float
     stable_weight: Floats
     slack_m2: tuple[float, float]
+    log: LineLog | None
+    logged_rad: Floats
 
     def effect(self, felt: Sensitivities) -> Reals:
         """Effect of the estimated state on heights (n,) [m], to be taken off."""
@@ -141,7 +151,8 @@ def adjust(patches: Patches, assumed_rad: Floats, before: Beforehand, log: LineL
     heights = normals.heights(len(of.names))
     unknown = Unknown(of, reduced.own, reduced.felt, solved.whole(), solved.precision, heights, pattern)
     held_by = slacks(patches, weight, normals, unknown)
-    return Adjustment(of, solved.by_line(of), unknown, solved.step_m, trust[~moving], held_by)
+    state, logged_rad = solved.by_line(of), solved.logged_rad(of, log)
+    return Adjustment(of, state, unknown, solved.step_m, trust[~moving], held_by, log, logged_rad)
 
 
 @dataclass(frozen=True)
@@ -246,6 +257,15 @@ class _Solved:
         state = rows_at_lines(of, self.estimate[: len(of.names), None])[:, 0]
         state[len(GLOBAL) : len(GLOBAL) + of.line_count] += self.reduced.own_rad(self.estimate)
         return np.asarray(state)
+
+    def logged_rad(self, of: Basis, log: LineLog | None) -> Floats:
+        """What a log should say of each line (lines,) [rad], but for its own faults."""
+        state = self.by_line(of)
+        felt = tilt_along(of.line_azimuth_rad) @ state[:2]
+        felt += state[len(GLOBAL) : len(GLOBAL) + of.line_count]
+        if log is not None and log.apart is not None:
+            felt += log.apart.lean_rad @ self.estimate[log.beside(of)]
+        return np.asarray(felt)
 
     def whole(self) -> Factored:
         """Return the normal equations with the prior that was chosen."""

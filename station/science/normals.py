@@ -24,7 +24,16 @@ from station.science.shared import (
     lines_from_knots,
     rows_at_knots,
     rows_at_lines,
+    tilt_along,
 )
+
+
+@dataclass(frozen=True)
+class Apart:
+    """What a reference leans by, which no log feels: some patterns, each of one sigma."""
+
+    lean_rad: Floats  # (lines, k) along the line of sight
+    state: Floats  # (p, k) all of the reference's state that goes with it, by knots
 
 
 @dataclass(frozen=True)
@@ -34,6 +43,30 @@ class LineLog:
     lean_rad: Floats  # (lines,) along the line of sight
     weight: Floats  # (lines,) 1 / rad², nought where there is none
     faults: Floats  # (lines, f) effect of one sigma of each of its common errors [rad]
+    apart: Apart | None = None  # where it is set against the lean from a reference
+
+    @property
+    def common(self) -> Floats:
+        """Effect of one sigma of what it has in common (lines, f + k) [rad]."""
+        return self.faults if self.apart is None else np.hstack([self.faults, self.apart.lean_rad])
+
+    def beside(self, of: Basis) -> slice:
+        """Which of an adjustment's unknowns are patterns of the reference's lean."""
+        first = len(of.names) + self.faults.shape[1]
+        return slice(first, first + (0 if self.apart is None else self.apart.lean_rad.shape[1]))
+
+    def against(self, of: Basis, reference: Floats) -> LineLog:
+        """Return the same against the state from a reference, whose own has a covariance (p, p).
+
+        The sensor does not feel how that leans, of which the patterns count that exceed a line's noise.
+        """
+        values, vectors = np.linalg.eigh(reference)
+        root = vectors * np.sqrt(np.maximum(values, 0.0))
+        lean = interpolated(of, root[len(GLOBAL) : len(GLOBAL) + of.lean_count])
+        lean += tilt_along(of.line_azimuth_rad) @ root[:2]
+        patterns, sizes, turn = linalg.svd(lean, full_matrices=False)
+        seen = sizes**2 * self.weight.max(initial=0.0) > 1
+        return replace(self, apart=Apart(patterns[:, seen] * sizes[seen], root @ turn[seen].T))
 
 
 @dataclass(frozen=True)
@@ -51,9 +84,12 @@ class Beforehand:
         """Return the same for the difference to the state of the reference, which is wrong itself."""
         if reference is None:
             return self
-        if reference.names != self.of.names:  # the scanner has been moved: it is as unsure as a scan
-            return Beforehand(self.of, 2 * self.knots, self.own.twice())
-        return Beforehand(self.of, self.knots + reference.covariance, self.own)
+        own = self.own if reference.names == self.of.names else self.own.twice()
+        return Beforehand(self.of, self.knots + self.of_reference(reference), own)
+
+    def of_reference(self, reference: Shared) -> Floats:
+        """Covariance (p, p) of the state of a reference; once the scanner has been moved that of a scan."""
+        return reference.covariance if reference.names == self.of.names else self.knots
 
     def by_line(self) -> Floats:
         """Covariance (u, u) of globals, leans of lines, knots of refraction and lean across."""
@@ -79,7 +115,7 @@ class Reduced:
 
 
 class Normals:
-    """Normal equations of the state by knots, the log's own faults and the change: m unknowns.
+    """Normal equations of the state by knots, the common errors of the log and the change: m unknowns.
 
     Each line's own lean is an unknown too, which is taken out at once.
     """
@@ -96,27 +132,44 @@ class Normals:
         seen, state = _design(felt), len(before.knots)
         self._patches = len(felt)
         self._lean, self._line, self._wanted = felt.lean, felt.line, wanted_m
-        faults = 0 if log is None else log.faults.shape[1]
-        self.size = state + faults
-        self._design = sparse.hstack([seen, sparse.csr_array((len(felt), faults)), field], format="csr")
+        common = 0 if log is None else log.common.shape[1]
+        self.size = state + common
+        self._design = sparse.hstack([seen, sparse.csr_array((len(felt), common)), field], format="csr")
         self._log_weight = np.empty(0)
         if log is not None:
             self._add(log, interpolated(of, np.eye(of.lean_count)), of.line_azimuth_rad)
         self._prior = np.zeros((self._design.shape[1],) * 2)
-        self._prior[:state, :state] = Factored(before.knots).inverse()
         self._prior[range(state, self.size), range(state, self.size)] = 1.0
+        self._expect(before, log)
         self._own = before.own
         rows = np.arange(len(self._line))
         shape = of.line_count, len(rows)
         self._lines = sparse.csr_array((self._lean, (self._line, rows)), shape=shape)
         self._across = self._design.T.tocsr()
 
+    def _expect(self, before: Beforehand, log: LineLog | None) -> None:
+        """Say what is thought of the state beforehand.
+
+        It is a difference: together with the reference's own state, which is told by patterns, it is the
+        scan's, which has nothing to do with those.
+        """
+        knots, state = before.knots, len(before.knots)
+        if log is None or (apart := log.apart) is None:
+            self._prior[:state, :state] = Factored(knots).inverse()
+            return
+        beside = log.beside(before.of)
+        left = Factored(knots - apart.state @ apart.state.T).inverse()
+        tied = left @ apart.state
+        self._prior[:state, :state] = left
+        self._prior[:state, beside], self._prior[beside, :state] = tied, tied.T
+        self._prior[beside, beside] += apart.state.T @ tied
+
     def _add(self, log: LineLog, knots: Floats, azimuth_rad: Floats) -> None:
         """Add what the log says of each line, as further observations."""
         felt = np.zeros((len(knots), self._design.shape[1]))
-        felt[:, 0], felt[:, 1] = np.cos(azimuth_rad), -np.sin(azimuth_rad)
+        felt[:, :2] = tilt_along(azimuth_rad)
         felt[:, len(GLOBAL) : len(GLOBAL) + knots.shape[1]] = knots
-        felt[:, self.size - log.faults.shape[1] : self.size] = log.faults
+        felt[:, self.size - log.common.shape[1] : self.size] = log.common
         self._design = sparse.vstack([self._design, sparse.csr_array(felt)], format="csr")
         self._lean = np.concatenate([self._lean, np.ones(len(knots))])
         self._line = np.concatenate([self._line, np.arange(len(knots))])
@@ -183,14 +236,29 @@ class Unknown:
 
     def by_line(self) -> Floats:
         """Covariance (u, u) of the state."""
-        of = self.of
-        state, lines = len(of.names), slice(len(GLOBAL), len(GLOBAL) + of.line_count)
-        tied = rows_at_lines(of, np.eye(state, self.felt.shape[1]))
-        tied[lines] -= self.own.times(self.felt.toarray())
-        half = self.whole.half(tied.T)
+        half = self.whole.half(self._tied().T)
         covariance = half.T @ half
-        covariance[lines, lines] += self.own.times(np.eye(of.line_count))
+        covariance[self._lines, self._lines] += self.own.times(np.eye(self.of.line_count))
         return np.asarray(covariance)
+
+    def along_sight(self, log: LineLog) -> Floats:
+        """Covariance (lines, lines) of what a log feels, its own faults aside [rad²]."""
+        tied = self._tied()
+        felt = tilt_along(self.of.line_azimuth_rad) @ tied[:2] + tied[self._lines]
+        if log.apart is not None:
+            felt[:, log.beside(self.of)] += log.apart.lean_rad
+        half = self.whole.half(felt.T)
+        return np.asarray(half.T @ half + self.own.times(np.eye(self.of.line_count)))
+
+    @property
+    def _lines(self) -> slice:
+        return slice(len(GLOBAL), len(GLOBAL) + self.of.line_count)
+
+    def _tied(self) -> Floats:
+        """How the state (u, m) goes with the unknowns."""
+        tied = rows_at_lines(self.of, np.eye(len(self.of.names), self.felt.shape[1]))
+        tied[self._lines] -= self.own.times(self.felt.toarray())
+        return np.asarray(tied)
 
     def going_with(self, at_knots: Floats, by_line: Floats) -> tuple[Floats, Floats]:
         """Covariance of the unknowns (m,) and of the own leans (lines,) with what feels the state so.

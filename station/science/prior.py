@@ -12,7 +12,7 @@ from station.quantities import Floats, Habits, HeadTrack, Shared, Tilt
 from station.science.inclination import SENSOR_STEP_RAD, Cycle, Lean
 from station.science.leans import OwnLeans
 from station.science.normals import Beforehand, LineLog
-from station.science.shared import GLOBAL, LEAN_PER_REFRACTION, LINES_A_KNOT, Basis, by_knots
+from station.science.shared import GLOBAL, LEAN_PER_REFRACTION, LINES_A_KNOT, Basis, by_knots, tilt_along
 
 REFRACTION_MEMORY_RAD = math.radians(15.0)
 RANGE_SCALE_UNKNOWN_PPM = 4.0  # no weather: 5 K and 5 hPa off, 0.737 ppm/K, 0.290 ppm/hPa, EQUATIONS 5.8
@@ -98,7 +98,7 @@ def line_log(of: Basis, lines: Lines, lean: Lean, zero: Cycle, to_local: Floats)
     one = np.ones_like(azimuth_rad)
     faults = np.concatenate(
         [
-            np.stack([np.cos(azimuth_rad), -np.sin(azimuth_rad)], axis=-1) * SENSOR_BIAS_RAD,
+            tilt_along(azimuth_rad) * SENSOR_BIAS_RAD,
             np.stack([one, np.cos(2 * azimuth_rad), np.sin(2 * azimuth_rad)], axis=-1) * CYCLE_CHANGE_RAD,
             cycle_changes(lines, zero),
         ],

@@ -15,7 +15,6 @@ from station.quantities import Bools, Floats, Habits
 from station.science.adjustment import Adjustment
 from station.science.normals import LineLog
 from station.science.prior import BIASES, Lines, motion
-from station.science.shared import GLOBAL
 
 CHANCE = 1e-5  # that a log within its habits looks as far off
 SEEN = 1e-3  # least share of the best seen combination of faults
@@ -64,20 +63,16 @@ class Expected:
 
 
 def expected(lines: Lines, log: LineLog, found: Adjustment) -> Expected:
-    """Take the log out of an adjustment again.
+    """Take the log out of an adjustment again that was held to it.
 
-    With x, C adjusted, R the covariance of noise and faults and r = log - H x, the difference to the estimate
-    without the log is R (R - H C Hᵀ)⁻¹ r: the formula of leave-one-out residuals, for all lines at once.
+    With m, K what the log should have said and the covariance of that, R the covariance of noise and faults
+    and r = log - m, the difference to what is expected without the log is R (R - K)⁻¹ r: the formula of
+    leave-one-out residuals, for all lines at once.
     """
     order = np.argsort(lines.time_s)
     order = order[log.weight[order] > 0]
-    state = len(GLOBAL) + order
-    azimuth_rad = found.of.line_azimuth_rad[order]
-    tilt = np.stack([np.cos(azimuth_rad), -np.sin(azimuth_rad)], axis=-1)
-    covariance = found.covariance
-    across = tilt @ covariance[:2, state]
-    known = covariance[np.ix_(state, state)] + across + across.T + tilt @ covariance[:2, :2] @ tilt.T
-    left = log.lean_rad[order] - tilt @ found.estimate[:2] - found.estimate[state]
+    known = found.unknown.along_sight(log)[np.ix_(order, order)]
+    left = log.lean_rad[order] - found.logged_rad[order]
     weight, faults = log.weight[order], log.faults[order]
     weighted = weight[:, None] * faults
     inner = np.linalg.cholesky(np.eye(faults.shape[1]) + faults.T @ weighted)

@@ -375,6 +375,11 @@ def interpolated(of: Basis, at_knots: Floats) -> Floats:
     return np.asarray(at_knots[before] * (1 - share) + at_knots[(before + 1) % of.lean_count] * share)
 
 
+def tilt_along(azimuth_rad: Floats) -> Floats:
+    """Lean along lines of sight (lines, 2) for a tilt of one about east, and about north."""
+    return np.stack([np.cos(azimuth_rad), -np.sin(azimuth_rad)], axis=-1)
+
+
 def against(unknown: Shared, common: Shared | None) -> Shared:
     """Return what a scan leaves unknown against a reference that does not know `common` itself.
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from station.quantities import Habits
+from station.quantities import Habits, Shared
 from station.science import adjustment, prior, shared
 from station.science.adjustment import adjust
 from station.science.likeness import common_errors
@@ -316,6 +316,53 @@ def test_a_log_alone_gives_the_lean_it_shows_no_better_than_it_is():
     with_ground = adjust(stable.patches(np.zeros(300)), STILL, known_before(OF), log)
     assert np.median(sigmas(found, cells)) > 3 * np.median(sigmas(with_ground, cells))
     assert distrust(found, HABITS) == ["no stable ground seen"]
+
+
+def reference_of(sigma_rad):
+    """A reference that leans by so much, as a whole and from knot to knot, and is right otherwise."""
+    names, lean = OF.names, slice(GLOBALS, GLOBALS + OF.lean_count)
+    covariance = np.zeros((len(names),) * 2)
+    covariance[[0, 1], [0, 1]] = sigma_rad**2
+    knots = np.arange(OF.lean_count)
+    covariance[lean, lean] = sigma_rad**2 * np.exp(-np.abs(np.subtract.outer(knots, knots)) / 20)
+    return Shared(names, OF.units, np.zeros(len(names)), covariance, np.zeros(len(names)))
+
+
+@pytest.mark.parametrize(("sigma_deg", "too_sure"), [(0.002, 1.3), (0.004, 2.0)])
+def test_a_log_does_not_feel_what_the_reference_leans_by(sigma_deg, too_sure):
+    """Scans differ from such a reference by more than their logs can know; σ says by how much."""
+    lines, reference = line_of_sight(), reference_of(math.radians(sigma_deg))
+    before = known_before(OF).against(reference)
+    root = np.linalg.cholesky(reference.covariance + 1e-24 * np.eye(len(OF.names)))
+    known, ignored = [], []
+    for seed in range(60):
+        rng = np.random.default_rng(seed)
+        state = prior_of(OF)[1] @ rng.normal(size=len(prior_of(OF)[0]))
+        log = log_of(state, rng)
+        state -= shared.rows_at_lines(OF, root @ rng.normal(size=(len(root), 1)))[:, 0]
+        for ratios, told in ((known, log.against(OF, reference.covariance)), (ignored, log)):
+            found = adjust(nothing(), STILL, before, told)
+            sigma_rad = np.sqrt(np.einsum("ij,jk,ik->i", lines, found.covariance, lines))
+            ratios.append(lines @ (found.estimate - state) / sigma_rad)
+    assert 0.85 < np.sqrt(np.mean(np.square(known))) < 1.15
+    assert np.sqrt(np.mean(np.square(ignored))) > too_sure
+
+
+def test_what_a_log_should_have_said_is_known_as_well_as_stated():
+    """With ground and a reference that leans: the scan's own lean, which is the sum of both."""
+    lines, stable, reference = line_of_sight(), ground(3, 400), reference_of(math.radians(0.003))
+    before, ratios = known_before(OF).against(reference), []
+    root = np.linalg.cholesky(reference.covariance + 1e-24 * np.eye(len(OF.names)))
+    for seed in range(30):
+        rng = np.random.default_rng(seed)
+        own = prior_of(OF)[1] @ rng.normal(size=len(prior_of(OF)[0]))
+        state = own - shared.rows_at_lines(OF, root @ rng.normal(size=(len(root), 1)))[:, 0]
+        residual_m = stable.matrix() @ state + rng.normal(0, 0.01, 400)
+        log = log_of(own, rng).against(OF, reference.covariance)
+        found = adjust(stable.patches(residual_m), STILL, before, log)
+        sigma_rad = np.sqrt(np.diag(found.unknown.along_sight(log)))
+        ratios.append((found.logged_rad - lines @ own) / sigma_rad)
+    assert np.sqrt(np.mean(np.square(ratios))) == pytest.approx(1, abs=0.3)
 
 
 def test_a_dead_stretch_of_the_log_counts_nothing():

@@ -71,11 +71,15 @@ class Scan:
             normal += FELT.T @ np.linalg.solve(noise, FELT)
             right += FELT.T @ np.linalg.solve(noise, log.lean_rad)
         covariance = np.linalg.inv(normal)
-        unknown = SimpleNamespace(by_line=lambda: covariance)
-        return Adjustment(OF, covariance @ right, unknown, 0.001, np.ones(9), (1.0, 1.0))
+        return as_adjusted(covariance @ right, covariance, log)
 
     def told(self, log):
         return sensor.expected(LINES, log, self.adjusted(log))
+
+
+def as_adjusted(estimate, covariance, log):
+    unknown = SimpleNamespace(by_line=lambda: covariance, along_sight=lambda _: FELT @ covariance @ FELT.T)
+    return Adjustment(OF, estimate, unknown, 0.001, np.ones(9), (1.0, 1.0), log, FELT @ estimate)
 
 
 def test_what_the_ground_expects_is_what_it_says_without_the_log():
@@ -103,8 +107,7 @@ def test_lines_without_a_log_do_not_count():
         spread, log.lean_rad[kept] - FELT[kept] @ alone.estimate
     )
     covariance = alone.covariance - gain @ np.linalg.solve(spread, gain.T)
-    unknown = SimpleNamespace(by_line=lambda: covariance)
-    told = sensor.expected(LINES, with_gap, Adjustment(OF, estimate, unknown, 0.001, np.ones(9), (1.0, 1.0)))
+    told = sensor.expected(LINES, with_gap, as_adjusted(estimate, covariance, with_gap))
     assert told.ground_rad[::-1] == pytest.approx((FELT @ alone.estimate)[kept], abs=1e-9)
 
 
