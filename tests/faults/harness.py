@@ -170,9 +170,10 @@ class Station:
         """Return the service and all it has started."""
         found = [self.pid]
         for pid in found:
-            for task in Path(f"/proc/{pid}/task").glob("*/children"):
-                with suppress(OSError):  # the task has ended meanwhile
-                    found += [int(one) for one in task.read_text().split()]
+            with suppress(OSError):  # it has ended meanwhile
+                for task in list(Path(f"/proc/{pid}/task").iterdir()):
+                    with suppress(OSError):  # the same
+                        found += [int(one) for one in (task / "children").read_text().split()]
         return found
 
     def limit_files(self, size):
