@@ -8,6 +8,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from statistics import median
@@ -89,8 +90,9 @@ def family(pid: int) -> list[int]:
     """Return a process and all below it, nearest first."""
     found = [pid]
     for one in found:
-        for task in Path(f"/proc/{one}/task").glob("*/children"):
-            found += [int(child) for child in _told(task).split()]
+        with suppress(OSError):  # it has ended meanwhile
+            for task in list(Path(f"/proc/{one}/task").iterdir()):
+                found += [int(child) for child in _told(task / "children").split()]
     return found
 
 

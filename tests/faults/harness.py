@@ -18,6 +18,7 @@ from pathlib import Path
 import netCDF4
 import numpy as np
 
+from benchmarks.cost import family
 from station.service.journal import Journal, State
 from station.simulation.scenario import tiny
 from station.simulation.station import simulate
@@ -168,13 +169,7 @@ class Station:
 
     def processes(self):
         """Return the service and all it has started."""
-        found = [self.pid]
-        for pid in found:
-            with suppress(OSError):  # it has ended meanwhile
-                for task in list(Path(f"/proc/{pid}/task").iterdir()):
-                    with suppress(OSError):  # the same
-                        found += [int(one) for one in (task / "children").read_text().split()]
-        return found
+        return family(self.pid)
 
     def limit_files(self, size):
         """Let no file of the service grow beyond a size, as on a full disk; None: as before."""

@@ -208,7 +208,7 @@ def test_a_child_that_finds_its_parent_gone_ends_without_a_traceback(step):
 def is_alive(pid):
     try:
         return "Z" not in Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()[0]
-    except FileNotFoundError:
+    except (FileNotFoundError, ProcessLookupError):
         return False
 
 
