@@ -13,7 +13,6 @@ from scipy import linalg, special
 
 from station.quantities import Bools, Floats, Habits
 from station.science.adjustment import Adjustment
-from station.science.normals import LineLog
 from station.science.prior import BIASES, Lines, motion
 
 CHANCE = 1e-5  # that a log within its habits looks as far off
@@ -62,13 +61,15 @@ class Expected:
     by_noise: Floats
 
 
-def expected(lines: Lines, log: LineLog, found: Adjustment) -> Expected:
-    """Take the log out of an adjustment again that was held to it.
+def expected(lines: Lines, found: Adjustment) -> Expected | None:
+    """Take the log out of an adjustment again; None where there was none.
 
     With m, K what the log should have said and the covariance of that, R the covariance of noise and faults
     and r = log - m, the difference to what is expected without the log is R (R - K)⁻¹ r: the formula of
     leave-one-out residuals, for all lines at once.
     """
+    if (log := found.log) is None:
+        return None
     order = np.argsort(lines.time_s)
     order = order[log.weight[order] > 0]
     known = found.unknown.along_sight(log)[np.ix_(order, order)]

@@ -293,9 +293,11 @@ def _log_against_ground(
     levelled: tuple[Told, Adjustment] | None, reference: Reference | None
 ) -> tuple[list[str], dict[str, float]]:
     """Say what the ground has against a scan's log, and how late that is as the store keeps it."""
-    if levelled is None or reference is None or (log := levelled[1].log) is None:
+    if levelled is None or reference is None:
         return [], {}
-    expected = sensor.expected(levelled[0].lines, log, levelled[1])
+    expected = sensor.expected(levelled[0].lines, levelled[1])
+    if expected is None:
+        return [], {}
     doubts = sensor.off_habit(expected)
     late = sensor.lateness(expected, reference.habits, len(reference.scan_ids))
     if late is None:

@@ -74,7 +74,7 @@ class Scan:
         return as_adjusted(covariance @ right, covariance, log)
 
     def told(self, log):
-        return sensor.expected(LINES, log, self.adjusted(log))
+        return sensor.expected(LINES, self.adjusted(log))
 
 
 def as_adjusted(estimate, covariance, log):
@@ -107,7 +107,7 @@ def test_lines_without_a_log_do_not_count():
         spread, log.lean_rad[kept] - FELT[kept] @ alone.estimate
     )
     covariance = alone.covariance - gain @ np.linalg.solve(spread, gain.T)
-    told = sensor.expected(LINES, with_gap, as_adjusted(estimate, covariance, with_gap))
+    told = sensor.expected(LINES, as_adjusted(estimate, covariance, with_gap))
     assert told.ground_rad[::-1] == pytest.approx((FELT @ alone.estimate)[kept], abs=1e-9)
 
 
@@ -190,4 +190,6 @@ def test_a_log_of_few_lines_does_not_tell():
     scan = Scan(5)
     log = scan.log()
     short = LineLog(log.lean_rad, np.where(np.arange(OF.line_count) < 60, log.weight, 0.0), FAULTS)
-    assert sensor.lateness(sensor.expected(LINES, short, scan.adjusted(log)), HABITS, MANY) is None
+    assert (
+        sensor.lateness(sensor.expected(LINES, replace(scan.adjusted(log), log=short)), HABITS, MANY) is None
+    )
