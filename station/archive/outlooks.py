@@ -5,6 +5,7 @@ Only a memory: named after all that it was made from, and where it is gone or da
 
 from __future__ import annotations
 
+import mmap
 import os
 import weakref
 from collections.abc import Callable
@@ -140,15 +141,31 @@ class _Plain:
             raise StoreError(f"{self._path}: cannot be read: {error}") from error
         if read != len(values):
             raise _damaged(self._path)
+        return self._proven(values, first, stop)
+
+    def __array__(self, dtype: Any = None, copy: bool | None = None) -> Array:  # noqa: ANN401, FBT001 - numpy's
+        """Return all of it, where the system keeps the file: memory is taken only for what is overwritten."""
+        skipped = self._at % mmap.ALLOCATIONGRANULARITY
+        size = self._shape[0] * self._row_bytes
+        try:
+            held = mmap.mmap(
+                self._kept.descriptor, skipped + size, access=mmap.ACCESS_COPY, offset=self._at - skipped
+            )
+        except ValueError as error:  # it ends before
+            raise _damaged(self._path) from error
+        except OSError as error:
+            raise StoreError(f"{self._path}: cannot be read: {error}") from error
+        return np.asarray(
+            self._proven(np.frombuffer(held, np.uint8, size, skipped), 0, self._shape[0]), dtype=dtype
+        )
+
+    def _proven(self, values: Array, first: int, stop: int) -> Array:
+        """Hold some rows' bytes against the checksums of the parts that are whole; return what they mean."""
         for number in range(*np.searchsorted(self._edges, (first, stop)).tolist()):
             begin, end = (int(row - first) * self._row_bytes for row in self._edges[number : number + 2])
             if end <= len(values) and _crc(values[begin:end]) != self._crc[number]:
                 raise _damaged(self._path)
         return values.view(self._dtype).reshape(-1, *self._shape[1:])
-
-    def __array__(self, dtype: Any = None, copy: bool | None = None) -> Array:  # noqa: ANN401, FBT001 - numpy's
-        """Return all of it."""
-        return np.asarray(self[:], dtype=dtype)
 
 
 def _edges(rows: int) -> Ints:
