@@ -72,21 +72,28 @@ def collect(of: Basis, bands: Iterable[Cells], reach_m: float) -> Patches:
     stretches = int(reach_m / STRETCH_M) + 1
     a_kind = of.line_count * stretches
     size = a_kind * Kind.UNUSED
-    sums = np.zeros((len(GLOBAL) + 3, size))
+    sums = np.zeros((len(GLOBAL) + 3, Kind.UNUSED, of.line_count, stretches))
     held: list[tuple[Ints32, Floats32, Floats32]] = []
     one_in = (1, 1)
     for cells in bands:
-        used, one_in = cells.kind != Kind.UNUSED, cells.one_in
-        felt = cells.felt
+        used, one_in = np.flatnonzero(cells.kind != Kind.UNUSED), cells.one_in
+        if not len(used):
+            continue
+        felt, kind, line = cells.felt, cells.kind[used], cells.felt.line[used]
         stretch = np.minimum((cells.range_m[used] / STRETCH_M).astype(np.int64), stretches - 1)
-        key = cells.kind[used] * a_kind + felt.line[used] * stretches + stretch
         weight = 1 / cells.variance_m2[used]
-        for row, effect in enumerate([*felt.globals_, felt.lean, felt.refraction]):
-            sums[row] += np.bincount(key, weight * effect[used], size)
-        sums[-1] += np.bincount(key, weight, size)
+        # Cells of a band lie in few lines: to sum up over all of them each time takes most of the time.
+        first, lines = int(line.min()), int(np.ptp(line)) + 1
+        near = (kind * lines + line - first) * stretches + stretch
+        total = sums[:, :, first : first + lines]
+        for row, effect in enumerate([*felt.globals_, felt.lean, felt.refraction, None]):
+            weighted = weight if effect is None else weight * effect[used]
+            total[row] += np.bincount(near, weighted, total[row].size).reshape(total[row].shape)
+        key = kind * a_kind + line * stretches + stretch
         held.append(
             (key.astype(np.int32), cells.residual_m[used].astype(np.float32), weight.astype(np.float32))
         )
+    sums = sums.reshape(len(sums), size)
     if not held:
         held.append((np.empty(0, np.int32), np.empty(0, np.float32), np.empty(0, np.float32)))
     key, residual_m, weight = (np.concatenate(parts) for parts in zip(*held, strict=True))
