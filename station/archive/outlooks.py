@@ -141,31 +141,26 @@ class _Plain:
             raise StoreError(f"{self._path}: cannot be read: {error}") from error
         if read != len(values):
             raise _damaged(self._path)
-        return self._proven(values, first, stop)
+        for number in range(*np.searchsorted(self._edges, (first, stop)).tolist()):
+            begin, end = (int(row - first) * self._row_bytes for row in self._edges[number : number + 2])
+            if end <= len(values) and _crc(values[begin:end]) != self._crc[number]:
+                raise _damaged(self._path)
+        return values.view(self._dtype).reshape(-1, *self._shape[1:])
 
     def __array__(self, dtype: Any = None, copy: bool | None = None) -> Array:  # noqa: ANN401, FBT001 - numpy's
         """Return all of it, where the system keeps the file: memory is taken only for what is overwritten."""
+        for begin, end in pairwise(self._edges.tolist()):
+            self[begin:end]  # for the checksums; and a disk that fails tells so here, not by a signal
         skipped = self._at % mmap.ALLOCATIONGRANULARITY
         size = self._shape[0] * self._row_bytes
         try:
             held = mmap.mmap(
                 self._kept.descriptor, skipped + size, access=mmap.ACCESS_COPY, offset=self._at - skipped
             )
-        except ValueError as error:  # it ends before
-            raise _damaged(self._path) from error
         except OSError as error:
             raise StoreError(f"{self._path}: cannot be read: {error}") from error
-        return np.asarray(
-            self._proven(np.frombuffer(held, np.uint8, size, skipped), 0, self._shape[0]), dtype=dtype
-        )
-
-    def _proven(self, values: Array, first: int, stop: int) -> Array:
-        """Hold some rows' bytes against the checksums of the parts that are whole; return what they mean."""
-        for number in range(*np.searchsorted(self._edges, (first, stop)).tolist()):
-            begin, end = (int(row - first) * self._row_bytes for row in self._edges[number : number + 2])
-            if end <= len(values) and _crc(values[begin:end]) != self._crc[number]:
-                raise _damaged(self._path)
-        return values.view(self._dtype).reshape(-1, *self._shape[1:])
+        values = np.frombuffer(held, self._dtype, size // self._dtype.itemsize, skipped)
+        return np.asarray(values.reshape(self._shape), dtype=dtype)
 
 
 def _edges(rows: int) -> Ints:
