@@ -2,11 +2,12 @@
 
 import pytest
 
-from benchmarks.large import decoded, large_station, measured, prepared
+from benchmarks.large import decoded, large_station, measured, prepared, referenced
 
 MOST_GB = 0.65
 GROWTH = 1.12  # forty times the points see some two million more cells, whose sums take 24 bytes each
 POINTS = (1_440_000, 14_400_000, 57_600_000)
+MOST_BYTES_A_CELL = 155  # of a reference in the making: 137, and 250 where scans are added as a whole
 
 
 @pytest.mark.slow
@@ -15,6 +16,14 @@ def test_memory_is_bounded_by_the_grid_not_by_the_points(tmp_path):
     peaks_gb = [measured(prepared(tmp_path, points)).peak_gb for points in POINTS]
     assert max(peaks_gb) <= MOST_GB
     assert max(peaks_gb) <= GROWTH * min(peaks_gb)
+
+
+@pytest.mark.slow
+def test_a_reference_is_made_in_little_more_memory_than_it_has_cells(tmp_path):
+    """1,000 x 1,250 and 2,000 x 2,500 cells: what the larger takes more."""
+    peaks_gb = [referenced(large_station(tmp_path, 100_000, size=size)).peak_gb for size in (0.25, 0.5)]
+    more_cells = 4000 * 5000 * (0.5**2 - 0.25**2)
+    assert (peaks_gb[1] - peaks_gb[0]) * 1e9 <= MOST_BYTES_A_CELL * more_cells
 
 
 def test_a_small_one_of_its_kind_is_adjusted_and_good(tmp_path):

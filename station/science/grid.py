@@ -9,8 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
+from station.science.terrain import bands
+
 if TYPE_CHECKING:
-    from station.quantities import Floats, Floats32, Grid, Ints, Ints32
+    from station.quantities import Floats, Floats32, Grid, Ints, Ints32, Reals
     from station.science.terrain import Ground
 
 # Sums are whole numbers, of 2^-20 m (and m²), so that the order in which points come cannot matter.
@@ -146,11 +148,12 @@ class Gridder:
         """Take a copy of cells (n,) by their numbers."""
         return Sums(*np.ascontiguousarray(self._sums.take(number, axis=0).T))
 
-    def rasters(self) -> Sums:
-        """Lay out a copy of all sums on the grid, (ny, nx) each."""
-        laid = np.zeros((3, *self.grid.shape), np.int64)
-        there = self.number >= 0
-        laid[:, there] = self._sums[self.number[there]].T
+    def rasters(self, rows: slice = slice(None)) -> Sums:
+        """Lay out a copy of all sums on some rows of the grid, or all, (r, nx) each."""
+        number = self.number[rows]
+        laid = np.zeros((3, *number.shape), np.int64)
+        there = number >= 0
+        laid[:, there] = self._sums.take(number[there], axis=0).T
         return Sums(*laid)
 
     def memory(self) -> NDArray[np.uint8]:
@@ -159,17 +162,22 @@ class Gridder:
 
 
 class Stack:
-    """Several scans on one grid, each within itself: what they share among their own points stays apart."""
+    """Several scans on one grid, each within itself: what they share among their own points stays apart.
+
+    Scans are added band by band, lest the grid's memory be taken several times.
+    """
 
     def __init__(self, grid: Grid) -> None:
         self.grid = grid
-        self.count = np.zeros(grid.shape)
-        self._residual, self._variance, self._within, self._freedom = (np.zeros(grid.shape) for _ in range(4))
+        self._residual = np.zeros(grid.shape)
+        self.count, self._variance, self._within, self._freedom = (
+            np.zeros(grid.shape, np.float32) for _ in range(4)
+        )
         self._bright, self._lit, self._steps, self._pairs, self._seen = (
             np.zeros(grid.shape, np.float32) for _ in range(5)
         )
         self._scans = 0
-        self._last: tuple[Floats32, Floats32] | None = None
+        self._last: Floats32 | None = None  # (2, ny, nx): mean and its variance, of the scan before
 
     def add(
         self,
@@ -182,39 +190,42 @@ class Stack:
         `known`, on a reference: random variance of a shot and what to lower heights by, and the
         `roughness_m2` of that reference, (ny, nx) each. Then scans are also compared with each other.
         """
-        sums = gridder.rasters()
-        count = sums.count.astype(np.float64)
-        seen = count > 0
-        self._seen += seen
         self._scans += 1
-        self.count += count
-        mean_m = sums.mean_residual()
-        shot_m2 = np.zeros(self.grid.shape, np.float32)
-        if known is not None:
-            shot_m2, correction_m = known
-            mean_m -= correction_m
-        self._residual[seen] += mean_m[seen] * count[seen]
-        bright = sums.intensity()
-        lit = np.where(np.isfinite(bright), count, 0).astype(np.float32)
-        self._bright += np.nan_to_num(bright) * lit
-        self._lit += lit
-        if roughness_m2 is not None:
-            variance_m2 = (shot_m2 + roughness_m2) / np.maximum(count, 1)
-            self._compare(mean_m.astype(np.float32), variance_m2.astype(np.float32))
-        self._variance[seen] += shot_m2[seen] * count[seen]
-        self._within += np.nan_to_num(sums.spread()).astype(np.float64) ** 2 * np.maximum(count - 1, 0)
-        self._freedom += np.maximum(count - 1, 0)
+        if roughness_m2 is not None and self._last is None:
+            self._last = np.full((2, *self.grid.shape), np.nan, np.float32)
+        for rows in bands(self.grid.ny):
+            sums = gridder.rasters(rows)
+            count = sums.count.astype(np.float32)
+            shot_m2, correction_m = (one[rows] for one in known) if known else np.zeros((2, *count.shape))
+            mean_m = sums.mean_residual() - correction_m
+            self._add(rows, sums, count, mean_m, shot_m2)
+            if roughness_m2 is not None:
+                variance_m2 = (shot_m2 + roughness_m2[rows]) / np.maximum(count, 1)
+                self._compare(rows, mean_m.astype(np.float32), variance_m2.astype(np.float32))
 
-    def _compare(self, mean_m: Floats32, variance_m2: Floats32) -> None:
+    def _add(self, rows: slice, sums: Sums, count: Floats32, mean_m: Floats, shot_m2: Reals) -> None:
+        self._seen[rows] += count > 0
+        self.count[rows] += count
+        self._residual[rows] += np.nan_to_num(mean_m) * count
+        bright = sums.intensity()
+        lit = np.where(np.isfinite(bright), count, np.float32(0))
+        self._bright[rows] += np.nan_to_num(bright) * lit
+        self._lit[rows] += lit
+        self._variance[rows] += shot_m2 * count
+        freedom = np.maximum(count - 1, 0)
+        self._within[rows] += np.nan_to_num(sums.spread()) ** 2 * freedom
+        self._freedom[rows] += freedom
+
+    def _compare(self, rows: slice, mean_m: Floats32, variance_m2: Floats32) -> None:
         """Take the step from the scan before, in units of what it should be."""
-        if self._last is not None:
-            before_m, before_m2 = self._last
-            expected_m2 = variance_m2 + before_m2
-            there = np.isfinite(mean_m - before_m) & (expected_m2 > 0)
-            steps = (mean_m - before_m)[there] ** 2 / expected_m2[there]
-            self._steps[there] += np.minimum(steps, STEP_MOST**2)
-            self._pairs[there] += 1
-        self._last = mean_m, variance_m2
+        assert self._last is not None  # noqa: S101 - the caller's case
+        before_m, before_m2 = self._last[:, rows]
+        expected_m2 = variance_m2 + before_m2
+        there = np.isfinite(mean_m - before_m) & (expected_m2 > 0)
+        steps = (mean_m - before_m)[there] ** 2 / expected_m2[there]
+        self._steps[rows][there] += np.minimum(steps, STEP_MOST**2)
+        self._pairs[rows][there] += 1
+        before_m[:], before_m2[:] = mean_m, variance_m2
 
     def intensity(self) -> Floats32:
         """Mean brightness of each cell (ny, nx), 0-1, NaN where unknown."""
@@ -226,48 +237,52 @@ class Stack:
         """Share of the scans that saw each cell (ny, nx)."""
         return self._seen / np.float32(max(self._scans, 1))
 
-    def variance_factor(self, classes: Ints) -> Floats32:
+    def variance_factor(self, classes: Ints32) -> Floats32:
         """Random variance that cells show from scan to scan against the modelled (ny, nx).
 
         It is drawn to that of the cell's class, of `classes` (ny, nx) from nought: its own few steps weigh
         against `CLASS_STEPS` of the class. One where there is nothing to tell.
         """
         number = int(classes.max()) + 1
-        of_class = np.bincount(classes.ravel(), self._steps.ravel(), number)
-        pairs = np.bincount(classes.ravel(), self._pairs.ravel(), number)
-        ratio = (of_class + CLASS_STEPS) / (pairs + CLASS_STEPS)
-        return np.asarray(
-            (self._steps + CLASS_STEPS * ratio[classes]) / (self._pairs + CLASS_STEPS), dtype=np.float32
-        )
+        of_class, pairs = np.zeros((2, number))
+        for rows in bands(self.grid.ny):
+            of_class += np.bincount(classes[rows].ravel(), self._steps[rows].ravel(), number)
+            pairs += np.bincount(classes[rows].ravel(), self._pairs[rows].ravel(), number)
+        ratio = ((of_class + CLASS_STEPS) / (pairs + CLASS_STEPS)).astype(np.float32)
+        factor = CLASS_STEPS * ratio[classes]
+        factor += self._steps
+        factor /= self._pairs + CLASS_STEPS
+        return np.asarray(factor)
 
     def mean_residual(self) -> Floats:
         """Mean height of all points above reference or datum (ny, nx) [m], NaN in empty cells."""
-        mean_m = np.full(self.grid.shape, np.nan)
-        np.divide(self._residual, self.count, out=mean_m, where=self.count > 0)
-        return mean_m
+        return np.asarray(self._per_point(self._residual))
 
-    def roughness(self) -> Floats:
+    def roughness(self) -> Floats32:
         """Variance of the terrain about the reference within each cell (ny, nx) [m²].
 
         It is what the points of a scan scatter more than their own errors explain, pooled with the cells
         around, for a few points say little of a variance; nought where nothing tells.
         """
-        expected = np.divide(self._variance, self.count, out=np.zeros(self.grid.shape), where=self.count > 0)
-        excess = ndimage.gaussian_filter(self._within - expected * self._freedom, ROUGHNESS_CELLS)
+        excess = self._within - self._per_point(self._variance, empty=0.0) * self._freedom
+        excess = ndimage.gaussian_filter(excess, ROUGHNESS_CELLS)
         freedom = ndimage.gaussian_filter(self._freedom, ROUGHNESS_CELLS)
-        told = np.divide(excess, freedom, out=np.zeros(self.grid.shape), where=freedom > 1e-3)
-        return np.where(self.count > 0, np.maximum(told, 0.0), 0.0)
+        told = np.zeros(self.grid.shape, np.float32)
+        np.divide(excess, freedom, out=told, where=(freedom > 1e-3) & (self.count > 0))
+        return np.maximum(told, 0.0, out=told)
 
-    def random_variance(self) -> Floats32:
+    def random_variance(self, roughness_m2: Floats32) -> Floats32:
         """Random variance of the mean of all points (ny, nx) [m²], NaN in empty cells.
 
         Source: Hartzell et al. (2015), Eq. 12, with the roughness as part of each point's variance.
         """
-        variance_m2 = np.full(self.grid.shape, np.nan, np.float32)
-        seen = self.count > 0
-        total_m2 = self._variance[seen] / self.count[seen] + self.roughness()[seen]
-        variance_m2[seen] = total_m2 / self.count[seen]
-        return variance_m2
+        return self._per_point(self._per_point(self._variance) + roughness_m2)
+
+    def _per_point(self, values: Reals, empty: float = np.nan) -> Reals:
+        """Divide by the number of points (ny, nx)."""
+        divided = np.full_like(values, empty)
+        np.divide(values, self.count, out=divided, where=self.count > 0)
+        return divided
 
 
 def slope_sampling_variance(cell_m: float, tan_slope: Floats, count: Floats) -> Floats:

@@ -9,7 +9,7 @@ import numpy as np
 from station.quantities import Bools, Floats, Floats32, Habits, Reference, Shared
 from station.science import ground
 from station.science.grid import Stack
-from station.science.terrain import smooth, smooth_gradient
+from station.science.terrain import MARGIN_ROWS, bands, smooth, smooth_gradient
 
 PROVISIONAL_CELLS = 1.0  # one sigma of the smoothing before residuals are taken
 UNCHANGED_SIGMAS = 3.0  # of a mean over many scans, on ground that stays
@@ -55,12 +55,13 @@ def master(
     factor, stable = np.ones(stack.grid.shape, np.float32), np.zeros(stack.grid.shape, bool)
     if position_m is not None:
         factor, stable = _as_scans_show(stack, position_m, elevation_m)
+    roughness_m2 = stack.roughness()
     return Reference(
         grid=stack.grid,
         version=version,
         elevation_m=elevation_m,
-        random_variance_m2=stack.random_variance() * factor,
-        roughness_m2=stack.roughness().astype(np.float32),
+        random_variance_m2=stack.random_variance(roughness_m2) * factor,
+        roughness_m2=roughness_m2,
         shared=common,
         scan_ids=scan_ids,
         intensity=stack.intensity(),
@@ -76,7 +77,7 @@ def improved(base: Reference, stack: Stack, position_m: Position, version: str, 
 
     Elsewhere it stays as it is: it is what change counts from. What scans show of cells is learned anew.
     """
-    mean_m, mean_m2 = stack.mean_residual(), stack.random_variance()
+    mean_m, mean_m2 = stack.mean_residual(), stack.random_variance(stack.roughness())
     factor, steady = _as_scans_show(stack, position_m, base.elevation_m)
     mean_m2 *= factor
     still = np.abs(mean_m) < UNCHANGED_SIGMAS * np.sqrt(mean_m2 + base.random_variance_m2)
@@ -96,8 +97,14 @@ def improved(base: Reference, stack: Stack, position_m: Position, version: str, 
 
 def _as_scans_show(stack: Stack, position_m: Position, elevation_m: Floats) -> tuple[Floats32, Bools]:
     """How much more cells vary from scan to scan than modelled, and which are stable (ny, nx)."""
-    east, north = smooth_gradient(elevation_m - position_m[2], stack.grid.cell_m)
-    tan_slope = np.hypot(east, north)
-    away_m = np.hypot(stack.grid.x_m[None, :] - position_m[0], stack.grid.y_m[:, None] - position_m[1])
-    factor = stack.variance_factor(ground.classes(away_m, tan_slope))
-    return factor, np.isfinite(elevation_m) & (tan_slope > ground.STABLE_FLATTEST) & (factor < STEADY)
+    grid = stack.grid
+    alike, steep = np.empty(grid.shape, np.int32), np.empty(grid.shape, bool)
+    for rows in bands(grid.ny):
+        around = slice(max(rows.start - MARGIN_ROWS, 0), rows.stop + MARGIN_ROWS)
+        inner = slice(rows.start - around.start, rows.stop - around.start)
+        east, north = smooth_gradient(elevation_m[around] - position_m[2], grid.cell_m, rows=inner)
+        tan_slope = np.hypot(east, north)
+        away_m = np.hypot(grid.x_m[None, :] - position_m[0], grid.y_m[rows, None] - position_m[1])
+        alike[rows], steep[rows] = ground.classes(away_m, tan_slope), tan_slope > ground.STABLE_FLATTEST
+    factor = stack.variance_factor(alike)
+    return factor, np.isfinite(elevation_m) & steep & (factor < STEADY)

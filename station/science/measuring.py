@@ -22,8 +22,9 @@ from station.quantities import (
 )
 from station.science import budget, change, ground, shared, uncertainty
 from station.science.grid import Gridder, Sums, slope_sampling_variance
-from station.science.outlook import HIGH_INCIDENCE_COS, MARGIN_ROWS, Outlook, Sector, Trait, gradients
+from station.science.outlook import HIGH_INCIDENCE_COS, Outlook, Sector, Trait, gradients
 from station.science.shared import Sensitivities
+from station.science.terrain import MARGIN_ROWS
 from station.science.view import View
 
 BAND_ROWS = 64  # looked at together for the cells beyond the reference

@@ -18,11 +18,9 @@ from numpy.typing import NDArray
 from station.quantities import UPRIGHT, Bools, Floats, Floats32, Grid, Ints, Ints32, Reals, Reference, Scanner
 from station.science import ground, shared, terrain
 from station.science.shared import Basis, Sensitivities
-from station.science.terrain import Cells, Ground, smooth_gradient
+from station.science.terrain import MARGIN_ROWS, Cells, Ground, smooth_gradient
 from station.science.view import View
 
-BAND_ROWS = 128  # looked at together: what a store chunk is high
-MARGIN_ROWS = 4  # rows beyond a band that its smoothed gradient looks at
 MOVING_MOST = 400_000  # cells of moving ground that an adjustment looks at
 STABLE_MOST = 800_000  # the same of stable ground, in whole rows; so many tell all there is to tell
 TOGETHER = 50_000  # cells of a sector where nobody knows the head
@@ -182,8 +180,7 @@ def look(
     below = terrain.ground(reference)
     count, first = int(below.number.max()) + 1, 0
     cells = {name: np.empty(count, dtype) for name, dtype in CELLS.items()}
-    for top in range(0, grid.ny, BAND_ROWS):
-        rows = slice(top, min(top + BAND_ROWS, grid.ny))
+    for rows in terrain.bands(grid.ny):
         told = _cells(reference, rows, below, stable[rows], scanner, of, position_m, published=published)
         end = first + len(told["cell"])
         for name, values in told.items():

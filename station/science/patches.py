@@ -81,26 +81,26 @@ def collect(of: Basis, bands: Iterable[Cells], reach_m: float) -> Patches:
             continue
         felt, kind, line = cells.felt, cells.kind[used], cells.felt.line[used]
         stretch = np.minimum((cells.range_m[used] / STRETCH_M).astype(np.int64), stretches - 1)
-        weight = 1 / cells.variance_m2[used]
+        precision = 1 / cells.variance_m2[used]
         # Cells of a band lie in few lines: to sum up over all of them each time takes most of the time.
         first, lines = int(line.min()), int(np.ptp(line)) + 1
         near = (kind * lines + line - first) * stretches + stretch
         total = sums[:, :, first : first + lines]
         for row, effect in enumerate([*felt.globals_, felt.lean, felt.refraction, None]):
-            weighted = weight if effect is None else weight * effect[used]
+            weighted = precision if effect is None else precision * effect[used]
             total[row] += np.bincount(near, weighted, total[row].size).reshape(total[row].shape)
         key = kind * a_kind + line * stretches + stretch
         held.append(
-            (key.astype(np.int32), cells.residual_m[used].astype(np.float32), weight.astype(np.float32))
+            (key.astype(np.int32), cells.residual_m[used].astype(np.float32), precision.astype(np.float32))
         )
-    sums = sums.reshape(len(sums), size)
     if not held:
         held.append((np.empty(0, np.int32), np.empty(0, np.float32), np.empty(0, np.float32)))
     key, residual_m, weight = (np.concatenate(parts) for parts in zip(*held, strict=True))
     held.clear()  # of many cells it is the most that is held here
-    there = np.flatnonzero(sums[-1])
+    of_patch = sums.reshape(len(sums), size)
+    there = np.flatnonzero(of_patch[-1])
     mean_m, variance_m2, count = (values[there] for values in _robust_means(key, residual_m, weight, size))
-    effects = sums[:-1, there] / sums[-1, there]
+    effects = of_patch[:-1, there] / of_patch[-1, there]
     place = there % a_kind
     passed = (place // stretches + 0.5) / LINES_A_KNOT
     felt = Sensitivities(of, effects[: len(GLOBAL)], effects[-2], effects[-1], passed)

@@ -11,7 +11,8 @@ from scipy import ndimage
 from station.quantities import Bools, Floats, Floats32, Grid, Ints, Ints32, Reals, Reference
 
 ALL = slice(None)
-BAND_ROWS = 128  # looked at together: what a store chunk is high
+BAND_ROWS = 128  # looked at together: what a store chunk is high …
+MARGIN_ROWS = 4  # … and the rows beside them that a smoothed gradient looks at, too
 TOGETHER = 200_000  # cells
 
 Cells = tuple[Ints, Ints]  # rows and columns (n,)
@@ -180,7 +181,7 @@ def ground(reference: Reference) -> Ground:
     rise_m = np.empty(reference.grid.shape, np.float32)
     number = np.full(reference.grid.shape, -1, np.int32)
     datum_m, first = _datum(reference), 0
-    for rows in _bands(reference):
+    for rows in bands(reference.grid.ny):
         rise_m[rows] = reference.elevation_m[rows] - datum_m
         known = np.isfinite(rise_m[rows])
         end = first + int(np.count_nonzero(known))
@@ -191,13 +192,13 @@ def ground(reference: Reference) -> Ground:
 
 def _datum(reference: Reference) -> float:
     """Return a height that all of a surface is near."""
-    heights = (reference.elevation_m[rows] for rows in _bands(reference))
+    heights = (reference.elevation_m[rows] for rows in bands(reference.grid.ny))
     total_m, count = np.sum([(np.nansum(one), np.isfinite(one).sum()) for one in heights], axis=0)
     return float(np.round(total_m / max(count, 1)))
 
 
-def _bands(reference: Reference) -> Iterator[slice]:
-    ny = reference.grid.ny
+def bands(ny: int) -> Iterator[slice]:
+    """Give the rows of a grid, as many at a time as are looked at together."""
     return (slice(top, min(top + BAND_ROWS, ny)) for top in range(0, ny, BAND_ROWS))
 
 

@@ -81,21 +81,31 @@ def build_reference(site: Site, arrivals: list[Arrival], version: str, progress:
     Thrice over the scans: their plain means, then twice their residuals to what there is, each scan adjusted
     to it. What the scans show of the station's habits is learned on the way.
     """
-    series = series_of(site)
-    scan_ids = tuple(arrival.path.stem for arrival in arrivals)
+    _look_at(site, version, _built(site, arrivals, version, progress))
+    return version
+
+
+def _built(site: Site, arrivals: list[Arrival], version: str, progress: Progress) -> Setup:
+    """Make and store it; return the setup of its scans."""
     surface: Reference | None = None
     for _ in range(REFERENCE_PASSES):
-        stack, seen_from = Stack(series.grid), _SeenFrom(site, surface)
-        laid = [_lay_on(stack, site, arrival, seen_from, progress) for arrival in arrivals]
-        habits = _learned(surface.habits if surface else Habits(), laid)
-        unknown = [one.gathered.unknown for one in laid]
-        position_m = laid[0].gathered.setup.position_m
-        surface = master(stack, surface, unknown, position_m, version, scan_ids, habits)
+        surface, laid = _passed(site, arrivals, surface, version, progress)
         made_from = tuple(one.made.told() for one in laid)
-    if surface is not None:
-        write_reference(series, surface, Lineage(version, site.science_hash, made_from=made_from))
-        _look_at(site, version, laid)
-    return version
+    assert surface is not None  # noqa: S101 - there is a pass
+    write_reference(series_of(site), surface, Lineage(version, site.science_hash, made_from=made_from))
+    return laid[-1].gathered.setup
+
+
+def _passed(
+    site: Site, arrivals: list[Arrival], surface: Reference | None, version: str, progress: Progress
+) -> tuple[Reference, list[_Laid]]:
+    """Return what scans make of a surface, or make without one."""
+    stack, laid = _stacked(site, arrivals, surface, progress)
+    scan_ids = tuple(one.made.scan_id for one in laid)
+    unknown = [one.gathered.unknown for one in laid]
+    habits = _learned(surface.habits if surface else Habits(), laid)
+    position_m = laid[0].gathered.setup.position_m
+    return master(stack, surface, unknown, position_m, version, scan_ids, habits), laid
 
 
 def improve_reference(
@@ -105,12 +115,19 @@ def improve_reference(
 
     It is laid on the version `on`, and takes the place of those it `replaces`.
     """
+    _look_at(site, version, _improved(site, arrivals, version, on, replaces, progress))
+    return version
+
+
+def _improved(
+    site: Site, arrivals: list[Arrival], version: str, on: str, replaces: tuple[str, ...], progress: Progress
+) -> Setup:
+    """Make and store it; return the setup of its scans."""
     series = series_of(site)
     base = read_reference(series, on)
     if base is None:
         raise StoreError(f"{series.folder}: no reference to improve")
-    stack, seen_from = Stack(series.grid), _SeenFrom(site, base)
-    laid = [_lay_on(stack, site, arrival, seen_from, progress) for arrival in arrivals]
+    stack, laid = _stacked(site, arrivals, base, progress)
     habits = _learned(base.habits, laid)
     position_m = laid[0].gathered.setup.position_m
     if position_m is None:
@@ -122,8 +139,7 @@ def improve_reference(
         made_from=tuple(one.made.told() for one in laid),
     )
     write_reference(series, improved(base, stack, position_m, version, habits), lineage)
-    _look_at(site, version, laid)
-    return version
+    return laid[-1].gathered.setup
 
 
 @dataclass(frozen=True)
@@ -135,11 +151,19 @@ class _Laid:
     made: Made
 
 
-def _look_at(site: Site, version: str, laid: list[_Laid]) -> None:
-    """Have the outlook ready for the next scan."""
+def _stacked(
+    site: Site, arrivals: list[Arrival], surface: Reference | None, progress: Progress
+) -> tuple[Stack, list[_Laid]]:
+    """Lay scans on a surface, or on none yet, one after the other."""
+    stack, seen_from = Stack(site.grid_cells), _SeenFrom(site, surface)
+    return stack, [_lay_on(stack, site, arrival, seen_from, progress) for arrival in arrivals]
+
+
+def _look_at(site: Site, version: str, setup: Setup) -> None:
+    """Have the outlook of a setup ready for the next scan."""
     reference = open_reference(series_of(site), version)
     if reference is not None:
-        outlook_of(site, laid[-1].gathered.setup, reference)
+        outlook_of(site, setup, reference)
 
 
 def _learned(habits: Habits, laid: list[_Laid]) -> Habits:
