@@ -14,6 +14,7 @@ from pathlib import Path
 from statistics import median
 from typing import Any
 
+LONG_UNUSED_S = 5.0
 LASTING = 3  # processes of an idle service: it, the tracker of its resources, the server of its children
 ONE_THREAD = {"OPENBLAS_NUM_THREADS": "1"}  # a BLAS that spins for work would be counted as work
 
@@ -84,6 +85,18 @@ _startup_s: list[float] = []
 def middle(costs: Sequence[Cost]) -> Cost:
     """Return the median of each figure."""
     return Cost(*(median(getattr(one, name) for one in costs) for name in Cost.__annotations__))
+
+
+def fresh_s_a_gb() -> float:
+    """CPU seconds that a gigabyte takes to be had, which nobody has used for a while.
+
+    Virtual machines that hand free memory back to their host take seconds for it, and so does any program of
+    its size there.
+    """
+    time.sleep(LONG_UNUSED_S)
+    began_s = time.process_time()
+    held = b"1" * 2**30
+    return (time.process_time() - began_s) / (len(held) / 1e9)
 
 
 def family(pid: int) -> list[int]:

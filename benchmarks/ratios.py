@@ -13,7 +13,7 @@ from pathlib import Path
 from rich.console import Console
 from rich.table import Table
 
-from benchmarks.cost import Cost
+from benchmarks.cost import Cost, fresh_s_a_gb
 
 VERSIONS = ("numpy", "scipy", "laspy", "lazrs", "netCDF4", "datashader", "numba", "py4dgeo")
 HEADS = ("CPU-s", "ratio", "wall-s", "ratio ", "peak GB")
@@ -101,9 +101,12 @@ def footer() -> str:
             found.append(f"{name} {version(name)}")
         except PackageNotFoundError:
             continue
+    fresh_s = fresh_s_a_gb()
     cores, loaded = len(os.sched_getaffinity(0)), os.getloadavg()[1]
     said = f"{cores} cores of {cpu}, load {loaded:.1f}, Python {sys.version.split()[0]}, {', '.join(found)}."
     return (
         f"{said} CPU: user and system of the process and its children. Start-up (imports, first compilation)"
-        " is taken off everywhere. Accuracy: python -m benchmarks.accuracy; soak: python -m benchmarks.soak."
+        " is taken off everywhere. A GB of memory that was not used for a while takes"
+        f" {fresh_s:.2g} CPU-s, which is little on a machine of its own."
+        " Accuracy: python -m benchmarks.accuracy; soak: python -m benchmarks.soak."
     )
