@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import netCDF4
@@ -13,7 +13,7 @@ from station.archive.rasters import around
 from station.archive.reference import open_reference
 from station.archive.store import Row, rows
 from station.errors import StoreError
-from station.quantities import Bools, ChangeErrors, Floats, Grid, Quality, Reference, Shared
+from station.quantities import Bools, ChangeErrors, Floats, Grid, Quality, Reals, Reference, Shared
 from station.science import ground
 from station.science.held import share
 from station.science.likeness import common_errors
@@ -134,6 +134,27 @@ class Aggregates:
             median_sigma_m=float(np.sqrt(of_median_m2)),
             coverage=float(seen.mean()),
         )
+
+    def shared_between(self, row: Row, other: Row, part: Grid, elevation_m: Reals, cells: Bools) -> Floats:
+        """Variance (n,) [m²] of what points share in the change from another epoch to one, without its noise.
+
+        Of the chosen cells (ny, nx) of a surface on a grid of its own. Source: EQUATIONS 6.2.
+        """
+        held = [self.read(one, np.zeros(self._series.grid.shape, np.bool_)) for one in (row, other)]
+        told = [(one.scanner, one.unknown) for one in held if one.unknown is not None]
+        common = common_of(held)
+        if common is not None:
+            (scanner, one), (_, another) = told
+            covariance = one.covariance + another.covariance - common - common.T
+            noise = one.noise_variance + another.noise_variance
+            told = [(scanner, replace(one, covariance=covariance, noise_variance=noise))]
+        gradient = smooth_gradient(elevation_m, part.cell_m)
+        variance_m2 = np.zeros(np.count_nonzero(cells))
+        for scanner, unknown in told:
+            of, position_m = self._basis(scanner)
+            felt = cell_sensitivities(of, part, position_m, elevation_m, gradient, cells)
+            variance_m2 += felt.variance(unknown)
+        return variance_m2
 
     def _held(self, cells: Bools, row: Row, other: Row | None) -> list[Held]:
         return [self.read(one, cells) for one in ([row] if other is None else [row, other])]

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from station.archive.aggregate import Aggregates
 from station.archive.layout import Series
 from station.archive.rasters import Raster
 from station.archive.store import COLUMNS, Row
@@ -106,23 +107,27 @@ def look_at(epoch: Row | Measurement, base: Base, *, points: bool = False) -> Lo
 def look_between(row: Row, other: Row, base: Base, series: Series) -> Look:
     """Read what changed from another epoch to one, with its sigma.
 
-    What both do not know of one reference surface cancels cell by cell; what each scan's cells share adds up.
-    Raises StoreError where a file cannot be read.
+    What both do not know of one reference surface cancels cell by cell; of what the points of each share,
+    what both have wrong does. Raises StoreError where a file cannot be read.
     """
     where = base.rows, base.columns, base.factor
-    name = "reference_random_uncertainty"
-    surface = _stored(series.folder / f"reference_{base.version}.nc", None, name, name)
-    known, _, before_m2 = _sums(surface, *where)
-    total_m2 = np.zeros(base.shade.shape, np.float32)
-    change_m = []
-    for one in (row, other):
-        count, *sums = _sums(_bands(one, CHANGE, SIGMA, RANDOM), *where)
-        with np.errstate(invalid="ignore", divide="ignore"):
-            change_m.append(sums[0] / count)
-            own_m2 = np.maximum(sums[2] / count - before_m2 / known, 0) / count
-            total_m2 += own_m2 + np.maximum(sums[1] - sums[2], 0) / count
+    path = series.folder / f"reference_{base.version}.nc"
+    known, height_m, before_m2 = _sums(
+        _stored(path, None, "reference_elevation", "reference_random_uncertainty"), *where
+    )
+    own_m2, change_m = np.zeros(base.shade.shape, np.float32), []
+    with np.errstate(invalid="ignore", divide="ignore"):
+        for one in (row, other):
+            count, total_m, random_m2 = _sums(_bands(one, CHANGE, RANDOM), *where)
+            change_m.append(total_m / count)
+            own_m2 += np.maximum(random_m2 / count - before_m2 / known, 0) / count
+        surface_m = height_m / known
     difference_m = change_m[0] - change_m[1]
-    return Look(base, difference_m, np.where(np.isfinite(difference_m), np.sqrt(total_m2), np.nan))
+    seen = np.isfinite(difference_m)
+    sigma_m = np.full(seen.shape, np.nan, np.float32)
+    shared_m2 = Aggregates(series).shared_between(row, other, base.grid, surface_m, seen)
+    sigma_m[seen] = np.sqrt(own_m2[seen] + shared_m2)
+    return Look(base, difference_m, sigma_m)
 
 
 def _bands(epoch: Row | Measurement, *names: str) -> Bands:

@@ -1,6 +1,7 @@
 """What is in a picture: the right colour at the right place, means of what does not fit, small enough."""
 
 import io
+from dataclasses import replace
 
 import netCDF4
 import numpy as np
@@ -16,10 +17,12 @@ from station.products import maps
 from station.products.colours import change_scale, points_scale, round_up, sigma_scale
 from station.products.look import base_of, look_at, look_between
 from station.products.maps import MOST_BYTES, PAPER, Caption, change_map, encoded, points_map, sigma_map
-from station.quantities import Grid
+from station.quantities import ChangeErrors, Grid, Shared
+from station.science.shared import basis
 
 CAPTION = Caption("Hintereisferner", "2025-11-21 05:00 UTC", "degraded: no weather")
 WIDTH = 1248  # 20 pixels a cell
+SCANNER = (632_300.0, 5_184_500.0, 3200.0)
 
 
 @pytest.fixture
@@ -110,27 +113,52 @@ def test_an_epoch_in_memory_looks_as_it_will_in_the_store(series, small, pixels)
         assert np.nanmax(np.abs(one - other)) <= 2**-11, name  # half of the last digit that a file keeps
 
 
-def test_sigma_between_two_epochs_is_that_of_the_store(series, small):
-    """Cell by cell what `station.variance` says, where no parameters are shared."""
-    before = len(store.rows(series))
+def with_shared(epoch, alike):
+    """An epoch whose points share a lean and errors of a change; `alike` to all others made so, or not."""
+    of, rng = basis(epoch.measurement.grid, SCANNER), np.random.default_rng(5)
+    size = len(of.names)
+    modes = np.zeros((size, 32))
+    modes[:2] = rng.normal(0, 4e-5, (2, 32)) / np.sqrt(32)
+    pattern = np.random.default_rng(0 if alike else int(epoch.start_s)).normal(size=288)
+    covariance = modes @ modes.T
+    covariance[range(2), range(2)] += 2e-10
+    shared = Shared(
+        of.names, of.units, np.zeros(size), covariance, np.zeros(size), ChangeErrors(modes, pattern)
+    )
+    place = dict(zip(("scanner_east", "scanner_north", "scanner_height"), SCANNER, strict=True))
+    numbers = epoch.numbers | place | {"scanner_axis_east": 0.0, "scanner_axis_north": 0.0}
+    return replace(epoch, shared=shared, numbers=numbers)
+
+
+@pytest.mark.parametrize("pixels", [WIDTH, 29])
+@pytest.mark.parametrize(("alike", "low", "high"), [(True, 0.05, 0.6), (False, 0.8, 1.0)])
+def test_sigma_between_two_epochs_is_that_of_the_store(series, small, alike, low, high, pixels):
+    """What `station.variance` says of the mean of a pixel's cells: what both have wrong is not in it."""
     for hour in (7, 9):
-        one = small.make_epoch(hour)
-        one.measurement.cells["uncertainty_m"] = one.measurement.cells["random_uncertainty_m"]
-        store.write_epoch(series, one)
+        store.write_epoch(series, with_shared(small.make_epoch(hour), alike))
     build_series(series)
-    only_random = store.rows(series)[-2:]
-    assert len(store.rows(series)) == before + 2
-    look = look_between(only_random[1], only_random[0], base_of(series, "1", WIDTH), series)
-    found = Aggregates(series)
-    looked_at = 0
-    for row, column in np.argwhere(look.seen)[::200]:
+    other, row = store.rows(series)[-2:]
+    look = look_between(row, other, base_of(series, "1", pixels), series)
+    found, factor, base = Aggregates(series), look.base.factor, look.base
+    with netCDF4.Dataset(row.path) as one, netCDF4.Dataset(other.path) as two:
+        both = [np.ma.filled(file["elevation_change"][0].astype(float), np.nan) for file in (one, two)]
+    seen = np.isfinite(both[0] - both[1])
+    shares = []
+    for at in np.argwhere(look.seen)[:: 200 // factor**2]:
         weights = np.zeros(small.GRID.shape)
-        weights[row, column] = 1
-        wanted = found.variance(weights, only_random[1], only_random[0])
-        assert look.sigma_m[row, column] ** 2 == pytest.approx(wanted, rel=1e-3)
-        looked_at += 1
-    assert looked_at > 5
-    assert np.nanmean(look.change_m[small.RISE]) == pytest.approx(0.10, abs=0.01)
+        first = at * factor + (base.rows.start, base.columns.start)
+        weights[first[0] : first[0] + factor, first[1] : first[1] + factor] = 1
+        if not seen[weights > 0].all():
+            continue
+        weights /= weights.sum()
+        wanted = found.variance(weights, row, other)
+        assert look.sigma_m[tuple(at)] ** 2 == pytest.approx(wanted, rel=1e-3 if factor == 1 else 0.05)
+        apart = sum(found.variance(weights, one) for one in (row, other))
+        shares.append(wanted / apart)
+    assert len(shares) > 5
+    assert low < np.median(shares) < high
+    if factor == 1:
+        assert np.nanmean(look.change_m[small.RISE]) == pytest.approx(0.10, abs=0.01)
 
 
 def test_sigma_and_points_have_their_maps(series, last, small):
