@@ -19,7 +19,7 @@ def test_memory_is_bounded_by_the_grid_not_by_the_points(tmp_path):
 
 
 @pytest.mark.slow
-def test_a_reference_is_made_in_little_more_memory_than_it_has_cells(tmp_path):
+def test_the_memory_that_a_reference_is_made_in_goes_with_its_cells(tmp_path):
     """1,000 x 1,250 and 2,000 x 2,500 cells: what the larger takes more."""
     peaks_gb = [referenced(large_station(tmp_path, 100_000, size=size)).peak_gb for size in (0.25, 0.5)]
     more_cells = 4000 * 5000 * (0.5**2 - 0.25**2)

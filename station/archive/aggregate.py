@@ -136,9 +136,10 @@ class Aggregates:
         )
 
     def shared_between(self, row: Row, other: Row, part: Grid, elevation_m: Reals, cells: Bools) -> Floats:
-        """Variance (n,) [m²] of what points share in the change from another epoch to one, without its noise.
+        """Variance (n,) of the change from another epoch to one, as far as points of a scan share it [m²].
 
-        Of the chosen cells (ny, nx) of a surface on a grid of its own. Source: EQUATIONS 6.2.
+        Of the chosen cells (ny, nx) of a surface on a grid of its own: a cell's own noise is not in it.
+        Source: EQUATIONS 6.2.
         """
         held = [self.read(one, np.zeros(self._series.grid.shape, np.bool_)) for one in (row, other)]
         told = [(one.scanner, one.unknown) for one in held if one.unknown is not None]
