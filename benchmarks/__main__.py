@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks.cost import Cost, FailedError, cost_of, job_cost, middle
+from benchmarks.growth import STEPS
 from benchmarks.peers import M3C2, PEERS, Peer, Work, take
 from benchmarks.ratios import Row, show
 from station.service.child import SURROUNDINGS
@@ -21,7 +22,7 @@ ROUNDS = 3  # and scans, of each the median
 MUST_PEAK_GB = 0.9
 MUST_PEAK_GROWTH = 1.1
 MUST_EPOCHS = 1.2
-OVER_EPOCHS = "growth over epochs: what follows an epoch; ratios to the fewest"
+OVER_EPOCHS = "growth over epochs: file, series, areas and page, or all but the file; ratios to the fewest"
 FEW_SHARE, MANY_TIMES = 0.1, 4  # of the points: 1.44, 14.4 and 57.6 million
 SIZES = (0.25, 0.5, 1.0)  # of the grid: 1,000 x 1,250 to 4,000 x 5,000
 QUICK_SIZE, QUICK_POINTS = 0.05, 40_000
@@ -174,16 +175,17 @@ def _over_cells(run: Run, full: str) -> list[Row]:
 
 
 def _over_epochs(found: dict[str, float]) -> list[Row]:
+    """Return what the store takes for an epoch, and how much of that comes after its file."""
     rows = []
     for size, grid in (("full", "the full grid"), ("small", "a tiny grid")):
-        few, year = (
-            Cost(sum(value for name, value in found.items() if name.endswith(f"_s_{size}_{word}")))
-            for word in ("few", "year")
-        )
-        rows += [
-            Row(f"station, epoch 10, {grid}", few, few),
-            Row(f"station, epoch 8,760, {grid}", year, few, {"cpu": MUST_EPOCHS}),
-        ]
+        for steps, what, must in ((STEPS, "epoch", {"cpu": MUST_EPOCHS}), (STEPS[1:], "after epoch", {})):
+            few, year = (
+                Cost(sum(found[f"{step}_{size}_{word}"] for step in steps)) for word in ("few", "year")
+            )
+            rows += [
+                Row(f"station, {what} 10, {grid}", few, few),
+                Row(f"station, {what} 8,760, {grid}", year, few, must),
+            ]
     return rows
 
 

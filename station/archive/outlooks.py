@@ -148,19 +148,19 @@ class _Plain:
         return values.view(self._dtype).reshape(-1, *self._shape[1:])
 
     def __array__(self, dtype: Any = None, copy: bool | None = None) -> Array:  # noqa: ANN401, FBT001 - numpy's
-        """Return all of it, where the system keeps the file: memory is taken only for what is overwritten."""
+        """Return all of it, where the system keeps the file, to be read only; or a copy."""
         for begin, end in pairwise(self._edges.tolist()):
             self[begin:end]  # for the checksums; and a disk that fails tells so here, not by a signal
         skipped = self._at % mmap.ALLOCATIONGRANULARITY
         size = self._shape[0] * self._row_bytes
         try:
             held = mmap.mmap(
-                self._kept.descriptor, skipped + size, access=mmap.ACCESS_COPY, offset=self._at - skipped
+                self._kept.descriptor, skipped + size, access=mmap.ACCESS_READ, offset=self._at - skipped
             )
         except OSError as error:
             raise StoreError(f"{self._path}: cannot be read: {error}") from error
         values = np.frombuffer(held, self._dtype, size // self._dtype.itemsize, skipped)
-        return np.asarray(values.reshape(self._shape), dtype=dtype)
+        return np.array(values.reshape(self._shape), dtype=dtype, copy=copy)
 
 
 def _edges(rows: int) -> Ints:

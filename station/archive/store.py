@@ -5,11 +5,11 @@ from __future__ import annotations
 import os
 import re
 from bisect import bisect_right
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import overload
+from typing import Any, overload
 
 import h5py
 import netCDF4
@@ -36,6 +36,9 @@ COLUMNS = {  # of a measurement, by variable
 }
 AIR = ("air_temperature", "air_pressure", "relative_humidity")  # variables, told where weather was known
 _EPOCH_NAME = re.compile(r"_(\d{8}T\d{6}Z)(?:_r(\d+))?\.nc$")
+
+Array = np.ndarray[Any, Any]
+Seen = Callable[[slice, Mapping[str, Array]], None]
 
 
 @dataclass(frozen=True)
@@ -77,11 +80,12 @@ class Row:
     time_s: float
 
 
-def write_epoch(series: Series, epoch: Epoch, newer_than: int = 0) -> Stored:
+def write_epoch(series: Series, epoch: Epoch, newer_than: int = 0, seen: Seen | None = None) -> Stored:
     """Write an epoch beside the series; raise StoreError where it cannot, and leave nothing then.
 
     A second epoch of the same start is a new revision, also where the journal remembers one (`newer_than`)
-    whose file is lost; no file is ever changed.
+    whose file is lost; no file is ever changed. `seen` is shown its rasters as they are written, some rows of
+    the grid at a time: to lay them out again takes half as long.
     """
     start = datetime.fromtimestamp(epoch.start_s, UTC)
     known = [0, *(one.revision for one in revisions(series, start))]
@@ -96,13 +100,16 @@ def write_epoch(series: Series, epoch: Epoch, newer_than: int = 0) -> Stored:
             _write(file, series, epoch, path.name)
         columns = _columns(epoch.measurement)
         rows = {column: BY_NAME[name] for name, column in columns.items()}
-        write_rasters(
-            beside,
-            list(rows.values()),
-            lambda band: epoch.measurement.laid(
-                *rows, rows=band, made=lambda column, values: rounded(rows[column], values)
-            ),
-        )
+
+        def band(part: slice) -> list[Array]:
+            laid = epoch.measurement.laid(
+                *rows, rows=part, made=lambda column, values: rounded(rows[column], values)
+            )
+            if seen is not None:
+                seen(part, dict(zip(columns, laid, strict=True)))
+            return laid
+
+        write_rasters(beside, list(rows.values()), band)
     return Stored(path, start, revision)
 
 

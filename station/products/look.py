@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -12,9 +12,9 @@ import numpy as np
 from station.archive.aggregate import Aggregates
 from station.archive.layout import Series
 from station.archive.rasters import Raster
-from station.archive.store import COLUMNS, Row
+from station.archive.store import Row
 from station.archive.variables import FILL
-from station.quantities import Bools, Floats32, Grid, Measurement
+from station.quantities import Bools, Floats32, Grid
 from station.science.change import significant
 
 BAND_ROWS = 128  # that a file holds together
@@ -27,7 +27,8 @@ CHANGE, SIGMA, RANDOM = (
 )
 POINTS = "point_count"
 
-Bands = Callable[[slice], Iterable[np.ndarray[Any, Any]]]  # gives some rows (r, nx) of each of some rasters
+Array = np.ndarray[Any, Any]
+Bands = Callable[[slice], Iterable[Array]]  # gives some rows (r, nx) of each of some rasters
 
 
 @dataclass(frozen=True)
@@ -74,7 +75,7 @@ def base_of(series: Series, version: str, pixels: int) -> Base:
     longer = max(rows.stop - rows.start, columns.stop - columns.start)
     factor = max(1, longer // pixels)
     rows, columns = (_whole(part, factor, n) for part, n in ((rows, grid.ny), (columns, grid.nx)))
-    count, total = _sums(surface, rows, columns, factor)
+    count, total = _pass(surface, _Sums(rows, columns, factor, 1))
     with np.errstate(invalid="ignore"):
         elevation_m = total / count
     part = Grid(
@@ -87,21 +88,42 @@ def base_of(series: Series, version: str, pixels: int) -> Base:
     return Base(version, factor, rows, columns, _shade(elevation_m, part.cell_m), part)
 
 
-def look_at(epoch: Row | Measurement, base: Base, *, points: bool = False) -> Look:
-    """See the change of an epoch, and how many points its cells have where that is asked for.
+def look_at(row: Row, base: Base, *, points: bool = False) -> Look:
+    """See the change of a stored epoch, and how many points its cells have where that is asked for.
 
-    It is read from the store, or taken as it was just measured: to inflate it takes five times as long. A
-    pixel's sigma is that of its mean: what cells share does not average out. Raises StoreError where the file
-    cannot be read.
+    Raises StoreError where the file cannot be read. Inflating it takes nearly all the time.
     """
-    counted = (POINTS,) if points else ()
-    if base.factor == 1:
-        cells = _bands(epoch, CHANGE, SIGMA, *counted)(base.rows)
-        change_m, sigma_m, *total = (_cells(values, base.columns) for values in cells)
-    else:
-        change_m, sigma_m, *total = _means(epoch, base, *counted)
-    mean_points = [np.where(one > 0, one / base.factor**2, np.nan).astype(np.float32) for one in total]
-    return Look(base, change_m, sigma_m, *mean_points)
+    looking = Looking(base, points=points)
+    _pass(_stored(row.path, row.index, *looking.names), looking.sums)
+    return looking.look()
+
+
+class Looking:
+    """A look at an epoch that comes to be as the epoch comes by, some rows of its rasters at a time.
+
+    A pixel's sigma is that of its mean: what cells share is taken as one within a pixel and does not average
+    out.
+    """
+
+    def __init__(self, base: Base, *, points: bool = False) -> None:
+        """Begin; with `points` to tell how many points cells have."""
+        self._base = base
+        self.names = (CHANGE, SIGMA, RANDOM, *((POINTS,) if points else ()))
+        self.sums = _Sums(base.rows, base.columns, base.factor, len(self.names), counted=int(points))
+
+    def add(self, rows: slice, band: Mapping[str, Array]) -> None:
+        """Take some rows (r, nx) of the rasters as a file holds them, fill included."""
+        self.sums.add(rows.start, (band[name] for name in self.names))
+
+    def look(self) -> Look:
+        """See what has come by."""
+        count, total, sigma_m2, random_m2, *points = self.sums.totals
+        with np.errstate(invalid="ignore", divide="ignore"):
+            shared_m2 = np.maximum(sigma_m2 - random_m2, 0) / count
+            change_m, sigma_m = total / count, np.sqrt(random_m2 / count**2 + shared_m2)
+        cells = self._base.factor**2
+        mean_points = [np.where(one > 0, one / cells, np.nan).astype(np.float32) for one in points]
+        return Look(self._base, change_m, sigma_m, *mean_points)
 
 
 def look_between(row: Row, other: Row, base: Base, series: Series) -> Look:
@@ -112,13 +134,13 @@ def look_between(row: Row, other: Row, base: Base, series: Series) -> Look:
     """
     where = base.rows, base.columns, base.factor
     path = series.folder / f"reference_{base.version}.nc"
-    known, height_m, before_m2 = _sums(
-        _stored(path, None, "reference_elevation", "reference_random_uncertainty"), *where
+    known, height_m, before_m2 = _pass(
+        _stored(path, None, "reference_elevation", "reference_random_uncertainty"), _Sums(*where, 2)
     )
     own_m2, change_m = np.zeros(base.shade.shape, np.float32), []
     with np.errstate(invalid="ignore", divide="ignore"):
         for one in (row, other):
-            count, total_m, random_m2 = _sums(_bands(one, CHANGE, RANDOM), *where)
+            count, total_m, random_m2 = _pass(_stored(one.path, one.index, CHANGE, RANDOM), _Sums(*where, 2))
             change_m.append(total_m / count)
             own_m2 += np.maximum(random_m2 / count - before_m2 / known, 0) / count
         surface_m = height_m / known
@@ -130,71 +152,67 @@ def look_between(row: Row, other: Row, base: Base, series: Series) -> Look:
     return Look(base, difference_m, sigma_m)
 
 
-def _bands(epoch: Row | Measurement, *names: str) -> Bands:
-    if isinstance(epoch, Row):
-        return _stored(epoch.path, epoch.index, *names)
-    return lambda rows: epoch.laid(*(COLUMNS[name] for name in names), rows=rows)
-
-
 def _stored(path: Path, index: int | None, *names: str) -> Bands:
     rasters = [Raster(path, name, index=index) for name in names]
     return lambda rows: (raster[rows] for raster in rasters)
 
 
-def _means(epoch: Row | Measurement, base: Base, *counted: str) -> tuple[Floats32, ...]:
-    """Mean change of blocks of cells and its sigma: what they share is taken as one within a block.
+class _Sums:
+    """Sums over blocks of cells, of rasters that come by band by band, as high as they like.
 
-    And the sums of rasters that count something.
+    `totals`: of ones where the first raster has a value, of that, of the others' squares; of the `counted`
+    last ones of what they count.
     """
-    bands, where = _bands(epoch, CHANGE, SIGMA, RANDOM, *counted), (base.rows, base.columns, base.factor)
-    count, total, sigma_m2, random_m2, *totals = _sums(bands, *where, len(counted))
-    with np.errstate(invalid="ignore", divide="ignore"):
-        shared_m2 = np.maximum(sigma_m2 - random_m2, 0) / count
-        return total / count, np.sqrt(random_m2 / count**2 + shared_m2), *totals
 
+    def __init__(self, rows: slice, columns: slice, factor: int, rasters: int, *, counted: int = 0) -> None:
+        self.rows, self._columns, self.factor, self._counted = rows, columns, factor, counted
+        shape = (rows.stop - rows.start) // factor, (columns.stop - columns.start) // factor
+        self.totals: list[Floats32] = [np.zeros(shape, np.float32) for _ in range(1 + rasters)]
 
-def _sums(bands: Bands, rows: slice, columns: slice, factor: int, counted: int = 0) -> list[Floats32]:
-    """Sums over blocks of cells: of ones where the first raster has a value, of that, of the others' squares.
-
-    Of the `counted` last ones it is what they count. Band by band; of what is stored, inflating it takes
-    nearly all the time.
-    """
-    told = []
-    height = max(1, BAND_ROWS // factor) * factor
-    for top in range(rows.start, rows.stop, height):
-        part = bands(slice(top, min(top + height, rows.stop)))
-        first, *others = (_filled(values, columns) for values in part)
+    def add(self, top: int, band: Iterable[Array]) -> None:
+        """Add some rows (r, nx) of each raster, the first of which is the grid's `top`."""
+        begin, end = (max(edge - top, 0) for edge in (self.rows.start, self.rows.stop))
+        first, *others = (_filled(values[begin:end], self._columns) for values in band)
         seen = first < FILL / 2
         first *= seen
-        last = len(others) - counted
+        last = len(others) - self._counted
         squares = ((values * seen) ** 2 for values in others[:last])
-        summed = seen.astype(np.float32), first, *squares, *others[last:]
-        told.append([_blocks(values, factor) for values in summed])
-    return [np.concatenate(parts) for parts in zip(*told, strict=True)]
+        pixel, skipped = divmod(top + begin - self.rows.start, self.factor)
+        for total, values in zip(
+            self.totals, (seen.astype(np.float32), first, *squares, *others[last:]), strict=True
+        ):
+            blocks = _blocks(values, skipped, self.factor)
+            total[pixel : pixel + len(blocks)] += blocks
 
 
-def _blocks(values: Floats32, factor: int) -> Floats32:
-    """Sum over blocks of cells; adding every nth row is three times as fast as reshaping."""
-    rows = values[::factor].copy()
-    for first in range(1, factor):
-        rows += values[first::factor]
+def _pass(bands: Bands, sums: _Sums) -> list[Floats32]:
+    """Return the sums of rasters once all of them has come by."""
+    height = max(1, BAND_ROWS // sums.factor) * sums.factor
+    for top in range(sums.rows.start, sums.rows.stop, height):
+        sums.add(top, bands(slice(top, min(top + height, sums.rows.stop))))
+    return sums.totals
+
+
+def _blocks(values: Floats32, skipped: int, factor: int) -> Floats32:
+    """Sum over blocks of cells, of the first of which some rows were skipped.
+
+    Adding every nth row is three times as fast as reshaping.
+    """
+    rows = np.zeros((-(-(skipped + len(values)) // factor), values.shape[1]), np.float32)
+    for first in range(min(factor, len(values))):
+        every = values[first::factor]
+        at = (skipped + first) // factor
+        rows[at : at + len(every)] += every
     total = rows[:, ::factor].copy()
     for first in range(1, factor):
         total += rows[:, first::factor]
     return np.asarray(total)
 
 
-def _filled(values: np.ndarray[Any, Any], columns: slice) -> Floats32:
+def _filled(values: Array, columns: slice) -> Floats32:
     """Return some columns as they stand in a file, with the fill where they have no value."""
     part = values[:, columns].astype(np.float32)
     return np.fmin(part, np.float32(FILL), out=part)
-
-
-def _cells(raster: np.ndarray[Any, Any], columns: slice) -> Floats32:
-    """Return some columns, NaN where they have no value."""
-    values = _filled(raster, columns)
-    values[values > FILL / 2] = np.nan
-    return values
 
 
 def _known(surface: Bands, grid: Grid) -> tuple[slice, slice]:

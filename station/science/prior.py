@@ -226,22 +226,19 @@ def _missed_by_log(lines: Lines, lean: Lean, zero: Cycle, habits: Habits, beside
 
     Along the line of sight, or along a direction so far counter-clockwise beside it.
     """
-    _, fast, white = motions(lines)
     apart_s = np.abs(np.subtract.outer(lines.time_s, lines.time_s))
-    apart_rad = np.subtract.outer(lines.azimuth_rad, lines.azimuth_rad)
+    along = tilt_along(lines.azimuth_rad)
+    alike = along @ along.T  # the cosine of the angle between lines
     # The share of the slow motion's spectrum (a Lorentzian) that lies above the cut-off.
     missed = 1 - 2 / math.pi * math.atan(2 * math.pi * lean.cutoff_hz * SLOW_MOTION_S)
     width_s = lean.memory_s / (2 * math.sqrt(math.pi))  # of the Gaussian window with the same memory
-    noise = np.exp(-((apart_s / width_s) ** 2) / 4) * np.cos(apart_rad)
     changes = cycle_changes(lines, zero, beside_rad)
-    return np.asarray(
-        habits.fast_motion_rad**2 * fast
-        + habits.line_motion_rad**2 * white
-        + habits.slow_motion_rad**2 * missed * np.exp(-apart_s / max(lean.memory_s, 1.0))
-        + lean.filtered_noise_rad**2 * noise
-        + CYCLE_CHANGE_RAD**2 * np.cos(apart_rad) ** 2
-        + changes @ changes.T
-    )
+    told = changes @ changes.T + CYCLE_CHANGE_RAD**2 * alike**2
+    told += lean.filtered_noise_rad**2 * np.exp(-((apart_s / width_s) ** 2) / 4) * alike
+    told += habits.fast_motion_rad**2 * np.exp(-apart_s / FAST_MOTION_S)
+    told += habits.slow_motion_rad**2 * missed * np.exp(-apart_s / max(lean.memory_s, 1.0))
+    told[np.diag_indices_from(told)] += habits.line_motion_rad**2
+    return np.asarray(told)
 
 
 def cycle_changes(lines: Lines, zero: Cycle, beside_rad: float = 0.0) -> Floats:

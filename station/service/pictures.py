@@ -1,14 +1,17 @@
-"""What the pictures of a scan need, taken while it is in memory: reading it again is five times the work."""
+"""What the pictures of a scan need, taken as it is written: reading it again is five times the work."""
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping
 from pathlib import Path
+from typing import Any
+
+import numpy as np
 
 from station.archive.layout import Series
-from station.archive.store import Epoch
 from station.config import Site
 from station.products.gallery import kept_base
-from station.products.look import Look, look_at
+from station.products.look import Look, Looking
 
 
 def page_folder(site: Site) -> Path:
@@ -16,16 +19,36 @@ def page_folder(site: Site) -> Path:
     return site.station.data / "page"
 
 
-def look_in_memory(site: Site, series: Series, epoch: Epoch) -> Look | None:
-    """See an epoch as its pictures will; None where it has no change, or only the store can tell.
+class Watched:
+    """An epoch seen as its pictures will show it, while it is written.
 
-    It is stored by now, and nothing that goes wrong here may cost it.
+    Nothing that goes wrong here may cost the epoch: the page is made from the store then, and tells why.
     """
-    version = epoch.provenance["reference_version"]
-    if not version:
-        return None
-    try:
+
+    def __init__(self, site: Site, series: Series, version: str) -> None:
+        """Prepare for an epoch that was measured from a version of the reference; without one for none."""
+        self._looking: Looking | None = None
+        if version:
+            self._try(lambda: self._begin(site, series, version))
+
+    def _begin(self, site: Site, series: Series, version: str) -> None:
         base = kept_base(series, page_folder(site), version, site.products.quicklook_width_px)
-        return look_at(epoch.measurement, base, points=True)
-    except Exception:  # noqa: BLE001 - the page is made from the store then, and tells what is wrong
-        return None
+        self._looking = Looking(base, points=True)
+
+    def add(self, rows: slice, rasters: Mapping[str, np.ndarray[Any, Any]]) -> None:
+        """See some rows, as `store.write_epoch` shows them."""
+        if (looking := self._looking) is not None:
+            self._try(lambda: looking.add(rows, rasters))
+
+    @property
+    def look(self) -> Look | None:
+        """What has been seen; None where nothing was to be, or something went wrong."""
+        looking = self._looking
+        return None if looking is None else self._try(looking.look)
+
+    def _try(self, step: Callable[[], Look | None]) -> Look | None:
+        try:
+            return step()
+        except Exception:  # noqa: BLE001 - whatever it is
+            self._looking = None
+            return None

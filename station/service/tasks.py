@@ -47,7 +47,7 @@ from station.service.child import give_back
 from station.service.content import held_still, sha256_of
 from station.service.gather import Gathered, gather
 from station.service.inbox import Arrival
-from station.service.pictures import look_in_memory
+from station.service.pictures import Watched
 
 Progress = Callable[[], None]
 CELLS_MOST = 500_000  # that the figures of a scan are of; of more, some
@@ -161,7 +161,9 @@ def process(
             site, arrival, scan_sha256, reference, progress, rehearsal=False, wait_for_weather=young
         )
     give_back()
-    written = _same_as(series, epoch) or store.write_epoch(series, epoch, newer_than=past.revision)
+    version, written = epoch.provenance["reference_version"], _same_as(series, epoch)
+    watched = Watched(site, series, version if looked_at and written is None else "")
+    written = written or store.write_epoch(series, epoch, past.revision, watched.add)
     return Outcome(
         start_utc_s=epoch.start_s,
         sha256=scan_sha256,
@@ -169,11 +171,11 @@ def process(
         revision=written.revision,
         verdict=epoch.verdict,
         reason=epoch.verdict_reason,
-        reference=epoch.provenance["reference_version"] or None,
+        reference=version or None,
         figures=_figures(epoch, time.monotonic() - began_s),
         log_sha256=epoch.provenance["log_sha256"],
         epoch_sha256=sha256_of(written.path),
-        look=look_in_memory(site, series, epoch) if looked_at else None,
+        look=watched.look,
     )
 
 
