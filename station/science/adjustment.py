@@ -342,9 +342,10 @@ def _scatter(patches: Patches, left_m: Floats, moving: Bools) -> Floats:
 def _excess(left_m: Floats, variance_m2: Floats, most_m: float) -> float:
     """Variance that residuals have beyond their random errors [m²], robustly: by their median."""
     low, high = SCATTER_M[0] ** 2, most_m**2
+    apart_m2 = left_m**2 / CHI2_MEDIAN - variance_m2
     for _ in range(30):
         middle = float(np.sqrt(low * high))
-        if np.median(left_m**2 / (variance_m2 + middle)) > CHI2_MEDIAN:
+        if np.count_nonzero(apart_m2 > middle) > len(apart_m2) / 2:
             low = middle
         else:
             high = middle

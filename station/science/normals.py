@@ -7,6 +7,7 @@ line's own lean is taken out before and found again after. Source: EQUATIONS 6.3
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from scipy import linalg, sparse
@@ -254,10 +255,15 @@ class Unknown:
     def _lines(self) -> slice:
         return slice(len(GLOBAL), len(GLOBAL) + self.of.line_count)
 
+    @cached_property
+    def _own_felt(self) -> Floats:
+        """How the own leans (lines, m) go with the unknowns."""
+        return self.own.times(self.felt.toarray())
+
     def _tied(self) -> Floats:
         """How the state (u, m) goes with the unknowns."""
         tied = rows_at_lines(self.of, np.eye(len(self.of.names), self.felt.shape[1]))
-        tied[self._lines] -= self.own.times(self.felt.toarray())
+        tied[self._lines] -= self._own_felt
         return np.asarray(tied)
 
     def going_with(self, at_knots: Floats, by_line: Floats) -> tuple[Floats, Floats]:
@@ -274,7 +280,7 @@ class Unknown:
         """Return what is known of the state (u,), condensed to knots."""
         of, own, between = self.of, self.own, leans_between(self.of)
         lean = slice(len(GLOBAL), len(GLOBAL) + of.lean_count)
-        felt = own.times(self.felt.toarray())
+        felt = self._own_felt
         narrow = between.fit @ felt
         tied = np.eye(len(of.names), self.felt.shape[1])
         tied[lean] -= narrow

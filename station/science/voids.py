@@ -63,18 +63,14 @@ def void_variance(cells: Bools, reach: Ints, change_m: Floats, random_variance_m
 
 def _semivariance(change_m: Floats, random_variance_m2: Floats, lag: int) -> float:
     """Half the mean square of what cells so many apart differ by, less their noise [m²]."""
-    total, count = 0.0, 0
-    for axis in (0, 1):
-        if change_m.shape[axis] <= lag:
-            continue
-        one, other = (np.moveaxis(change_m, axis, 0)[part] for part in (np.s_[lag:], np.s_[:-lag]))
-        noise = np.moveaxis(random_variance_m2, axis, 0)
-        both = np.isfinite(one) & np.isfinite(other)
-        total += float(np.sum((one - other)[both] ** 2 - (noise[lag:] + noise[:-lag])[both]))
-        count += int(np.count_nonzero(both))
+    total_m2, count = 0.0, 0
+    for surface_m, noise_m2 in ((change_m, random_variance_m2), (change_m.T, random_variance_m2.T)):
+        apart_m2 = (surface_m[lag:] - surface_m[:-lag]) ** 2 - (noise_m2[lag:] + noise_m2[:-lag])
+        total_m2 += float(np.nansum(apart_m2))
+        count += int(np.count_nonzero(np.isfinite(apart_m2)))
     if not count:  # nothing is seen so far apart: as much as all that is seen varies
         return float(np.nanvar(change_m))
-    return max(total / count / 2, 0.0)
+    return max(total_m2 / count / 2, 0.0)
 
 
 def _window_sum(values: Floats, width: int) -> Floats:
