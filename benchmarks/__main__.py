@@ -12,8 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from benchmarks.cost import Cost, FailedError, cost_of, job_cost, middle
-from benchmarks.growth import STEPS
+from benchmarks.cost import STEPS, Cost, FailedError, cost_of, job_cost, middle
 from benchmarks.peers import M3C2, PEERS, Peer, Work, take
 from benchmarks.ratios import Row, show
 from station.service.child import SURROUNDINGS

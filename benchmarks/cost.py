@@ -16,6 +16,7 @@ from typing import Any
 
 LONG_UNUSED_S = 5.0
 LASTING = 3  # processes of an idle service: it, the tracker of its resources, the server of its children
+STEPS = ("write_s", "publish_s", "show_s")  # of what the store takes for an epoch
 ONE_THREAD = {"OPENBLAS_NUM_THREADS": "1"}  # a BLAS that spins for work would be counted as work
 
 

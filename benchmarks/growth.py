@@ -17,6 +17,7 @@ import numpy as np
 import xarray as xr
 from scipy import ndimage
 
+from benchmarks.cost import STEPS
 from station.archive import join, store
 from station.archive.aggregate import AreaChange
 from station.archive.areas import update_areas
@@ -44,7 +45,6 @@ SMALL = Grid(west_m=632_000.0, north_m=5_186_000.0, cell_m=10.0, nx=60, ny=45)
 FULL = Grid(west_m=632_000.0, north_m=5_186_000.0, cell_m=1.0, nx=4000, ny=5000)
 DISTINCT = 3  # rasters that the epochs of a store take turns with
 ROUNDS = 3
-STEPS = ("write_s", "publish_s", "show_s")  # of an epoch
 SHOWN = 20
 READ = ("elevation", "elevation_change")  # variables of the year on the full grid
 SEEN = 0.31  # of a grid's cells, in an epoch

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -33,7 +34,7 @@ class Sums:
     residual: Ints
     square: Ints
 
-    @property
+    @cached_property
     def count(self) -> Ints32:
         """Points in each cell (ny, nx)."""
         return (self.tally >> BITS).astype(np.int32)

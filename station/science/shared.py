@@ -285,9 +285,9 @@ def sensitivities(
     assumed one. Source: EQUATIONS 6.1.
     """
     x_m, y_m, z_m = offset_m
-    horizontal_m = np.maximum(np.hypot(x_m, y_m), 1e-6)
+    horizontal_m = np.maximum(np.sqrt(x_m**2 + y_m**2), 1e-6)  # np.hypot takes five times as long
     along_m = z_m - east_gradient * x_m - north_gradient * y_m  # n_u · P
-    range_m = np.hypot(horizontal_m, z_m)
+    range_m = np.sqrt(horizontal_m**2 + z_m**2)
     rise_m = horizontal_m + z_m * (east_gradient * x_m + north_gradient * y_m) / horizontal_m  # F
     one = np.ones_like(x_m)
     return Sensitivities(
