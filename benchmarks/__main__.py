@@ -8,6 +8,7 @@ from __future__ import annotations
 import argparse
 import sys
 import tempfile
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -74,18 +75,15 @@ class Data:
 def measured(run: Run) -> list[tuple[str, list[Row]]]:
     """Return the sections of the table."""
     data = _data(run)
-    _say("decoding")
-    floor = middle([run.decode(scan) for scan in data.coming])
     epoch = Row(
         "station, epoch written",
-        _own(run, "epoch", data),
-        floor,
+        *_own(run, "epoch", data),
         {"cpu": 1.25, "peak_gb": MUST_PEAK_GB},
         {"cpu": 1.1},
         "adjustment, pictures",
     )
     return [
-        (f"{run.points / 1e6:g} million points: ratios to decoding them", _ways(run, data, floor, epoch)),
+        (f"{run.points / 1e6:g} million points: ratios to decoding them", _ways(run, data, epoch)),
         ("growth over points: epoch written; ratios to decoding them", _over_points(run, data.alone, epoch)),
         ("growth over cells: epoch written; ratios to the smallest grid", _over_cells(run, data.alone)),
         *_store(run),
@@ -103,44 +101,53 @@ def _data(run: Run) -> Data:
     return Data(site, alone["site"], served["site"], of_reference[0], coming)
 
 
-def _ways(run: Run, data: Data, floor: Cost, epoch: Row) -> list[Row]:
+def _ways(run: Run, data: Data, epoch: Row) -> list[Row]:
     """Return what the station takes for a scan, and what others take."""
     _say("the service")
+    decoded = [run.decode(scan) for scan in data.coming]
     _, served = run.own("serve", site=data.served, scans=data.coming)
-    service = middle([Cost(**one) for one in served["took"]])
+    decoded += [run.decode(scan) for scan in data.coming]
+    floor, service = middle(decoded), middle([Cost(**one) for one in served["took"]])
     works = [
         Work(**run.own("work", site=data.site, scan=scan, before=data.before)[1]) for scan in data.coming
     ]
-    million = "its functions, a million points at once"
     return [
         Row("laspy + lazrs, one thread", floor, floor),
-        Row("station, on the grid", _own(run, "hot", data), floor, note="epoch, adjustment"),
+        Row("station, on the grid", *_own(run, "hot", data), note="epoch, adjustment"),
         epoch,
         Row(
             "station, running service", service, floor, {"cpu": 2.0, "wall": 1.6, "peak_gb": MUST_PEAK_GB}
         ),
-        Row(million, _own(run, "chunks", data), floor, note="epoch, adjustment"),
-        *(_peer(run, peer, works, floor) for peer in PEERS),
+        Row("its functions, a million points at once", *_own(run, "chunks", data), note="epoch, adjustment"),
+        *(_peer(run, peer, works) for peer in PEERS),
     ]  # fmt: skip
 
 
-def _own(run: Run, job: str, data: Data) -> Cost:
+def _own(run: Run, job: str, data: Data) -> tuple[Cost, Cost]:
+    """Return what a job takes for a scan, and what decoding it takes."""
     _say(job)
-    cost = middle([run.own(job, site=data.alone, scan=scan)[0] for scan in data.coming])
+    cost, floor = _beside(run, data.coming, lambda scan: run.own(job, site=data.alone, scan=scan)[0])
     _say(f"  {cost.cpu_s:.2f} CPU-s")
-    return cost
+    return cost, floor
 
 
-def _peer(run: Run, peer: Peer, works: list[Work], floor: Cost) -> Row:
+def _beside(run: Run, scans: list[str], take_it: Callable[[str], Cost]) -> tuple[Cost, Cost]:
+    """Return what work on a scan takes, and what decoding takes just before: machines have slower minutes."""
+    floors, costs = zip(*((run.decode(scan), take_it(scan)) for scan in scans), strict=True)
+    return middle(costs), middle(floors)
+
+
+def _peer(run: Run, peer: Peer, works: list[Work]) -> Row:
     """Return the row of a peer, also where it is not there or fails."""
     if not peer.is_there:
         return Row(peer.title, None, note="not installed")
     _say(peer.title)
+    by_scan = {work.scan: work for work in works}
     try:
-        costs = [take(peer, work, run.folder)[0] for work in works]
+        costs = _beside(run, list(by_scan), lambda scan: take(peer, by_scan[scan], run.folder)[0])
     except FailedError as error:
         return Row(peer.title, None, note=f"failed: {error}")
-    return Row(peer.title, middle(costs), floor, note=peer.lacks)
+    return Row(peer.title, *costs, note=peer.lacks)
 
 
 def _over_points(run: Run, site: str, measured: Row) -> list[Row]:

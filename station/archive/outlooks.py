@@ -149,6 +149,8 @@ class _Plain:
 
     def __array__(self, dtype: Any = None, copy: bool | None = None) -> Array:  # noqa: ANN401, FBT001 - numpy's
         """Return all of it, where the system keeps the file, to be read only; or a copy."""
+        if copy:
+            return np.asarray(self[:], dtype=dtype)
         for begin, end in pairwise(self._edges.tolist()):
             self[begin:end]  # for the checksums; and a disk that fails tells so here, not by a signal
         skipped = self._at % mmap.ALLOCATIONGRANULARITY
@@ -160,7 +162,7 @@ class _Plain:
         except OSError as error:
             raise StoreError(f"{self._path}: cannot be read: {error}") from error
         values = np.frombuffer(held, self._dtype, size // self._dtype.itemsize, skipped)
-        return np.array(values.reshape(self._shape), dtype=dtype, copy=copy)
+        return np.asarray(values.reshape(self._shape), dtype=dtype)
 
 
 def _edges(rows: int) -> Ints:

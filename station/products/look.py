@@ -172,14 +172,13 @@ class _Sums:
     def add(self, top: int, band: Iterable[Array]) -> None:
         """Add some rows (r, nx) of each raster, the first of which is the grid's `top`."""
         begin, end = (max(edge - top, 0) for edge in (self.rows.start, self.rows.stop))
-        first, *others = (_filled(values[begin:end], self._columns) for values in band)
+        first, *others = (_single(values[begin:end, self._columns]) for values in band)
         seen = first < FILL / 2
-        first *= seen
         last = len(others) - self._counted
         squares = ((values * seen) ** 2 for values in others[:last])
         pixel, skipped = divmod(top + begin - self.rows.start, self.factor)
         for total, values in zip(
-            self.totals, (seen.astype(np.float32), first, *squares, *others[last:]), strict=True
+            self.totals, (_single(seen), first * seen, *squares, *others[last:]), strict=True
         ):
             blocks = _blocks(values, skipped, self.factor)
             total[pixel : pixel + len(blocks)] += blocks
@@ -209,10 +208,9 @@ def _blocks(values: Floats32, skipped: int, factor: int) -> Floats32:
     return np.asarray(total)
 
 
-def _filled(values: Array, columns: slice) -> Floats32:
-    """Return some columns as they stand in a file, with the fill where they have no value."""
-    part = values[:, columns].astype(np.float32)
-    return np.fmin(part, np.float32(FILL), out=part)
+def _single(values: Array) -> Floats32:
+    """Return values in single precision."""
+    return values.astype(np.float32, copy=False)
 
 
 def _known(surface: Bands, grid: Grid) -> tuple[slice, slice]:
