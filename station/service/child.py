@@ -45,8 +45,8 @@ PRELOAD = (
 # Two cores decode, all else of a scan is one core's work; and every further thread of a BLAS reserves address
 # space against RLIMIT_AS. Memory that is let go is kept for the next array, for to clear it each time takes
 # long; between steps that want arrays of other sizes a task may `give_back` what is kept. Arrays lie in small
-# pages: a virtual machine hands free memory back to its host by huge pages, and each scan would have to ask for
-# it again, half a second's work; looking up cells in small ones costs nothing that can be measured.
+# pages: huge ones that are free a virtual machine hands back to its host, and each scan would have to ask for
+# them again, half a second's work; to look cells up in small ones costs nothing that can be measured.
 SURROUNDINGS = {
     "OPENBLAS_NUM_THREADS": "1",
     "OMP_NUM_THREADS": "1",
