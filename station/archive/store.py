@@ -9,7 +9,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any, overload
+from typing import overload
 
 import h5py
 import netCDF4
@@ -17,7 +17,7 @@ import numpy as np
 from isal.igzip_lib import IsalError
 
 from station.archive.layout import Series, define, lay_out, strings, text, written_whole
-from station.archive.rasters import rounded, write_rasters
+from station.archive.rasters import Array, rounded, write_rasters
 from station.archive.tiles import column
 from station.archive.variables import BY_NAME, TERMS, TEXT_LENGTH, VARIABLES, VERDICTS
 from station.errors import StoreError
@@ -37,7 +37,6 @@ COLUMNS = {  # of a measurement, by variable
 AIR = ("air_temperature", "air_pressure", "relative_humidity")  # variables, told where weather was known
 _EPOCH_NAME = re.compile(r"_(\d{8}T\d{6}Z)(?:_r(\d+))?\.nc$")
 
-Array = np.ndarray[Any, Any]
 Seen = Callable[[slice, Mapping[str, Array]], None]
 
 
@@ -85,7 +84,7 @@ def write_epoch(series: Series, epoch: Epoch, newer_than: int = 0, seen: Seen | 
 
     A second epoch of the same start is a new revision, also where the journal remembers one (`newer_than`)
     whose file is lost; no file is ever changed. `seen` is shown its rasters as they are written, some rows of
-    the grid at a time: to lay them out again takes half as long.
+    the grid at a time: to lay them out once more would take as long as a quarter of the writing.
     """
     start = datetime.fromtimestamp(epoch.start_s, UTC)
     known = [0, *(one.revision for one in revisions(series, start))]

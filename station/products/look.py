@@ -5,13 +5,12 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from station.archive.aggregate import Aggregates
 from station.archive.layout import Series
-from station.archive.rasters import Raster
+from station.archive.rasters import Array, Raster
 from station.archive.store import Row
 from station.archive.variables import FILL
 from station.quantities import Bools, Floats32, Grid
@@ -27,7 +26,6 @@ CHANGE, SIGMA, RANDOM = (
 )
 POINTS = "point_count"
 
-Array = np.ndarray[Any, Any]
 Bands = Callable[[slice], Iterable[Array]]  # gives some rows (r, nx) of each of some rasters
 
 
@@ -185,7 +183,7 @@ class _Sums:
 
 
 def _pass(bands: Bands, sums: _Sums) -> list[Floats32]:
-    """Return the sums of rasters once all of them has come by."""
+    """Return the sums of rasters once all of them have come by."""
     height = max(1, BAND_ROWS // sums.factor) * sums.factor
     for top in range(sums.rows.start, sums.rows.stop, height):
         sums.add(top, bands(slice(top, min(top + height, sums.rows.stop))))

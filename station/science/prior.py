@@ -114,8 +114,13 @@ def motions(lines: Lines) -> tuple[Floats, Floats, Floats]:
 
     Source: EQUATIONS 6.3.
     """
-    apart_s = np.abs(np.subtract.outer(lines.time_s, lines.time_s))
-    return np.exp(-apart_s / SLOW_MOTION_S), np.exp(-apart_s / FAST_MOTION_S), np.eye(len(apart_s))
+    slow, fast = (_faded(lines.time_s, memory_s) for memory_s in (SLOW_MOTION_S, FAST_MOTION_S))
+    return slow, fast, np.eye(len(slow))
+
+
+def _faded(time_s: Floats, memory_s: float) -> Floats:
+    """Correlation (n, n) of what fades by so much a time, between some times (n,)."""
+    return np.asarray(np.exp(-np.abs(np.subtract.outer(time_s, time_s)) / memory_s))
 
 
 def motion(habits: Habits, lines: Lines) -> Floats:
@@ -175,7 +180,7 @@ def beforehand(of: Basis, lines: Lines, habits: Habits, *, weather_known: bool) 
     knot_s = before_s - (after_s - before_s) / 2
     if not of.closed:
         knot_s = np.append(knot_s, lines.time_s[-1] + (lines.time_s[-1] - lines.time_s[-2]) / 2)
-    slow = np.exp(-np.abs(np.subtract.outer(knot_s, knot_s)) / SLOW_MOTION_S)
+    slow = _faded(knot_s, SLOW_MOTION_S)
     first, last = len(GLOBAL), len(GLOBAL) + of.lean_count
     knots = np.zeros((len(of.names),) * 2)
     knots[:first, :first] = np.diag(np.square(globals_sigma(habits, weather_known=weather_known)))
@@ -226,19 +231,19 @@ def _missed_by_log(lines: Lines, lean: Lean, zero: Cycle, habits: Habits, beside
 
     Along the line of sight, or along a direction so far counter-clockwise beside it.
     """
-    apart_s = np.abs(np.subtract.outer(lines.time_s, lines.time_s))
-    along = tilt_along(lines.azimuth_rad)
+    time_s, along = lines.time_s, tilt_along(lines.azimuth_rad)
     alike = along @ along.T  # the cosine of the angle between lines
     # The share of the slow motion's spectrum (a Lorentzian) that lies above the cut-off.
-    missed = 1 - 2 / math.pi * math.atan(2 * math.pi * lean.cutoff_hz * SLOW_MOTION_S)
+    share = 1 - 2 / math.pi * math.atan(2 * math.pi * lean.cutoff_hz * SLOW_MOTION_S)
     width_s = lean.memory_s / (2 * math.sqrt(math.pi))  # of the Gaussian window with the same memory
+    filtered = np.exp(-((np.subtract.outer(time_s, time_s) / width_s) ** 2) / 4)
     changes = cycle_changes(lines, zero, beside_rad)
-    told = changes @ changes.T + CYCLE_CHANGE_RAD**2 * alike**2
-    told += lean.filtered_noise_rad**2 * np.exp(-((apart_s / width_s) ** 2) / 4) * alike
-    told += habits.fast_motion_rad**2 * np.exp(-apart_s / FAST_MOTION_S)
-    told += habits.slow_motion_rad**2 * missed * np.exp(-apart_s / max(lean.memory_s, 1.0))
-    told[np.diag_indices_from(told)] += habits.line_motion_rad**2
-    return np.asarray(told)
+    missed_rad2 = changes @ changes.T + CYCLE_CHANGE_RAD**2 * alike**2
+    missed_rad2 += lean.filtered_noise_rad**2 * filtered * alike
+    missed_rad2 += habits.fast_motion_rad**2 * _faded(time_s, FAST_MOTION_S)
+    missed_rad2 += habits.slow_motion_rad**2 * share * _faded(time_s, max(lean.memory_s, 1.0))
+    missed_rad2[np.diag_indices_from(missed_rad2)] += habits.line_motion_rad**2
+    return np.asarray(missed_rad2)
 
 
 def cycle_changes(lines: Lines, zero: Cycle, beside_rad: float = 0.0) -> Floats:

@@ -1,14 +1,12 @@
-"""What the pictures of a scan need, taken as it is written: reading it again is five times the work."""
+"""What the pictures of a scan need, taken as it is written: reading it again is seven times the work."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any
-
-import numpy as np
 
 from station.archive.layout import Series
+from station.archive.rasters import Array
 from station.config import Site
 from station.products.gallery import kept_base
 from station.products.look import Look, Looking
@@ -35,7 +33,7 @@ class Watched:
         base = kept_base(series, page_folder(site), version, site.products.quicklook_width_px)
         self._looking = Looking(base, points=True)
 
-    def add(self, rows: slice, rasters: Mapping[str, np.ndarray[Any, Any]]) -> None:
+    def add(self, rows: slice, rasters: Mapping[str, Array]) -> None:
         """See some rows, as `store.write_epoch` shows them."""
         if (looking := self._looking) is not None:
             self._try(lambda: looking.add(rows, rasters))
@@ -49,6 +47,6 @@ class Watched:
     def _try(self, step: Callable[[], Look | None]) -> Look | None:
         try:
             return step()
-        except Exception:  # noqa: BLE001 - whatever it is
+        except Exception:  # noqa: BLE001 - the page is made from the store then, and tells what is wrong
             self._looking = None
             return None
