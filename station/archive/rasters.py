@@ -17,6 +17,7 @@ import h5py
 import numpy as np
 from isal import isal_zlib
 from isal.igzip_lib import IsalError
+from numpy.typing import NDArray
 
 from station.archive.tiles import Tiles, places, unpacked
 from station.archive.variables import FILL, Variable
@@ -63,19 +64,31 @@ def rounded(row: Variable, values: Array) -> Array:
 def _deflated(size: tuple[int, int], band: Array) -> dict[int, bytes]:
     """Return the chunks of a band of a raster that hold something, by their first column."""
     height, width = size
-    fill = band.dtype.type(FILL if band.dtype.kind == "f" else 0)
+    fill = FILL if band.dtype.kind == "f" else 0
     packed = {}
     for first in range(0, band.shape[1], BESIDE * width):
         part = band[:, first : first + BESIDE * width]
-        count = -(-part.shape[1] // width)
-        whole = np.full((height, count * width), fill)
-        whole[: part.shape[0], : part.shape[1]] = part
-        holds = whole.min(axis=0).reshape(count, width).min(axis=1) < FILL
-        by_byte = whole.view(np.uint8).reshape(height, count, width, -1).transpose(1, 3, 0, 2)
-        shuffled = np.ascontiguousarray(by_byte)
-        for at in np.flatnonzero(holds).tolist():
-            packed[first + at * width] = isal_zlib.compress(shuffled[at], LEVEL)
+        lacks = height - part.shape[0], -part.shape[1] % width
+        if any(lacks):
+            part = np.pad(part, [(0, lack) for lack in lacks], constant_values=fill)
+        chunks = np.array(part.reshape(height, -1, width).swapaxes(0, 1), order="C").reshape(-1, height * width)
+        holds = np.flatnonzero(chunks.min(axis=1) < FILL)
+        for at, shuffled in zip(holds.tolist(), _shuffled(chunks[holds]), strict=True):
+            packed[first + at * width] = isal_zlib.compress(shuffled, LEVEL)
     return packed
+
+
+def _shuffled(chunks: Array) -> NDArray[np.uint8]:
+    """Return chunks (n, m) byte by byte (n, bytes, m), the lowest first; they are used up.
+
+    To shift and cut them takes a third of the time of gathering bytes that lie apart.
+    """
+    shuffled = np.empty((len(chunks), chunks.itemsize, chunks.shape[1]), np.uint8)
+    whole = chunks.view(f"u{chunks.itemsize}")
+    for at in range(chunks.itemsize):
+        shuffled[:, at] = whole
+        whole >>= whole.dtype.type(8)
+    return shuffled
 
 
 def around(cells: Array) -> tuple[slice, slice]:

@@ -82,8 +82,8 @@ def _sines(time_s: Floats, tilt: Tilt) -> tuple[Floats, Floats]:
 class Frame:
     """The way from the upright scanner frame to the map.
 
-    First the rigid `to_local` (4, 4) into a frame whose z axis is up at the scanner, whose origin is the
-    scanner; then a polynomial in x, y and z [m] with `powers` (m, 3) and `coefficients` (m, 3) that gives
+    First the rigid `to_local` (4, 4) into a frame at the scanner whose axes lie along easting, northing and up
+    there; then a polynomial in x, y and z [m] with `powers` (m, 3) and `coefficients` (m, 3) that gives
     easting, northing and height beyond `position_m` [m]. No polynomial: the local frame is the map.
     """
 
@@ -117,18 +117,6 @@ class Frame:
                     np.add(axis_m, scratch, out=axis_m)
         return total_m
 
-    @property
-    def to_axes(self) -> Floats:
-        """Rotation (3, 3) from the scanner's frame to axes along easting, northing and up at the scanner.
-
-        True north lies 1.3° beside grid north at Hintereisferner: the head passes that in eight seconds.
-        """
-        turn = self.to_local[:3, :3]
-        if len(self.powers) == 0:
-            return turn
-        east_m, north_m, _ = self.coefficients[np.all(self.powers == (0, 1, 0), axis=1)][0]
-        return np.asarray(rotation_z(-math.atan2(east_m, north_m)) @ turn)
-
 
 def _monomials(x: Axis, y: Axis, z: Axis, powers: Ints) -> Monomials[Axis]:
     """Every wanted monomial, each by one product of two smaller ones."""
@@ -153,10 +141,8 @@ def frame_in_local_map(sop: Floats) -> Frame:
 
 def frame_by_pop(sop: Floats, pop: Floats, crs: str, reach_m: float) -> Frame:
     """Return the way SOP (4, 4), POP (4, 4) to WGS84 geocentric, map, good to 1 mm within `reach_m`."""
-    geocentric_m = (pop @ sop)[:3, 3]
-    upright = tangent_frame(geocentric_m)
-    to_local = np.linalg.inv(upright) @ pop @ sop
-    return _frame(upright, to_local, crs, reach_m)
+    level = level_frame((pop @ sop)[:3, 3], crs)
+    return _frame(level, np.linalg.inv(level) @ pop @ sop, crs, reach_m)
 
 
 def frame_by_origin(sop: Floats, origin_deg_m: tuple[float, float, float], crs: str, reach_m: float) -> Frame:
@@ -174,17 +160,12 @@ def frame_on_map(sop: Floats, crs: str, reach_m: float) -> Frame:
     is not a rigid frame: taken as one it is wrong by 0.9 m at 3.4 km from curvature alone and by more from
     scale (EQUATIONS 2.6). So only the scanner's position is read in the map.
     """
-    horizontal = horizontal_crs(crs)
-    to_geocentric = Transformer.from_crs(horizontal, GEOCENTRIC, always_xy=True)
-    from_geocentric = Transformer.from_crs(GEOCENTRIC, horizontal, always_xy=True)
-    geocentric_m = np.array(to_geocentric.transform(*sop[:3, 3]))
-    upright = tangent_frame(geocentric_m)
-    north_m = upright @ [0.0, 100.0, 0.0, 1.0]  # 100 m towards true north, seen on the map
-    east_m = np.array(from_geocentric.transform(*north_m[:3])) - sop[:3, 3]
-    convergence_rad = math.atan2(east_m[0], east_m[1])  # of true north from grid north, clockwise
-    to_local = np.eye(4)
-    to_local[:3, :3] = rotation_z(convergence_rad) @ sop[:3, :3]
-    return _frame(upright, to_local, crs, reach_m)
+    to_geocentric = Transformer.from_crs(horizontal_crs(crs), GEOCENTRIC, always_xy=True)
+    to_local = sop.copy()
+    to_local[:3, 3] = 0.0
+    return _frame(
+        level_frame(np.array(to_geocentric.transform(*sop[:3, 3])), crs), to_local, crs, reach_m
+    )
 
 
 def horizontal_crs(crs: str) -> CRS:
@@ -214,8 +195,21 @@ def tangent_frame(geocentric_m: Floats) -> Floats:
     return frame
 
 
-def _frame(upright: Floats, to_local: Floats, crs: str, reach_m: float) -> Frame:
-    """Fit the way from the tangent frame `upright` (4, 4) to the map by a polynomial of fourth degree.
+def level_frame(geocentric_m: Floats, crs: str) -> Floats:
+    """Matrix (4, 4) from axes along easting, northing and up at a point to WGS84 geocentric coordinates.
+
+    True north lies 1.3° beside grid north at Hintereisferner: the head passes that in eight seconds.
+    """
+    upright = tangent_frame(geocentric_m)
+    to_map = Transformer.from_crs(GEOCENTRIC, horizontal_crs(crs), always_xy=True)
+    along_m = upright[:3, 1] * [[-100.0], [100.0]] + geocentric_m  # the meridian
+    (east_m,), (north_m,), _ = np.diff(to_map.transform(*along_m.T))
+    upright[:3, :3] @= rotation_z(math.atan2(east_m, north_m))
+    return upright
+
+
+def _frame(level: Floats, to_local: Floats, crs: str, reach_m: float) -> Frame:
+    """Fit the way from a `level_frame` (4, 4) to the map by a polynomial of fourth degree.
 
     What that leaves out is 0.02 mm at 6 km; terms that never reach a twentieth of a millimetre go too.
     """
@@ -223,8 +217,8 @@ def _frame(upright: Floats, to_local: Floats, crs: str, reach_m: float) -> Frame
     nodes = chebyshev.chebpts1(9)
     x, y, z = (axis.ravel() for axis in np.meshgrid(nodes, nodes, nodes, indexing="ij"))
     local_m = np.stack([x, y, z, np.full_like(x, 1 / reach_m)]) * reach_m
-    mapped_m = np.stack(to_map.transform(*(upright @ local_m)[:3]), axis=-1)
-    position_m = np.array(to_map.transform(*upright[:3, 3]))
+    mapped_m = np.stack(to_map.transform(*(level @ local_m)[:3]), axis=-1)
+    position_m = np.array(to_map.transform(*level[:3, 3]))
     powers = np.array([(i, j, k) for i in range(5) for j in range(5 - i) for k in range(5 - i - j)][1:])
     monomials = _monomials(x, y, z, powers)
     design = np.stack([monomials[i, j, k] for i, j, k in powers.tolist()], axis=-1)

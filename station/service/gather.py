@@ -94,7 +94,7 @@ def gather(
             write_zero(site, sop_id, zero)
     lean = _lean(site, log, track, zero, lacking)
     air, weather_known = _air(site, start + (end - start) / 2, frame.position_m[2], lacking)
-    rotation = frame.to_axes
+    rotation = frame.to_local[:3, :3]
     axis = (float(rotation[0, 2]), float(rotation[1, 2]), float(rotation[2, 2]))
     setup = setup_of(site, frame.position_m, axis)
     if wait_for_weather and site.weather is not None and not weather_known:

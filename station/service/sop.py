@@ -126,31 +126,27 @@ def _solve_on_map(features: Features, start: Floats | None, crs: str) -> Registr
     place_m = np.average(features.reference_m, axis=0) if start is None else start[:3, 3]
     begin, found = None, None
     for _ in range(3):  # from the middle of the features to the scanner, and once more
-        to_local, turn = _level_frame(place_m, crs)
+        to_local = _LevelFrame(place_m, crs)
         ends = [to_local(features.reference_m + step * features.normal) for step in (0.0, 1.0)]
         normal = ends[1] - ends[0]
         normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-9)
         if start is not None:
             begin = start.copy()
-            begin[:3] = np.column_stack([turn @ start[:3, :3], to_local(start[None, :3, 3])[0]])
+            begin[:3] = np.column_stack([start[:3, :3], to_local(start[None, :3, 3])[0]])
         found = solve(replace(features, reference_m=ends[0], normal=normal), begin)
         place_m = to_local(found.sop[None, :3, 3], back=True)[0]
     assert found is not None  # noqa: S101 - three rounds
-    to_local, turn = _level_frame(place_m, crs)
-    sop = np.eye(4)
-    sop[:3, :3], sop[:3, 3] = turn.T @ found.sop[:3, :3], place_m
-    wide = np.kron(np.eye(2), turn.T)
-    return replace(found, sop=sop, covariance=wide @ found.covariance @ wide.T)
+    return replace(found, sop=np.column_stack([found.sop[:, :3], [*place_m, 1.0]]))
 
 
 class _LevelFrame:
-    """East, north and up at a place on a map, and back."""
+    """Along easting, northing and up at a place on a map, and back."""
 
     def __init__(self, place_m: Floats, crs: str) -> None:
-        horizontal = pose.horizontal_crs(crs)
+        horizontal = _known(crs)
         self._to_geocentric = Transformer.from_crs(horizontal, pose.GEOCENTRIC, always_xy=True)
         self._to_map = Transformer.from_crs(pose.GEOCENTRIC, horizontal, always_xy=True)
-        self._frame = pose.tangent_frame(np.array(self._to_geocentric.transform(*place_m)))
+        self._frame = pose.level_frame(np.array(self._to_geocentric.transform(*place_m)), crs)
 
     def __call__(self, points_m: Floats, *, back: bool = False) -> Floats:
         """Points (n, 3) on the map in the level frame, or the other way [m]."""
@@ -159,14 +155,6 @@ class _LevelFrame:
             return np.stack(self._to_map.transform(*there.T), axis=-1)
         geocentric_m = np.stack(self._to_geocentric.transform(*points_m.T), axis=-1)
         return np.asarray((geocentric_m - self._frame[:3, 3]) @ self._frame[:3, :3])
-
-
-def _level_frame(place_m: Floats, crs: str) -> tuple[_LevelFrame, Floats]:
-    """Return the level frame at a place on a map, and how it is turned (3, 3) from grid to true north."""
-    on_map = np.eye(4)
-    on_map[:3, 3] = place_m
-    _known(crs)
-    return _LevelFrame(place_m, crs), pose.frame_on_map(on_map, crs, NEAR_M).to_local[:3, :3]
 
 
 def _known(crs: str) -> CRS:
@@ -229,7 +217,9 @@ def _chain(name: str, sop: Floats, pop: Floats | None, crs: str | None) -> Chain
             to_map = Transformer.from_crs(pose.GEOCENTRIC, _known(crs), always_xy=True)
             map_m = [float(value) for value in to_map.transform(*geocentric_m)]
     elif crs is not None:
-        turn = _level_frame(sop[:3, 3], crs)[1] @ turn
+        to_geocentric = Transformer.from_crs(_known(crs), pose.GEOCENTRIC, always_xy=True)
+        geocentric_m = np.array(to_geocentric.transform(*sop[:3, 3]))
+        turn = pose.tangent_frame(geocentric_m)[:3, :3].T @ pose.level_frame(geocentric_m, crs)[:3, :3] @ turn
     axis = turn[:, 2]
     omega_phi_kappa_rad = (
         math.atan2(turn[2, 1], turn[2, 2]),

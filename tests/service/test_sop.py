@@ -61,7 +61,9 @@ def test_on_a_map(tmp_path):
     sop = read_matrix(tmp_path / "sop.dat")
     assert sop[:3, 3] == pytest.approx(PLACE_M, abs=1e-4)
     frame = pose.frame_on_map(sop, CRS, 3500.0)
-    assert frame.to_local[:3, :3] == pytest.approx(TURN, abs=1e-7)
+    grid_north = Proj(CRS).get_factors(LONGITUDE_DEG, LATITUDE_DEG).meridian_convergence
+    turn = Rotation.from_euler("Z", grid_north, degrees=True).as_matrix() @ TURN
+    assert frame.to_local[:3, :3] == pytest.approx(turn, abs=1e-7)
     assert found.chain.lean_deg == pytest.approx(np.degrees(np.arccos(TURN[2, 2])), abs=1e-5)
     assert found.observations == 10 * 3 + 4
     assert max(one.residual_m for one in found.features) < 2e-3
