@@ -81,7 +81,7 @@ def to_map(shots: Shots, pose: Pose) -> Points:
     if pose.air is not None:
         scale = pose.air.range_scale(z_m)
         x_m, y_m, z_m = x_m * scale, y_m * scale, z_m * scale
-        z_m -= refraction_rise(np.sqrt(x_m**2 + y_m**2), pose.air.refraction_coefficient)
+        z_m -= refraction_rise(x_m**2 + y_m**2, pose.air.refraction_coefficient)
     return pose.frame.to_map((x_m, y_m, z_m))
 
 

@@ -71,10 +71,11 @@ def _deflated(size: tuple[int, int], band: Array) -> dict[int, bytes]:
         lacks = height - part.shape[0], -part.shape[1] % width
         if any(lacks):
             part = np.pad(part, [(0, lack) for lack in lacks], constant_values=fill)
-        chunks = np.array(part.reshape(height, -1, width).swapaxes(0, 1), order="C").reshape(-1, height * width)
-        holds = np.flatnonzero(chunks.min(axis=1) < FILL)
-        for at, shuffled in zip(holds.tolist(), _shuffled(chunks[holds]), strict=True):
-            packed[first + at * width] = isal_zlib.compress(shuffled, LEVEL)
+        side_by_side = part.reshape(height, -1, width).swapaxes(0, 1)
+        chunks = np.array(side_by_side, order="C").reshape(-1, height * width)
+        holds, shuffled = chunks.min(axis=1) < FILL, _shuffled(chunks)
+        for at in np.flatnonzero(holds).tolist():
+            packed[first + at * width] = isal_zlib.compress(shuffled[at], LEVEL)
     return packed
 
 

@@ -134,10 +134,10 @@ def refraction_coefficient(temperature_c: float, pressure_hpa: float, gradient_k
     return 503.0 * pressure_hpa / (temperature_c + KELVIN) ** 2 * (0.0343 + gradient_k_per_m)
 
 
-def refraction_rise(horizontal_m: Floats, coefficient: float) -> Floats:
-    """How much too high a target appears because the beam bends down to it [m].
+def refraction_rise(horizontal_m2: Floats, coefficient: float) -> Floats:
+    """How much too high a target appears because the beam bends down to it [m], by its distance squared.
 
     The angle of Voordendag et al. (2023), Eq. 11, times the range, for a gradient that is the same all along;
     they neglect it: 0.12 m at 3421 m for k = 0.13. Source: EQUATIONS 5.10, k R² / 2 R_E.
     """
-    return coefficient / (2 * EARTH_RADIUS_M) * horizontal_m**2
+    return coefficient / (2 * EARTH_RADIUS_M) * horizontal_m2

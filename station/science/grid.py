@@ -92,14 +92,17 @@ class Gridder:
         # in one, heights, and their squares.
         self._sums = np.zeros((grid.nx * grid.ny, 3), np.int64)
 
-    def cells(self, x_m: Floats, y_m: Floats) -> tuple[Ints, Floats, Floats]:
-        """Number of each point (n,) that lies on the grid, and its column and row, in fractions of cells.
+    def cells(self, x_m: Floats, y_m: Floats) -> tuple[Ints | slice, Floats, Floats]:
+        """Which points (n,) lie on the grid, and their column and row, in fractions of cells.
 
         A point on an edge belongs to the cell east or south of it.
         """
         column = (x_m - self.grid.west_m) / self.grid.cell_m
         row = (self.grid.north_m - y_m) / self.grid.cell_m
-        inside = np.flatnonzero((column >= 0) & (column < self.grid.nx) & (row >= 0) & (row < self.grid.ny))
+        there = (column >= 0) & (column < self.grid.nx) & (row >= 0) & (row < self.grid.ny)
+        if there.all():  # as most are: to choose them all takes longer than to find that out
+            return slice(None), column, row
+        inside = np.flatnonzero(there)
         return inside, column[inside], row[inside]
 
     def numbered(self, column: Floats, row: Floats) -> Ints32:

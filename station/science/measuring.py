@@ -22,9 +22,9 @@ from station.quantities import (
 )
 from station.science import budget, change, ground, shared, uncertainty
 from station.science.grid import Gridder, Sums, slope_sampling_variance
-from station.science.outlook import HIGH_INCIDENCE_COS, Outlook, Sector, Trait, gradients
+from station.science.outlook import HIGH_INCIDENCE_COS, Outlook, Sector, Trait
 from station.science.shared import Sensitivities
-from station.science.terrain import MARGIN_ROWS
+from station.science.terrain import MARGIN_ROWS, gradient_in
 from station.science.view import View
 
 BAND_ROWS = 64  # looked at together for the cells beyond the reference
@@ -100,8 +100,9 @@ def _fringe(gridder: Gridder, setup: Setup, heights: _Heights, rows: slice) -> _
     if setup.position_m is not None:
         around_m, inner = heights.around(rows)
         if len(cell):
-            seen = np.divmod(cell, setup.grid.nx)
-            east, north = gradients(around_m, setup.grid.cell_m, inner, seen)
+            row, column = np.divmod(cell, setup.grid.nx)
+            gradient = gradient_in(around_m, setup.grid.cell_m, inner.start + row, column)
+            east, north = (np.nan_to_num(one.astype(np.float64)) for one in gradient)
     return _Fringe(numbers[cell], rows.start * setup.grid.nx + cell, east, north)
 
 

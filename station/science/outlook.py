@@ -15,10 +15,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from station.quantities import UPRIGHT, Bools, Floats, Floats32, Grid, Ints, Ints32, Reals, Reference, Scanner
+from station.quantities import UPRIGHT, Bools, Floats32, Grid, Ints, Ints32, Reals, Reference, Scanner
 from station.science import ground, shared, terrain
 from station.science.shared import Basis, Sensitivities
-from station.science.terrain import MARGIN_ROWS, Cells, Ground, smooth_gradient
+from station.science.terrain import MARGIN_ROWS, Ground, smooth_gradient
 from station.science.view import View
 
 MOVING_MOST = 400_000  # cells of moving ground that an adjustment looks at
@@ -202,12 +202,6 @@ def look(
     return Outlook(reference, of, position_m, below.datum_m, below.rise_m, number, bounds, one_in, cells)
 
 
-def gradients(around_m: Reals, cell_m: float, rows: slice, chosen: Cells) -> tuple[Floats, Floats]:
-    """Rise per metre eastward and northward (n,) of a smoothed surface in the chosen cells of some rows."""
-    east, north = smooth_gradient(around_m, cell_m, rows=rows, chosen=chosen)
-    return np.nan_to_num(east.astype(np.float64)), np.nan_to_num(north.astype(np.float64))
-
-
 def _cells(
     reference: Reference,
     rows: slice,
@@ -229,7 +223,8 @@ def _cells(
         np.nan,
     )
     inner = slice(rows.start - first, rows.stop - first)
-    east, north = gradients(around_m, grid.cell_m, inner, (row, column))
+    gradient = smooth_gradient(around_m, grid.cell_m, rows=inner)
+    east, north = (np.nan_to_num(one[known].astype(np.float64)) for one in gradient)
     x_m, y_m, height_m = grid.x_m[column], grid.y_m[rows][row], below.cell_means(rows)[known]
     trait = np.where(stable[known], Trait.STABLE, 0) | np.where(ground.withheld(x_m, y_m), Trait.WITHHELD, 0)
     trait |= np.where(np.hypot(east, north) < ground.MOVING_STEEPEST, Trait.SMOOTH, 0)

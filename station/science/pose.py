@@ -82,8 +82,8 @@ def _sines(time_s: Floats, tilt: Tilt) -> tuple[Floats, Floats]:
 class Frame:
     """The way from the upright scanner frame to the map.
 
-    First the rigid `to_local` (4, 4) into a frame at the scanner whose axes lie along easting, northing and up
-    there; then a polynomial in x, y and z [m] with `powers` (m, 3) and `coefficients` (m, 3) that gives
+    First the rigid `to_local` (4, 4) into a frame at the scanner, whose axes lie along easting, northing and
+    up there; then a polynomial in x, y and z [m] with `powers` (m, 3) and `coefficients` (m, 3) that gives
     easting, northing and height beyond `position_m` [m]. No polynomial: the local frame is the map.
     """
 
@@ -163,9 +163,7 @@ def frame_on_map(sop: Floats, crs: str, reach_m: float) -> Frame:
     to_geocentric = Transformer.from_crs(horizontal_crs(crs), GEOCENTRIC, always_xy=True)
     to_local = sop.copy()
     to_local[:3, 3] = 0.0
-    return _frame(
-        level_frame(np.array(to_geocentric.transform(*sop[:3, 3])), crs), to_local, crs, reach_m
-    )
+    return _frame(level_frame(np.array(to_geocentric.transform(*sop[:3, 3])), crs), to_local, crs, reach_m)
 
 
 def horizontal_crs(crs: str) -> CRS:

@@ -11,6 +11,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
+from itertools import pairwise
 
 import numpy as np
 
@@ -100,6 +101,15 @@ class Basis:
             *(unit for _, unit in GLOBAL), *["rad"] * self.lean_count, *["1"] * self.refraction_count,
             *["rad"] * self.refraction_count,
         )  # fmt: skip
+
+    def felt_after(self, knot: int) -> list[int]:
+        """Parameters that are felt after a knot of the lean: the globals, and of all others two neighbours."""
+        bend = knot // LEAN_PER_REFRACTION
+        bends = bend, (bend + 1) % self.refraction_count
+        first, leans = len(GLOBAL), (knot, (knot + 1) % self.lean_count)
+        last, beyond = first + self.lean_count, first + self.lean_count + self.refraction_count
+        parts = (0, range(first)), (first, leans), (last, bends), (beyond, bends)
+        return [start + at for start, part in parts for at in part]
 
     def knots_before(self, offset_m: tuple[Reals, Reals, Reals]) -> Reals:
         """How many knots of the lean the head has passed when it looks there (n,), in fractions of knots."""
@@ -227,43 +237,40 @@ class Sensitivities:
     def variance(self, unknown: Shared) -> Reals:
         """Variance of each cell's height (n,) [m²]: the diagonal of J C Jᵀ, and what its line adds.
 
-        Fastest where all cells lie between the same knots of the lean.
+        Fastest where cells come as the head does.
         """
-        before = self.passed.astype(np.int16)
-        if len(before) and before.min() == before.max():
-            return self._variance_between(int(before[0]), unknown)
-        order = np.argsort(before, kind="stable")
-        bounds = np.searchsorted(before[order], np.arange(self.of.intervals + 1))
-        ordered, variance_m2 = self.some(order), np.zeros_like(self.lean)
-        for knot in np.flatnonzero(np.diff(bounds)).tolist():
-            cells = slice(bounds[knot], bounds[knot + 1])
-            variance_m2[order[cells]] = ordered.some(cells).variance(unknown)
-        return variance_m2
+        of, knot = self.of, self.passed.astype(np.int16)
+        if not len(knot):
+            return np.zeros_like(self.lean)
+        if np.any(knot[1:] < knot[:-1]):
+            variance_m2, order = np.empty_like(self.lean), np.argsort(knot, kind="stable")
+            variance_m2[order] = self.some(order).variance(unknown)
+            return variance_m2
+        columns = self._columns()
+        halves = np.empty_like(columns)
+        for first, end in pairwise([0, *(np.flatnonzero(np.diff(knot)) + 1).tolist(), len(knot)]):
+            felt = of.felt_after(int(knot[first]))
+            covariance = unknown.covariance[np.ix_(felt, felt)].astype(columns.dtype)
+            np.matmul(covariance, columns[:, first:end], out=halves[:, first:end])
+        # Rounding may take it below nought where the covariance is singular.
+        told_m2 = np.maximum(np.einsum("ij,ij->j", columns, halves), 0.0)
+        lines = slice(int(knot[0]) * LINES_A_KNOT, (int(knot[-1]) + 1) * LINES_A_KNOT)
+        own = (leans_between(of).left[lines] ** 2 @ line_variances(of, unknown)).astype(columns.dtype)
+        return np.asarray(self.lean**2 * own[self.line - lines.start] + told_m2)
 
-    def _variance_between(self, knot: int, unknown: Shared) -> Reals:
-        """Return the variance of cells that all lie between a knot of the lean and the next."""
-        of, first, across = self.of, len(GLOBAL), self.across
-        bend = knot // LEAN_PER_REFRACTION
-        bend_after = (bend + 1) % of.refraction_count
-        leans = first + knot, first + (knot + 1) % of.lean_count
-        last, beyond = first + of.lean_count, first + of.lean_count + of.refraction_count
-        felt = [*range(first), *leans, last + bend, last + bend_after, beyond + bend, beyond + bend_after]
-        share = self.passed - knot
-        bent_share = self.passed / LEAN_PER_REFRACTION - bend
-        columns = np.empty((len(felt), len(self)), self.lean.dtype)
+    def _columns(self) -> Reals:
+        """Effects (15, n) of what each cell feels, as `Basis.felt_after` names them."""
+        first = len(GLOBAL)
+        bent = self.passed / LEAN_PER_REFRACTION
+        share, bent_share = self.passed - np.floor(self.passed), bent - np.floor(bent)
+        columns = np.empty((first + 6, len(self)), self.lean.dtype)
         columns[:first] = self.globals_
         for at, (effect, after) in enumerate(
-            ((self.lean, share), (self.refraction, bent_share), (across, bent_share))
+            ((self.lean, share), (self.refraction, bent_share), (self.across, bent_share))
         ):
             np.multiply(effect, after, out=columns[first + 2 * at + 1])
             np.subtract(effect, columns[first + 2 * at + 1], out=columns[first + 2 * at])
-        told_m2 = np.einsum(
-            "ij,ij->j", columns, unknown.covariance[np.ix_(felt, felt)].astype(columns.dtype) @ columns
-        )
-        lines = slice(knot * LINES_A_KNOT, (knot + 1) * LINES_A_KNOT)
-        own = (leans_between(of).left[lines] ** 2 @ line_variances(of, unknown)).astype(columns.dtype)
-        # Rounding may take it below nought where the covariance is singular.
-        return np.asarray(self.lean**2 * own[self.line - lines.start] + np.maximum(told_m2, 0.0))
+        return columns
 
 
 def line_variances(of: Basis, unknown: Shared) -> Floats:

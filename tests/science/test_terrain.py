@@ -58,8 +58,18 @@ def test_smoothing_is_a_normalised_gaussian_also_of_some_rows():
             terrain.smooth_gradient(values, 2.0, rows=rows), terrain.smooth_gradient(values, 2.0), strict=True
         ):
             assert np.array_equal(part, whole[rows], equal_nan=True)
-        chosen = np.nonzero(rng.uniform(size=told[rows].shape) < 0.2)
-        assert np.array_equal(terrain.smooth(values, 1.5, rows, chosen), told[rows][chosen], equal_nan=True)
+
+
+@pytest.mark.parametrize("shape", [(1, 1), (2, 9), (40, 33)])
+def test_gradient_in_a_few_cells_is_that_of_the_whole_surface(shape):
+    rng = np.random.default_rng(4)
+    surface = rng.normal(size=shape).astype(np.float32)
+    surface[rng.uniform(size=shape) < 0.5] = np.nan
+    surface[20:, 15:] = np.nan
+    row, column = np.nonzero(rng.uniform(size=shape) < 0.9)
+    found = terrain.gradient_in(surface, 2.0, row, column)
+    for part, whole in zip(found, terrain.smooth_gradient(surface, 2.0), strict=True):
+        assert part == pytest.approx(whole[row, column], abs=1e-6, nan_ok=True)
 
 
 def test_ground_is_bilinear_between_centres_and_goes_on_to_the_edge():
