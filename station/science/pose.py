@@ -83,8 +83,8 @@ class Frame:
     """The way from the upright scanner frame to the map.
 
     First the rigid `to_local` (4, 4) into a frame at the scanner, whose axes lie along easting, northing and
-    up there; then a polynomial in x, y and z [m] with `powers` (m, 3) and `coefficients` (m, 3) that gives
-    easting, northing and height beyond `position_m` [m]. No polynomial: the local frame is the map.
+    up there; then what the map is beyond that frame at `position_m`: a polynomial in x, y and z [m] with
+    `powers` (m, 3) and `coefficients` (m, 3) for easting, northing and height [m].
     """
 
     position_m: tuple[float, float, float]
@@ -94,28 +94,19 @@ class Frame:
 
     def to_map(self, local_m: tuple[Floats, Floats, Floats]) -> tuple[Floats, Floats, Floats]:
         """Easting, northing and height [m] of points in the local frame."""
-        if len(self.powers) == 0:
-            east_m, north_m, height_m = self.position_m
-            return local_m[0] + east_m, local_m[1] + north_m, local_m[2] + height_m
-        linear = self.powers.sum(axis=1) == 1
-        whole = _monomials(*local_m, self.powers[linear])
-        mapped_m = self._sum(whole, linear, [np.full_like(local_m[0], origin) for origin in self.position_m])
-        # What bends is metres: 24 bits hold it to a micrometre, at half the cost.
+        # What bends and scales is metres: 24 bits hold it to a micrometre, at half the cost.
         x, y, z = (axis_m.astype(np.float32) for axis_m in local_m)
-        single = _monomials(x, y, z, self.powers[~linear])
-        bent_m = self._sum(single, ~linear, [np.zeros_like(x) for _ in range(3)])
-        return mapped_m[0] + bent_m[0], mapped_m[1] + bent_m[1], mapped_m[2] + bent_m[2]
-
-    def _sum(self, monomials: Monomials[Axis], chosen: Bools, total_m: list[Axis]) -> list[Axis]:
-        """Add the chosen terms to easting, northing and height."""
-        scratch = np.empty_like(total_m[0])
-        chosen_m = zip(self.powers[chosen].tolist(), self.coefficients[chosen].tolist(), strict=True)
-        for power, row_m in chosen_m:
-            for axis_m, coefficient_m in zip(total_m, row_m, strict=True):
+        monomials, scratch = _monomials(x, y, z, self.powers), np.empty_like(x)
+        bent_m = [np.zeros_like(x) for _ in local_m]
+        for power, row_m in zip(self.powers.tolist(), self.coefficients.tolist(), strict=True):
+            for axis_m, coefficient_m in zip(bent_m, row_m, strict=True):
                 if coefficient_m:
                     np.multiply(monomials[tuple(power)], coefficient_m, out=scratch)
                     np.add(axis_m, scratch, out=axis_m)
-        return total_m
+        east_m, north_m, height_m = (
+            local + origin + bent for local, origin, bent in zip(local_m, self.position_m, bent_m, strict=True)
+        )
+        return east_m, north_m, height_m
 
 
 def _monomials(x: Axis, y: Axis, z: Axis, powers: Ints) -> Monomials[Axis]:
@@ -220,7 +211,7 @@ def _frame(level: Floats, to_local: Floats, crs: str, reach_m: float) -> Frame:
     powers = np.array([(i, j, k) for i in range(5) for j in range(5 - i) for k in range(5 - i - j)][1:])
     monomials = _monomials(x, y, z, powers)
     design = np.stack([monomials[i, j, k] for i, j, k in powers.tolist()], axis=-1)
-    coefficients = np.linalg.lstsq(design, mapped_m - position_m, rcond=None)[0]
+    coefficients = np.linalg.lstsq(design, mapped_m - position_m - local_m[:3].T, rcond=None)[0]
     coefficients[np.abs(coefficients) < 5e-5] = 0.0
     coefficients /= reach_m ** powers.sum(axis=1, keepdims=True).astype(np.float64)
     used = np.any(coefficients != 0.0, axis=1)
