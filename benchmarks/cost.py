@@ -22,7 +22,7 @@ ONE_THREAD = {"OPENBLAS_NUM_THREADS": "1"}  # a BLAS that spins for work would b
 
 @dataclass(frozen=True)
 class Cost:
-    """What it took, start-up taken off: a service starts once. Nought where it was not measured."""
+    """What it took, start-up and end taken off: a service has one each. Nought where it was not measured."""
 
     cpu_s: float  # user and system, of the process and all its children
     wall_s: float = 0.0
@@ -68,11 +68,15 @@ def job_cost(
 
 
 def run_job(jobs: dict[str, Any]) -> None:
-    """Be the process of one job: the arguments are its name and what it is told, as JSON."""
+    """Be the process of one job: the arguments are its name and what it is told, as JSON.
+
+    It ends as the children of a service do: to take an interpreter down is no work on a scan.
+    """
     name, told = sys.argv[1:]
     ready()
     figures = jobs[name](**json.loads(told))
-    print(json.dumps(figures | {"startup_s": _startup_s[-1]}))
+    print(json.dumps(figures | {"startup_s": _startup_s[-1]}), flush=True)
+    os._exit(0)
 
 
 def ready() -> None:

@@ -38,7 +38,7 @@ from station.science.shared import (
 )
 
 ROUNDS = 8
-SETTLED_M = 0.0001  # a round that moves the patches by less is the last
+SETTLED_M = 0.0003  # a round that moves the patches by less, root mean square, is the last
 ROUNDS_TRUSTING = 2  # until the scatter is known: else whole lines are left out that moving ground pulls away
 TRUSTED = 0.1  # weight of a patch that has not been left out
 TUKEY = 4.685  # 95 % efficient for normal errors

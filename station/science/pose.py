@@ -10,7 +10,7 @@ import numpy as np
 from numpy.polynomial import chebyshev
 from pyproj import CRS, Transformer
 
-from station.quantities import Bools, Floats, Floats32, Ints, Tilt
+from station.quantities import Floats, Floats32, Ints, Tilt
 
 KNOT_RAD = 1e-5  # of lean, apart
 GEOCENTRIC = "EPSG:4978"  # WGS84, where a POP leads
@@ -103,9 +103,8 @@ class Frame:
                 if coefficient_m:
                     np.multiply(monomials[tuple(power)], coefficient_m, out=scratch)
                     np.add(axis_m, scratch, out=axis_m)
-        east_m, north_m, height_m = (
-            local + origin + bent for local, origin, bent in zip(local_m, self.position_m, bent_m, strict=True)
-        )
+        ways_m = zip(local_m, self.position_m, bent_m, strict=True)
+        east_m, north_m, height_m = (local + origin + bent for local, origin, bent in ways_m)
         return east_m, north_m, height_m
 
 

@@ -103,7 +103,7 @@ class Basis:
         )  # fmt: skip
 
     def felt_after(self, knot: int) -> list[int]:
-        """Parameters that are felt after a knot of the lean: the globals, and of all others two neighbours."""
+        """Parameters felt after a knot of the lean: the globals, and of all others the two beside."""
         bend = knot // LEAN_PER_REFRACTION
         bends = bend, (bend + 1) % self.refraction_count
         first, leans = len(GLOBAL), (knot, (knot + 1) % self.lean_count)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 
@@ -48,9 +47,8 @@ def gradient_in(elevation_m: Floats32, cell_m: float, row: Ints, column: Ints) -
 
     A cell takes as long as twelve of a whole surface.
     """
-    share = _gaussian(GRADIENT_CELLS)
-    share = np.outer(share, share).reshape(-1)
-    reach = int(math.sqrt(len(share))) // 2 + 1
+    line = _gaussian(GRADIENT_CELLS)
+    share, reach = np.outer(line, line).reshape(-1), len(line) // 2 + 1
     around_m = np.pad(elevation_m, reach, constant_values=np.nan)
     place = np.arange(2 * reach + 1)
     square = (place[:, None] * around_m.shape[1] + place)[..., None]
@@ -71,10 +69,8 @@ def smooth(values: Floats | Floats32, cells: float, rows: slice = ALL) -> Floats
     """
     known = np.isfinite(values)
     weight = _under_gaussian(known.astype(np.float32), cells, rows)
-    total = _under_gaussian(
-        np.where(known, values, np.float32(0)).astype(np.float32, copy=False), cells, rows
-    )
-    return _per_weight(total, weight)
+    valued = np.where(known, values, np.float32(0)).astype(np.float32, copy=False)
+    return _per_weight(_under_gaussian(valued, cells, rows), weight)
 
 
 def _mean_known(values: Floats32, share: Floats32) -> Floats32:
@@ -98,7 +94,7 @@ def _gaussian(cells: float) -> Floats32:
     """Shares (2 n + 1,) of cells side by side under a Gaussian of `cells` (one sigma), cut off at two."""
     reach = int(2 * cells + 0.5)
     share = np.exp(-0.5 * (np.arange(-reach, reach + 1) / cells) ** 2)
-    return (share / share.sum()).astype(np.float32)
+    return np.asarray((share / share.sum()).astype(np.float32))
 
 
 def _under_gaussian(values: Floats32, cells: float, rows: slice) -> Floats32:
