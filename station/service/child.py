@@ -7,6 +7,7 @@ milliseconds. A task is a function a fresh interpreter can import; its last argu
 
 from __future__ import annotations
 
+import ctypes
 import fcntl
 import math
 import multiprocessing
@@ -43,9 +44,9 @@ PRELOAD = (
 )
 # Two cores decode, all else of a scan is one core's work; and every further thread of a BLAS reserves address
 # space against RLIMIT_AS. Memory that is let go is kept for the next array, for to clear it each time takes
-# long. Arrays lie in small pages: huge ones that are free a virtual machine hands back to its host, and each
-# scan would have to ask for them again, half a second's work; to look cells up in small ones costs nothing
-# that can be measured.
+# long; between steps that want arrays of other sizes a task may `give_back` what is kept. Arrays lie in small
+# pages: huge ones that are free a virtual machine hands back to its host, and each scan would have to ask for
+# them again, half a second's work; to look cells up in small ones costs nothing that can be measured.
 SURROUNDINGS = {
     "OPENBLAS_NUM_THREADS": "1",
     "OMP_NUM_THREADS": "1",
@@ -264,6 +265,12 @@ def _end_with_the_parent() -> None:
     fcntl.fcntl(parent.sentinel, fcntl.F_SETFL, flags | os.O_ASYNC)
     if multiprocessing.connection.wait([parent.sentinel], 0):  # it went before the kernel was asked
         os._exit(_ALONE)
+
+
+def give_back() -> None:
+    """Give memory that was let go back to the system, where glibc keeps it: milliseconds, for some 60 MB."""
+    if trim := getattr(ctypes.CDLL(None), "malloc_trim", None):
+        trim(0)
 
 
 def _mapped() -> int:

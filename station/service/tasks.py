@@ -43,6 +43,7 @@ from station.science.adjustment import Adjustment
 from station.science.grid import Gridder
 from station.science.outlook import Outlook
 from station.science.terrain import nodes_for
+from station.service.child import give_back
 from station.service.content import held_still, sha256_of
 from station.service.gather import Gathered, gather
 from station.service.inbox import Arrival
@@ -223,12 +224,14 @@ def _measure(
         raise ScanError("no point falls on the grid: wrong scans.frame, SOP, CRS or units?")
     progress()
     levelled = levelled_to(site, gridder, gathered, outlook)
+    give_back()
     flag = flag_of(site, start.timestamp(), end.timestamp())
     found = levelled[1] if levelled else None
     if levelled is not None and levelled[1].refused > MOST_REFUSED:
         levelled = None
     unknown = levelled[1].shared() if levelled is not None else gathered.unknown
     doubts, late = _log_against_ground(levelled, reference)
+    give_back()
     measured = measure(gridder, gathered.setup, unknown, outlook, levelled)
     progress()
     numbers = _numbers(measured, gathered, reader.header.point_count)
