@@ -9,7 +9,7 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from functools import partial
+from functools import cached_property, partial
 from io import BufferedReader
 from pathlib import Path
 from typing import BinaryIO, ClassVar, Self
@@ -29,7 +29,7 @@ NEEDED = DecompressionSelection.base().decompress_z().decompress_gps_time()  # h
 BRIGHT = NEEDED.decompress_intensity()
 BLOCKS_AT_ONCE = 4  # decoded together, a chunk a core; conversion still goes block by block, in the cache
 LONGEST_SCAN_S = 86_400.0
-GLANCE = 16  # points looked at in one place
+PLACES = 200  # where a scan is looked at that has no chunks, or few
 SKIP = 50_000  # points decoded at a time only to pass them
 BRIGHTEST = 1 / 65535  # intensity is of 16 bits: LAS 1.4 R15, table 7
 FEW_CHUNKS = 20  # with fewer, chunk starts are too far apart to follow the head
@@ -54,7 +54,6 @@ class LasScan:
             self._layout = read_layout(file, status.st_size)
             file.seek(0)
             crs_wkt = _crs_wkt(file)
-        self._time_range_s: tuple[float, float] | None = None
         low_m, high_m = self._layout.low_m, self._layout.high_m
         self.header = ScanHeader(
             point_count=self._layout.count,
@@ -108,54 +107,48 @@ class LasScan:
             yield points.fill
 
     def time_range_s(self) -> tuple[float, float] | None:
-        """Give the earliest and latest time stamp [s], from the chunks' starts and the end of the file.
+        """Give the earliest and latest time stamp [s] of echoes here and there.
 
         None where the format has no time or all stamps are zero.
         """
         if not self._layout.has_time:
             return None
-        if self._time_range_s is None:
-            check = _Check(self._layout, self._range_max_m)
-            for _ in self._glances(50, check):
-                pass  # the check keeps the time it has seen
-            self._time_range_s = (check.earliest_s, check.latest_s)
-        return self._time_range_s if any(self._time_range_s) else None
+        time_s, *_ = self._glance
+        range_s = float(time_s.min()), float(time_s.max())
+        return range_s if any(range_s) else None
 
-    def head_track(self, samples: int = 200) -> HeadTrack | None:
-        """Give where the head looked when, from a few points in about `samples` places.
+    def head_track(self) -> HeadTrack | None:
+        """Give where the head looked when, from echoes here and there.
 
-        Decodes no more than chunk starts where there are enough of them. None for a scan without time or not
-        in the scanner's frame.
+        Decodes no more than the end where there are chunks enough. None for a scan without time or not in the
+        scanner's frame.
         """
         if self._range_max_m is None or self.time_range_s() is None:
             return None
-        if self._layout.laszip is not None and len(self._layout.chunk_starts) < FEW_CHUNKS:
-            places = self.blocks(max(self._layout.count // samples, GLANCE))
-        else:
-            places = self._glances(samples, _Check(self._layout, self._range_max_m))
-        seen = []
-        for shots in places:
-            assert shots.time_s is not None  # noqa: S101 - asked for
-            few = slice(GLANCE)
-            seen.append((shots.time_s[few].mean(), shots.x_m[few].sum(), shots.y_m[few].sum()))
-        time_s, x_m, y_m = np.array(seen).T
+        time_s, x_m, y_m = self._glance
+        if 0 < self._layout.chunks < FEW_CHUNKS:
+            blocks = self.blocks(max(self._layout.count // PLACES, 1), brightness=False)
+            firsts = [(one.time_s[0], one.x_m[0], one.y_m[0]) for one in blocks if one.time_s is not None]
+            time_s, x_m, y_m = np.array(firsts).T
         time_s, first = np.unique(time_s, return_index=True)
         if len(time_s) < 2:
             return None
         return HeadTrack(time_s, np.unwrap(np.arctan2(y_m[first], x_m[first])))
 
-    def _glances(self, samples: int, check: _Check) -> Iterator[Shots]:
-        """Give a few echoes each from about `samples` places, the first and the last of the file included."""
-        count = self._layout.count
-        starts = self._layout.chunk_starts
-        if self._layout.laszip is None:
-            starts = np.linspace(0, count - 1, samples).astype(np.int64)
-        chosen = starts[np.linspace(0, len(starts) - 1, min(samples, len(starts))).astype(np.int64)]
+    @cached_property
+    def _glance(self) -> tuple[Floats, Floats, Floats]:
+        """Time [s], x and y [m] of echoes here and there (n,): the first of each chunk, the last of all."""
+        layout = self._layout
+        places = [] if layout.laszip else np.linspace(0, layout.count - 1, PLACES).astype(np.int64).tolist()
+        seen = [layout.chunk_firsts]
         with self._points(NEEDED, all_cores=False) as points:
-            for start in np.unique([*chosen, max(count - GLANCE, 0)]).tolist():
-                if start >= points.at:
-                    points.seek(start)
-                    yield check.shots(points.read(min(GLANCE, count - start)), timed=True)
+            for number in [*places, layout.count - 1]:
+                points.seek(number)
+                seen.append(points.read(1).tobytes())
+        records = np.frombuffer(b"".join(seen), layout.record)
+        shots = _Check(layout, self._range_max_m).shots(records, timed=True)
+        assert shots.time_s is not None  # noqa: S101 - asked for
+        return shots.time_s, shots.x_m, shots.y_m
 
     @contextmanager
     def _points(self, layers: DecompressionSelection, *, all_cores: bool) -> Iterator[_Points]:
@@ -226,8 +219,8 @@ class _Check:
         corner_m = np.linalg.norm(np.maximum(np.abs(layout.low_m), np.abs(layout.high_m)))
         self._range_max_m = range_max_m if range_max_m is not None and corner_m > range_max_m else None
         self._first_s: float | None = None
-        self.earliest_s = np.inf
-        self.latest_s = -np.inf
+        self._earliest_s = np.inf
+        self._latest_s = -np.inf
 
     def shots(self, records: Records, *, timed: bool, brightness: bool = False) -> Shots:
         """Give the echoes of some records, contiguous (n,), with their times if `timed`."""
@@ -263,10 +256,10 @@ class _Check:
         if low_s < self._first_s - WEEK_S / 2 and low_s >= 0 and self._first_s < WEEK_S:
             time_s = np.where(time_s < self._first_s - WEEK_S / 2, time_s + WEEK_S, time_s)
             low_s, high_s = float(time_s.min()), float(time_s.max())
-        self.earliest_s, self.latest_s = min(self.earliest_s, low_s), max(self.latest_s, high_s)
-        if self._scanner_frame and self.latest_s - self.earliest_s > LONGEST_SCAN_S:
+        self._earliest_s, self._latest_s = min(self._earliest_s, low_s), max(self._latest_s, high_s)
+        if self._scanner_frame and self._latest_s - self._earliest_s > LONGEST_SCAN_S:
             raise ScanError(
-                f"time stamps from {self.earliest_s:.3f} to {self.latest_s:.3f} s, more than a day apart:"
+                f"time stamps from {self._earliest_s:.3f} to {self._latest_s:.3f} s, more than a day apart:"
                 " corrupt, or several scans in one file"
             )
         return time_s

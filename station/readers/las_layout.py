@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 import struct
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import BinaryIO
 
@@ -52,7 +53,8 @@ class Layout:
     standard_time: bool
     software: str
     laszip: bytes | None  # the record that tells how the points are compressed; None: they are not
-    chunk_starts: Ints  # (chunks,) number of the first point of each, none where not compressed
+    chunks: int  # nought where not compressed
+    chunk_firsts: bytes  # the first point of each, which stands there as it is
     even_chunks: bool  # all of one length but the last
 
     @property
@@ -106,11 +108,11 @@ def read_layout(file: BinaryIO, size: int) -> Layout:
     laszip = _find_laszip(file, header)
     if not header.compressed:
         _check_room(header)
-        record, chunk_starts = None, np.empty(0, dtype=np.int64)
+        record, chunk_firsts = None, b""
     elif laszip is None:
         raise ScanError("compressed, but the record that says how (LASzip VLR) is missing")
     else:
-        record, chunk_starts = laszip.record, _check_chunks(file, header, laszip)
+        record, chunk_firsts = laszip.record, _check_chunks(file, header, laszip)
     return Layout(
         point_format=header.point_format,
         record_bytes=header.record_bytes,
@@ -123,7 +125,8 @@ def read_layout(file: BinaryIO, size: int) -> Layout:
         standard_time=bool(header.flags & 1),
         software=header.software,
         laszip=record,
-        chunk_starts=chunk_starts,
+        chunks=len(chunk_firsts) // header.record_bytes,
+        chunk_firsts=chunk_firsts,
         even_chunks=laszip is not None and laszip.chunk_points != VARIABLE_CHUNKS,
     )
 
@@ -260,8 +263,8 @@ def _read_laszip(record: bytes, record_bytes: int) -> _LasZip:
     return _LasZip(record, layers if compressor == LAYERED else 0, chunk_points)
 
 
-def _check_chunks(file: BinaryIO, header: _Header, laszip: _LasZip) -> Ints:
-    """Return the number of each chunk's first point (chunks,), once all chunks fit count and file."""
+def _check_chunks(file: BinaryIO, header: _Header, laszip: _LasZip) -> bytes:
+    """Return the first point of each chunk, once all chunks fit count and file."""
     first_at = header.points_at + 8
     file.seek(header.points_at)
     table_at = struct.unpack("<q", file.read(8))[0] if first_at <= header.points_end else -1
@@ -286,31 +289,32 @@ def _check_chunks(file: BinaryIO, header: _Header, laszip: _LasZip) -> Ints:
     points, sizes = np.asarray(told, dtype=np.uint64).astype(np.int64).reshape(-1, 2).T
     if fixed:
         points[-1:] = header.count - (chunks - 1) * laszip.chunk_points
-    if points.sum() != header.count or sizes.sum() != table_at - first_at or (sizes <= 0).any():
+    whole = sizes >= header.record_bytes
+    if points.sum() != header.count or sizes.sum() != table_at - first_at or not whole.all():
         raise ScanError("corrupt chunk table: its chunks do not add up to the points and bytes there are")
     if points.min() <= 0 or points.max() * header.record_bytes > MOST_CHUNK_BYTES:
         raise ScanError(f"corrupt chunk table: a chunk of {points.max():,} points")
-    if laszip.layers:
-        _check_layers(file, first_at, points, sizes, header.record_bytes, laszip.layers)
-    return np.concatenate([[0], np.cumsum(points)[:-1]])
+    return b"".join(_first_points(file, first_at, points, sizes, header.record_bytes, laszip.layers))
 
 
-def _check_layers(
+def _first_points(
     file: BinaryIO, first_at: int, points: Ints, sizes: Ints, record_bytes: int, layers: int
-) -> None:
-    """Check that every layered chunk holds the points it should, in layers that add up to its size.
+) -> Iterator[bytes]:
+    """Give the first point of each chunk; layered ones hold the points they should, in layers that add up.
 
     Decoders allocate what a layer says it takes, up to 4 GB each.
     """
     place = first_at
     head = struct.Struct(f"<{1 + layers}I")
     for number, (count, size) in enumerate(zip(points.tolist(), sizes.tolist(), strict=True)):
-        file.seek(place + record_bytes)
-        told = file.read(head.size)
-        counted, *lengths = head.unpack(told) if len(told) == head.size else (0,)
-        if counted != count or record_bytes + head.size + sum(lengths) != size:
-            raise ScanError(
-                f"corrupt in chunk {number + 1} of {len(points)}: {counted:,} points where"
-                f" {count:,} belong, or layers that do not add up"
-            )
+        file.seek(place)
+        yield file.read(record_bytes)
+        if layers:
+            told = file.read(head.size)
+            counted, *lengths = head.unpack(told) if len(told) == head.size else (0,)
+            if counted != count or record_bytes + head.size + sum(lengths) != size:
+                raise ScanError(
+                    f"corrupt in chunk {number + 1} of {len(points)}: {counted:,} points where"
+                    f" {count:,} belong, or layers that do not add up"
+                )
         place += size

@@ -81,7 +81,7 @@ class ScanReader(Protocol):
     def time_range_s(self) -> tuple[float, float] | None:
         """Give the earliest and latest time stamp [s], from samples; None where there are none."""
 
-    def head_track(self, samples: int = 200) -> HeadTrack | None:
+    def head_track(self) -> HeadTrack | None:
         """Give where the head looked when, from samples; None where it cannot be told."""
 
     def close(self) -> None:

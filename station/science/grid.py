@@ -91,6 +91,7 @@ class Gridder:
         # Of a cell side by side, for it is they that a shot has to wait for: number of points and brightness
         # in one, heights, and their squares.
         self._sums = np.zeros((grid.nx * grid.ny, 3), np.int64)
+        self._empty = True
 
     def cells(self, x_m: Floats, y_m: Floats) -> tuple[Ints | slice, Floats, Floats]:
         """Which points (n,) lie on the grid, and their column and row, in fractions of cells.
@@ -128,7 +129,7 @@ class Gridder:
 
     def is_empty(self) -> bool:
         """Tell whether no point has come."""
-        return not self._sums[: self.taken, 0].any()
+        return self._empty
 
     def complete(self) -> None:
         """No more points come: let the ground go that only they need."""
@@ -136,6 +137,7 @@ class Gridder:
 
     def add(self, number: Ints32, residual_m: Floats, intensity: Floats | None) -> None:
         """Add points (n,): number of their cell, height above reference or datum, and brightness, 0-1."""
+        self._empty &= not len(number)
         sums = self._sums.reshape(-1)
         steps = np.rint(residual_m * QUANTUM)
         at = np.multiply(number, 3, dtype=np.int64)

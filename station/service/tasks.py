@@ -429,7 +429,7 @@ def _figures(epoch: store.Epoch, seconds: float) -> dict[str, float | str]:
     measured = epoch.measurement
     told: dict[str, float | str] = {
         "points": int(epoch.numbers["point_total"]),
-        "cells": int(np.count_nonzero(measured.cells["count"])),
+        "cells": round(epoch.numbers["coverage"] * measured.number.size),
     }
     part = slice(None, None, 1 + len(measured.cells) // CELLS_MOST)
     change_m, sigma_m = (measured.cells[name][part] for name in ("change_m", "uncertainty_m"))

@@ -133,7 +133,7 @@ def test_memory_does_not_grow_with_the_scan(a_sweep):
     [("few_chunks.laz", 60_000), ("many_chunks.laz", 1_050_000), ("s.las", 60_000)],
 )
 def test_the_head_is_followed(a_sweep, name, count):
-    """One look is a mean over 8 ms, in which the head turns 0.8 mrad: azimuth and time fit each other."""
+    """Azimuth and time fit each other: in a millisecond the head turns 0.1 mrad."""
     track = LasScan(a_sweep(name, count), range_max_m=1000.0).head_track()
     assert np.all(np.diff(track.time_s) > 0)
     assert track.time_s[0] < 40.1
@@ -149,7 +149,7 @@ def test_no_head_is_followed_on_a_map(a_sweep):
 def test_an_echo_out_of_range_is_refused(a_sweep):
     path = a_sweep("s.laz", 1000)
     assert sum(len(block) for block in LasScan(path, range_max_m=900.1).blocks()) == 1000
-    with pytest.raises(ScanError, match=r"an echo 8\d\d m away, beyond scanner\.range_max_m = 850"):
+    with pytest.raises(ScanError, match=r"an echo (8\d\d|900) m away, beyond scanner\.range_max_m = 850"):
         list(LasScan(path, range_max_m=850.0).blocks())
 
 
