@@ -107,10 +107,11 @@ def _fringe(gridder: Gridder, setup: Setup, heights: _Heights, rows: slice) -> _
 
 
 class _Heights:
-    """Heights above the datum row by row, read from the sums of cells before these give way."""
+    """Heights above one datum row by row, read from the sums of cells before these give way."""
 
     def __init__(self, gridder: Gridder, outlook: Outlook | None, min_points: int) -> None:
         self._gridder, self._outlook, self._min_points = gridder, outlook, min_points
+        self._above_m = 0.0 if outlook is None else gridder.datum_m - outlook.datum_m  # the reference's datum
         self._rows = slice(0, 0)
         self._height_m = np.empty((0, gridder.grid.nx), np.float32)
 
@@ -132,10 +133,10 @@ class _Heights:
         beyond = np.flatnonzero(numbers >= gridder.known)
         sums = gridder.at(numbers.reshape(-1)[beyond])
         enough = sums.count >= self._min_points
-        height_m.reshape(-1)[beyond] = np.where(enough, sums.mean_residual(), np.nan)
+        height_m.reshape(-1)[beyond] = np.where(enough, sums.mean_residual() + self._above_m, np.nan)
         if outlook is not None:  # what it knows of the cells beside is better
-            better_m = outlook.rise_m[rows] + np.float32(outlook.datum_m - gridder.datum_m)
-            np.copyto(height_m, better_m, where=numbers.view(np.uint32) < np.uint32(gridder.known))
+            known = numbers.view(np.uint32) < np.uint32(gridder.known)
+            np.copyto(height_m, outlook.rise_m[rows], where=known)
         return height_m
 
 
