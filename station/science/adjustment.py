@@ -291,10 +291,12 @@ def _solve(reduced: Reduced, size: int, changes: _Changes, near: tuple[int, int]
             tried[place] = _likelihood(left, told, changes, place)
         return tried[place][0]
 
-    step = (len(CHANGE_STEPS_M) - 1) // 2 if near is None else near[1]
+    size_m = _step_m(near or (0, len(CHANGE_STEPS_M) // 2))  # about the same, however alike neighbours are
     for alike in range(len(ALIKE_CHANGES)):
         if near is None or abs(alike - near[0]) <= 1:
-            step = _climbed(odds, alike, step)
+            sizes_m = [_step_m((alike, step)) for step in range(len(CHANGE_STEPS_M))]
+            step = int(np.argmin(np.abs(np.log(np.divide(sizes_m, size_m)))))
+            size_m = sizes_m[_climbed(odds, alike, step)]
     place = max(tried, key=odds)
     change_m = tried[place][1]
     estimate = np.concatenate([state.solve(right[:size] - normal[:size, size:] @ change_m), change_m])
