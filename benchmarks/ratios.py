@@ -106,7 +106,7 @@ def footer() -> str:
     said = f"{cores} cores of {cpu}, load {loaded:.1f}, Python {sys.version.split()[0]}, {', '.join(found)}."
     return (
         f"{said} CPU: user and system of the process and its children. Start-up (imports, first compilation)"
-        " and the end of a process are taken off everywhere. A GB of memory that was not used for a while takes"
-        f" {fresh_s:.2g} CPU-s, which is little on a machine of its own."
+        " and the end of a process are taken off everywhere. A GB of memory that was not used for a while"
+        f" takes {fresh_s:.2g} CPU-s, which is little on a machine of its own."
         " Accuracy: python -m benchmarks.accuracy; soak: python -m benchmarks.soak."
     )
