@@ -137,7 +137,7 @@ class LasScan:
 
     @cached_property
     def _glance(self) -> tuple[Floats, Floats, Floats]:
-        """Time [s], x and y [m] of echoes here and there (n,): the first of each chunk, the last of all."""
+        """Time [s], x and y [m] of echoes (n,): the first of each chunk, or some on the way, and the last."""
         layout = self._layout
         places = [] if layout.laszip else np.linspace(0, layout.count - 1, PLACES).astype(np.int64).tolist()
         seen = [layout.chunk_firsts]

@@ -247,13 +247,13 @@ class Sensitivities:
             variance_m2[order] = self.some(order).variance(unknown)
             return variance_m2
         columns = self._columns()
-        halves = np.empty_like(columns)
+        weighted = np.empty_like(columns)
         for first, end in pairwise([0, *(np.flatnonzero(np.diff(knot)) + 1).tolist(), len(knot)]):
             felt = of.felt_after(int(knot[first]))
             covariance = unknown.covariance[np.ix_(felt, felt)].astype(columns.dtype)
-            np.matmul(covariance, columns[:, first:end], out=halves[:, first:end])
+            np.matmul(covariance, columns[:, first:end], out=weighted[:, first:end])
         # Rounding may take it below nought where the covariance is singular.
-        told_m2 = np.maximum(np.einsum("ij,ij->j", columns, halves), 0.0)
+        told_m2 = np.maximum(np.einsum("ij,ij->j", columns, weighted), 0.0)
         lines = slice(int(knot[0]) * LINES_A_KNOT, (int(knot[-1]) + 1) * LINES_A_KNOT)
         own = (leans_between(of).left[lines] ** 2 @ line_variances(of, unknown)).astype(columns.dtype)
         return np.asarray(self.lean**2 * own[self.line - lines.start] + told_m2)

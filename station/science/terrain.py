@@ -45,7 +45,7 @@ def smooth_gradient(
 def gradient_in(elevation_m: Floats32, cell_m: float, row: Ints, column: Ints) -> tuple[Floats32, Floats32]:
     """Return what `smooth_gradient` is in a few cells (n,), each from the square of cells around it.
 
-    A cell takes as long as twelve of a whole surface.
+    A cell takes as long as ten of a whole surface.
     """
     line = _gaussian(GRADIENT_CELLS)
     share, reach = np.outer(line, line).reshape(-1), len(line) // 2 + 1
