@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
-from functools import partial
+from functools import cached_property, partial
 
 import numpy as np
 
@@ -29,7 +29,7 @@ from station.science.measuring import Judge, measured
 from station.science.normals import LineLog
 from station.science.outlook import Outlook, Trait, look
 from station.science.patches import Cells, collect
-from station.science.pose import Frame, lean
+from station.science.pose import Frame, Turning, turning
 from station.science.shared import Basis, Sensitivities
 from station.science.view import Points
 
@@ -44,6 +44,11 @@ class Pose:
     frame: Frame | None
     tilt: Tilt | None
     air: AirCorrection | None
+
+    @cached_property
+    def upright(self) -> Turning:
+        """How shots are turned into the frame at the scanner: by the tilt of their moment, then the SOP."""
+        return turning(self.tilt, np.eye(3) if self.frame is None else self.frame.to_local[:3, :3])
 
 
 def outlook_on(reference: Reference, setup: Setup, stable: Bools) -> Outlook:
@@ -72,11 +77,8 @@ def to_map(shots: Shots, pose: Pose) -> Points:
     points = shots.x_m, shots.y_m, shots.z_m
     if pose.frame is None:
         return points
-    if pose.tilt is not None:
-        time_s = np.zeros(len(shots)) if shots.time_s is None else shots.time_s
-        points = lean(points, time_s, pose.tilt)
-    x_m, y_m, z_m = (
-        row[0] * points[0] + row[1] * points[1] + row[2] * points[2] for row in pose.frame.to_local[:3, :3]
+    x_m, y_m, z_m = pose.upright.turned(
+        points, np.zeros(len(shots)) if shots.time_s is None else shots.time_s
     )
     if pose.air is not None:
         scale = pose.air.range_scale(z_m)

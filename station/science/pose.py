@@ -12,7 +12,8 @@ from pyproj import CRS, Transformer
 
 from station.quantities import Floats, Floats32, Ints, Tilt
 
-KNOT_RAD = 1e-5  # of lean, apart
+KNOT_RAD = 3e-5  # of lean, apart
+SHORTEST_S = 1e-9  # between knots
 GEOCENTRIC = "EPSG:4978"  # WGS84, where a POP leads
 GEOGRAPHIC = "EPSG:4979"  # WGS84 with ellipsoidal height
 
@@ -46,36 +47,71 @@ def rotation(omega_rad: float, phi_rad: float, kappa_rad: float) -> Floats:
     return np.asarray(rotation_z(kappa_rad) @ rotation_y(phi_rad) @ rotation_x(omega_rad))
 
 
-def lean(xyz_m: tuple[Floats, Floats, Floats], time_s: Floats, tilt: Tilt) -> tuple[Floats, Floats, Floats]:
-    """Coordinates (n,) of shots in the upright scanner frame [m], each turned by the tilt of its moment.
+@dataclass(frozen=True)
+class Turning:
+    """A rotation that changes with time: what it is at some moments, linear from one to the next.
 
-    R_D = Ry(pitch) Rx(roll), in the scanner's frame, before the SOP.
-    Source: Hartzell et al. (2015), Eq. 5, which adds it to the chain of Eq. 4.
+    Before the first and after the last it stays as it is there.
     """
-    x_m, y_m, z_m = xyz_m
-    sin_r, sin_p = _sines(time_s, tilt)
-    cos_r, cos_p = np.sqrt(1 - sin_r * sin_r), np.sqrt(1 - sin_p * sin_p)
-    rolled_z_m = sin_r * y_m + cos_r * z_m
-    return (
-        cos_p * x_m + sin_p * rolled_z_m,
-        cos_r * y_m - sin_r * z_m,
-        cos_p * rolled_z_m - sin_p * x_m,
-    )
+
+    time_s: Floats  # (k,) increasing
+    matrix: Floats  # (k, 3, 3) from that moment on …
+    per_s: Floats  # (k, 3, 3) … and what each second adds to it
+
+    def turned(self, xyz_m: tuple[Floats, Floats, Floats], time_s: Floats) -> tuple[Floats, Floats, Floats]:
+        """Coordinates (n,) of shots [m], each turned as at its moment. Fastest where they come in turn."""
+        turned_m = np.empty_like(time_s), np.empty_like(time_s), np.empty_like(time_s)
+        if not len(time_s):
+            return turned_m
+        if np.any(time_s[1:] < time_s[:-1]):
+            order = np.argsort(time_s, kind="stable")
+            x_m, y_m, z_m = (axis_m[order] for axis_m in xyz_m)
+            for axis_m, sorted_m in zip(turned_m, self.turned((x_m, y_m, z_m), time_s[order]), strict=True):
+                axis_m[order] = sorted_m
+            return turned_m
+        first, last = np.searchsorted(self.time_s[1:], (time_s[0], time_s[-1]), side="right").tolist()
+        edges = [0, *np.searchsorted(time_s, self.time_s[first + 1 : last + 1]).tolist(), len(time_s)]
+        product = np.empty_like(time_s)
+        for knot, part in zip(range(first, last + 1), map(slice, edges, edges[1:]), strict=False):
+            since_s = np.maximum(time_s[part] - self.time_s[knot], 0.0)
+            here_m = [axis_m[part] for axis_m in xyz_m]
+            for axis_m, row, row_per_s in zip(turned_m, self.matrix[knot], self.per_s[knot], strict=True):
+                total_m = axis_m[part]
+                np.multiply(here_m[0], row_per_s[0], out=total_m)
+                _add(total_m, here_m[1:], row_per_s[1:], product[part])
+                np.multiply(total_m, since_s, out=total_m)
+                _add(total_m, here_m, row, product[part])
+        return turned_m
 
 
-def _sines(time_s: Floats, tilt: Tilt) -> tuple[Floats, Floats]:
-    """Sines (n,) of roll and pitch, both below 90°, that are linear between the knots of a tilt.
+def _add(total_m: Floats, axes_m: list[Floats], shares: Floats, product: Floats) -> None:
+    """Add shares of coordinates (n,) to a total, without memory of its own: to take that is a third of it."""
+    for axis_m, share in zip(axes_m, shares.tolist(), strict=True):
+        np.multiply(axis_m, share, out=product)
+        np.add(total_m, product, out=total_m)
 
-    A sine of each shot would be a quarter of the way to the map; between knots `KNOT_RAD` apart it is a line
-    but for 1e-11. Both are looked up at once, as one complex number.
+
+def turning(tilt: Tilt | None, then: Floats) -> Turning:
+    """Return how shots are turned upright by the tilt of their moment, `then` by a matrix (3, 3) of all time.
+
+    R_D = Ry(pitch) Rx(roll), in the scanner's frame, before the SOP; between knots `KNOT_RAD` apart it is
+    linear but for 1e-10. Source: Hartzell et al. (2015), Eq. 5, which adds it to the chain of Eq. 4.
     """
+    if tilt is None:
+        return Turning(np.zeros(1), then[None], np.zeros((1, 3, 3)))
     knots = np.stack([tilt.time_s, tilt.roll_rad, tilt.pitch_rad])
     steps = np.ceil(np.abs(np.diff(knots[1:])).max(axis=0, initial=0.0) / KNOT_RAD).astype(np.int64)
-    if steps.max(initial=0) > 1:
-        along = np.concatenate([[0.0], np.cumsum(np.maximum(steps, 1))])
-        knots = np.stack([np.interp(np.arange(along[-1] + 1), along, one) for one in knots])
-    sines = np.interp(time_s, knots[0], np.sin(knots[1]) + 1j * np.sin(knots[2]))
-    return np.ascontiguousarray(sines.real), np.ascontiguousarray(sines.imag)
+    along = np.concatenate([[0.0], np.cumsum(np.maximum(steps, 1))])
+    time_s, roll_rad, pitch_rad = (np.interp(np.arange(along[-1] + 1), along, one) for one in knots)
+    (sin_r, sin_p), (cos_r, cos_p) = ((f(roll_rad), f(pitch_rad)) for f in (np.sin, np.cos))
+    upright = [
+        [cos_p, sin_p * sin_r, sin_p * cos_r],
+        [0 * sin_r, cos_r, -sin_r],
+        [-sin_p, cos_p * sin_r, cos_p * cos_r],
+    ]
+    matrix = then @ np.moveaxis(np.array(upright), -1, 0)
+    per_s = np.diff(matrix, axis=0) / np.maximum(np.diff(time_s), SHORTEST_S)[:, None, None]
+    return Turning(time_s, matrix, np.concatenate([per_s, np.zeros((1, 3, 3))]))
 
 
 @dataclass(frozen=True)

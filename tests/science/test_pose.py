@@ -19,18 +19,22 @@ def test_rotation_is_omega_then_phi_then_kappa():
     assert pose.rotation(*angles) == pytest.approx(Rotation.from_euler("xyz", angles).as_matrix())
 
 
+def upright(tilt, points, time_s):
+    return pose.turning(tilt, np.eye(3)).turned(tuple(points), time_s)
+
+
 def test_lean_turns_roll_first():
     """A mount that leans 5° in both axes would show the other order as 0.4°."""
     roll, pitch = math.radians(5.0), math.radians(5.0)
     tilt = Tilt(np.array([0.0, 10.0]), np.array([roll, roll]), np.array([pitch, pitch]))
     points = np.random.default_rng(1).normal(size=(3, 20))
-    leaning = np.array(pose.lean(tuple(points), np.full(20, 5.0), tilt))
+    leaning = np.array(upright(tilt, points, np.full(20, 5.0)))
     assert leaning == pytest.approx(Rotation.from_euler("xy", [roll, pitch]).as_matrix() @ points)
 
 
 def test_lean_is_interpolated_per_shot():
     tilt = Tilt(np.array([0.0, 10.0]), np.array([0.0, 0.0]), np.array([0.0, 0.001]))
-    x_m, _, z_m = pose.lean((np.full(2, 1000.0), np.zeros(2), np.zeros(2)), np.array([2.5, 7.5]), tilt)
+    x_m, _, z_m = upright(tilt, np.array([[1000.0, 1000.0], [0.0, 0.0], [0.0, 0.0]]), np.array([2.5, 7.5]))
     assert z_m == pytest.approx([-0.25, -0.75], abs=1e-6)
     assert x_m == pytest.approx([1000.0, 1000.0], abs=1e-3)
 
@@ -128,7 +132,23 @@ def test_a_lean_that_jumps_between_its_knots_turns_as_its_angle_does():
     tilt = Tilt(np.array([0.0, 1.0, 2.0]), np.radians([0.0, 0.5, -30.0]), np.radians([0.2, -0.3, 5.0]))
     time_s = np.linspace(0, 2, 301)
     far_m = np.array([4000.0, -3000.0, 800.0])
-    leant = np.stack(pose.lean(tuple(np.full(301, axis) for axis in far_m), time_s, tilt), axis=-1)
+    leant = np.stack(upright(tilt, np.repeat(far_m[:, None], 301, axis=1), time_s), axis=-1)
     for at_s, found_m in zip(time_s, leant, strict=True):
         roll, pitch = (np.interp(at_s, tilt.time_s, angle) for angle in (tilt.roll_rad, tilt.pitch_rad))
         assert found_m == pytest.approx(pose.rotation_y(pitch) @ pose.rotation_x(roll) @ far_m, abs=1e-6)
+
+
+def test_the_lean_stays_as_it_is_before_and_after_its_log_and_shots_may_come_in_any_order():
+    """As the rotation at the angle of its moment, then by the SOP; of each shot whatever is beside it."""
+    rng = np.random.default_rng(2)
+    tilt = Tilt(np.array([10.0, 12.0, 15.0]), rng.normal(0, 1e-3, 3), rng.normal(0, 1e-3, 3))
+    sop, points, time_s = pose.rotation(0.1, -0.2, 2.0), everywhere(count=500), rng.uniform(5, 20, 500)
+    turning = pose.turning(tilt, sop)
+    told_m = np.array(turning.turned(tuple(points), time_s))
+    for at in range(500):
+        roll, pitch = (np.interp(time_s[at], tilt.time_s, angle) for angle in (tilt.roll_rad, tilt.pitch_rad))
+        wanted_m = sop @ pose.rotation_y(pitch) @ pose.rotation_x(roll) @ points[:, at]
+        assert told_m[:, at] == pytest.approx(wanted_m, abs=1e-6)
+        assert np.array_equal(
+            told_m[:, at], np.ravel(turning.turned(tuple(points[:, at : at + 1]), time_s[at : at + 1]))
+        )
