@@ -72,7 +72,7 @@ def collect(of: Basis, bands: Iterable[Cells], reach_m: float) -> Patches:
     stretches = int(reach_m / STRETCH_M) + 1
     a_kind = of.line_count * stretches
     size = a_kind * Kind.UNUSED
-    sums = np.zeros((len(GLOBAL) + 3, Kind.UNUSED, of.line_count, stretches))
+    sums = np.zeros((len(GLOBAL) + 4, Kind.UNUSED, of.line_count, stretches))
     held: list[tuple[Ints32, Floats32, Floats32]] = []
     one_in = (1, 1)
     for cells in bands:
@@ -86,7 +86,7 @@ def collect(of: Basis, bands: Iterable[Cells], reach_m: float) -> Patches:
         first, lines = int(line.min()), int(np.ptp(line)) + 1
         near = (kind * lines + line - first) * stretches + stretch
         total = sums[:, :, first : first + lines]
-        for row, effect in enumerate([*felt.globals_, felt.lean, felt.refraction, None]):
+        for row, effect in enumerate([*felt.globals_, felt.lean, felt.refraction, felt.across, None]):
             weighted = precision if effect is None else precision * effect[used]
             total[row] += np.bincount(near, weighted, total[row].size).reshape(total[row].shape)
         key = kind * a_kind + line * stretches + stretch
@@ -103,7 +103,8 @@ def collect(of: Basis, bands: Iterable[Cells], reach_m: float) -> Patches:
     effects = of_patch[:-1, there] / of_patch[-1, there]
     place = there % a_kind
     passed = (place // stretches + 0.5) / LINES_A_KNOT
-    felt = Sensitivities(of, effects[: len(GLOBAL)], effects[-2], effects[-1], passed)
+    lean, refraction, across = effects[len(GLOBAL) :]
+    felt = Sensitivities(of, effects[: len(GLOBAL)], lean, refraction, across, passed)
     return Patches(felt, place % stretches, there // a_kind, mean_m, variance_m2, count, one_in)
 
 

@@ -167,6 +167,7 @@ class Sensitivities:
     globals_: Reals  # (9, n)
     lean: Reals  # (n,) per rad
     refraction: Reals  # (n,) per unit of k
+    across: Reals  # (n,) per rad of turn about the direction in which the head looks
     passed: Reals  # (n,) knots of the lean before it, in fractions
 
     def __len__(self) -> int:
@@ -177,20 +178,6 @@ class Sensitivities:
     def line(self) -> Ints:
         """Group of scan lines (n,) that each cell lies in."""
         return (self.passed * LINES_A_KNOT).astype(np.int64)
-
-    @cached_property
-    def across(self) -> Reals:
-        """Effect of a turn about the direction in which the head looks (n,), per rad.
-
-        It shifts points sideways by their height under the scanner: steep ground close by shows it.
-        """
-        east, north = _clockwise(self.of.axis)
-        azimuth_rad = self.of.start_rad + LEAN_KNOT_RAD * self.passed
-        sine, cosine = np.sin(azimuth_rad), np.cos(azimuth_rad)
-        turn = [sine * e + cosine * n for e, n in zip(east, north, strict=True)]
-        return np.asarray(
-            self.globals_[0] * turn[0] + self.globals_[1] * turn[1] - self.globals_[2] * turn[2]
-        )
 
     def lean_knot(self) -> tuple[Ints, Ints, Reals]:
         """Knots of the lean before and after each cell (n,), and the share of the one after."""
@@ -230,9 +217,8 @@ class Sensitivities:
 
     def some(self, chosen: Bools | Ints | slice) -> Sensitivities:
         """Return those of the chosen cells."""
-        return Sensitivities(
-            self.of, self.globals_[:, chosen], self.lean[chosen], self.refraction[chosen], self.passed[chosen]
-        )
+        singles = (one[chosen] for one in (self.lean, self.refraction, self.across, self.passed))
+        return Sensitivities(self.of, self.globals_[:, chosen], *singles)
 
     def variance(self, unknown: Shared) -> Reals:
         """Variance of each cell's height (n,) [m²]: the diagonal of J C Jᵀ, and what its line adds.
@@ -297,13 +283,22 @@ def sensitivities(
     range_m = np.sqrt(horizontal_m**2 + z_m**2)
     rise_m = horizontal_m + z_m * (east_gradient * x_m + north_gradient * y_m) / horizontal_m  # F
     one = np.ones_like(x_m)
+    turns_m = (
+        -(y_m + north_gradient * z_m),
+        x_m + east_gradient * z_m,
+        east_gradient * y_m - north_gradient * x_m,
+    )
+    # A turn about the way to a point leaves it there. That way is `out_m` across the head's axis and `up_m`
+    # along it: what a turn about the one does, one about the other undoes.
+    u = of.axis
+    up_m = u[0] * x_m + u[1] * y_m + u[2] * z_m
+    about_axis_m = u[0] * turns_m[0] + u[1] * turns_m[1] - u[2] * turns_m[2]
+    out_m = np.sqrt(np.maximum(range_m**2 - up_m**2, 1e-12))
     return Sensitivities(
         of=of,
         globals_=np.stack(
             [
-                -(y_m + north_gradient * z_m),
-                x_m + east_gradient * z_m,
-                east_gradient * y_m - north_gradient * x_m,
+                *turns_m,
                 east_gradient,
                 north_gradient,
                 -one,
@@ -314,6 +309,7 @@ def sensitivities(
         ),
         lean=-rise_m,
         refraction=horizontal_m * rise_m / (2 * EARTH_RADIUS_M),
+        across=-up_m * about_axis_m / out_m,
         passed=of.knots_before(offset_m) if passed is None else passed,
     )
 

@@ -113,7 +113,7 @@ def together(*patches):
             np.hstack([one.globals_ for one in felt]),
             *(
                 np.concatenate([getattr(one, name) for one in felt])
-                for name in ("lean", "refraction", "passed")
+                for name in ("lean", "refraction", "across", "passed")
             ),
         ),
         *(

@@ -26,9 +26,7 @@ def some_cells(seed=0, count=4000):
 def part(cells, chosen):
     felt = cells.felt
     return Cells(
-        shared.Sensitivities(
-            OF, felt.globals_[:, chosen], felt.lean[chosen], felt.refraction[chosen], felt.passed[chosen]
-        ),
+        felt.some(chosen),
         cells.range_m[chosen],
         cells.kind[chosen],
         cells.residual_m[chosen],

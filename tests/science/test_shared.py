@@ -69,6 +69,18 @@ def test_sensitivities_against_moved_points(parameter, unit):
     )
 
 
+def test_a_turn_about_where_a_leaning_head_looks():
+    """As points move that are turned about the way to them, less what of it lies along the head's axis."""
+    axis = np.array([0.05, -0.08, 1.0]) / np.linalg.norm([0.05, -0.08, 1.0])
+    place_m = np.array(cells())
+    of = shared.basis(GRID, (0.0, 0.0, 0.0), tuple(axis.tolist()))
+    felt = shared.sensitivities(of, tuple(place_m), np.full(200, EAST), np.full(200, NORTH))
+    sight = place_m - axis[:, None] * (axis @ place_m)
+    moved_m = Rotation.from_rotvec(-1e-6 * (sight / np.linalg.norm(sight, axis=0)).T).apply(place_m.T).T
+    wanted = height_error(moved_m, place_m) / 1e-6
+    assert felt.across == pytest.approx(wanted, rel=2e-3, abs=1e-6 * abs(wanted).max())
+
+
 def dense(felt):
     """The whole matrix J, by asking for the effect on each cell alone."""
     return np.array([felt.total(row) for row in np.eye(len(felt))])
