@@ -25,7 +25,7 @@ from station.archive.reference import held_at
 from station.errors import StoreError
 from station.quantities import Ints, Reference
 from station.science import shared
-from station.science.outlook import Outlook, Position
+from station.science.outlook import CELLS, Outlook, Position
 
 ROWS = 128  # of the grid, that a checksum covers
 KEPT = 2  # at a time, of one station: a scanner that was moved may still have old scans to be done again
@@ -46,7 +46,7 @@ def kept_outlook(
     `place` of the scanner and its axis; `made_with` tells everything else that it depends on.
     """
     status = held_at(series, reference.version).stat()
-    told = __version__, reference.version, status.st_size, status.st_mtime_ns, place, made_with
+    told = __version__, [*CELLS], reference.version, status.st_size, status.st_mtime_ns, place, made_with
     path = series.folder / f".outlook-{sha256(repr(told).encode()).hexdigest()[:16]}.h5"
     if not path.is_file():
         made = look()

@@ -130,13 +130,16 @@ class _Heights:
         gridder, outlook = self._gridder, self._outlook
         numbers = gridder.number[rows]
         height_m = np.full(numbers.shape, np.nan, np.float32)
+        if (
+            outlook is not None
+        ):  # what it knows of cells is better; NaN is a number of all bits, for all others
+            others = numbers.view(np.uint32) >= np.uint32(gridder.known)
+            others_bits = np.negative(others.view(np.int8), dtype=np.int32)
+            np.bitwise_or(outlook.rise_m[rows].view(np.int32), others_bits, out=height_m.view(np.int32))
         beyond = np.flatnonzero(numbers >= gridder.known)
         sums = gridder.at(numbers.reshape(-1)[beyond])
         enough = sums.count >= self._min_points
         height_m.reshape(-1)[beyond] = np.where(enough, sums.mean_residual() + self._above_m, np.nan)
-        if outlook is not None:  # what it knows of the cells beside is better
-            known = numbers.view(np.uint32) < np.uint32(gridder.known)
-            np.copyto(height_m, outlook.rise_m[rows], where=known)
         return height_m
 
 
@@ -174,6 +177,7 @@ class _Made:
     def put(self, number: Ints | Ints32, sums: Sums, told: _Judged) -> None:
         """Lay down cells (m,); of those with too few points no more than number and spread."""
         enough = sums.count >= self.min_points
+        few = np.flatnonzero(~enough)
         cells = np.empty(len(number), MEASURED)
         kept_m = np.rint(told.elevation_m / KEPT_M).astype(np.float32)
         kept_m *= KEPT_M
@@ -184,7 +188,7 @@ class _Made:
             ("random_uncertainty_m", told.random_m),
         ):
             cells[name] = values
-            cells[name][~enough] = np.nan
+            cells[name][few] = np.nan
         cells["spread_m"], cells["count"] = sums.spread(), sums.count
         _as_one(self.cells)[number] = _as_one(cells)
         self.quality[number] = np.where(enough, told.flags, 0)
@@ -246,7 +250,9 @@ class Judge:
         sampling_m2 = slope_sampling_variance(setup.grid.cell_m, view.tan_slope, count)
         random_m2 = view.shot_variance(setup.scanner, published=setup.published_budget) / count + sampling_m2
         of = shared.basis(setup.grid, setup.position_m, setup.axis)
-        felt = shared.sensitivities(of, view.offset_m, view.east_gradient, view.north_gradient)
+        east_m, north_m, up_m = (axis_m.astype(np.float32) for axis_m in view.offset_m)
+        slopes = (slope.astype(np.float32) for slope in (view.east_gradient, view.north_gradient))
+        felt = shared.sensitivities(of, (east_m, north_m, up_m), *slopes)
         shared_m2, correction_m = self._shared(felt)
         terms = self._terms(felt, view, count, sampling_m2) if setup.store_terms else {}
         sigma_m = self._total(random_m2 + shared_m2)

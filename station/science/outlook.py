@@ -6,6 +6,7 @@ scan to scan. So they are worked out once, and laid in the order in which the he
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, fields
 from enum import IntFlag
@@ -17,13 +18,14 @@ from numpy.typing import NDArray
 
 from station.quantities import UPRIGHT, Bools, Floats32, Grid, Ints, Ints32, Reals, Reference, Scanner
 from station.science import ground, shared, terrain
-from station.science.shared import Basis, Sensitivities
+from station.science.shared import LEAN_PER_REFRACTION, Basis, Sensitivities
 from station.science.terrain import MARGIN_ROWS, Ground, smooth_gradient
 from station.science.view import View
 
 MOVING_MOST = 400_000  # cells of moving ground that an adjustment looks at
 STABLE_MOST = 800_000  # the same of stable ground, in whole rows; so many tell all there is to tell
 TOGETHER = 50_000  # cells of a sector where nobody knows the head
+STRETCH_M = 200.0  # of range, whose cells are counted together
 HIGH_INCIDENCE_COS = float(np.cos(np.radians(80.0)))
 
 SINGLES = [
@@ -37,7 +39,12 @@ SINGLES = [
     "intensity",
     "usual",
 ]
-CELLS = {"cell": np.int32, **dict.fromkeys(SINGLES, np.float32), "trait": np.uint8}  # of an outlook
+CELLS = {  # of an outlook
+    "cell": np.int32,
+    **dict.fromkeys(SINGLES, np.float32),
+    "place": np.int32,
+    "trait": np.uint8,
+}
 
 Position = tuple[float, float, float]
 Array = NDArray[Any]
@@ -84,10 +91,10 @@ class Outlook:
     """A reference as seen from one place. No place: on the map, by others' registration.
 
     `rise_m` and `number` (ny, nx) are those of `terrain.Ground`, above `datum_m`. `cells` are, by number, the
-    fields of `Sector` (n,), and `shot_m2`, the random variance of one shot, and `usual`, the share of the
-    reference's scans that saw the cell. Of these `bounds` part the sectors, each into the cells that an
-    adjustment looks at and the others: of very many a part tells all there is to tell. Arrays may be read
-    only as they are sliced.
+    fields of `Sector` (n,), and `shot_m2`, the random variance of one shot, `usual`, the share of the
+    reference's scans that saw the cell, and `place`, in which of `places` it is counted. Of these `bounds`
+    part the sectors, each into the cells that an adjustment looks at and the others: of very many a part
+    tells all there is to tell. Arrays may be read only as they are sliced.
     """
 
     reference: Reference
@@ -104,6 +111,13 @@ class Outlook:
     def grid(self) -> Grid:
         """The grid it lies on."""
         return self.reference.grid
+
+    @property
+    def places(self) -> tuple[int, int]:
+        """How many sectors of the head's azimuth and stretches of range cells are counted by."""
+        assert self.of is not None  # noqa: S101 - the callers' case
+        assert self.position_m is not None  # noqa: S101 - the callers' case
+        return self.of.intervals // LEAN_PER_REFRACTION, _stretches(self.grid, self.position_m)
 
     def ground(self) -> Ground:
         """Return the reference as shots look it up."""
@@ -229,6 +243,7 @@ def _cells(
     trait = np.where(stable[known], Trait.STABLE, 0) | np.where(ground.withheld(x_m, y_m), Trait.WITHHELD, 0)
     trait |= np.where(np.hypot(east, north) < ground.MOVING_STEEPEST, Trait.SMOOTH, 0)
     passed: Reals = np.zeros(len(row))
+    place: Ints = np.zeros(len(row), np.int64)
     shot_m2 = np.full(len(row), scanner.range_sigma_m**2)
     if of is not None and position_m is not None:
         view = View.of((x_m, y_m, around_m[inner][known] + below.datum_m), position_m, east, north)
@@ -236,6 +251,8 @@ def _cells(
         trait |= np.where(view.cos_incidence < HIGH_INCIDENCE_COS, Trait.GRAZED, 0)
         last = np.nextafter(np.float32(of.intervals), np.float32(0))
         passed = np.minimum(passed.astype(np.float32), last)
+        stretch = (np.hypot(view.offset_m[0], view.offset_m[1]) / STRETCH_M).astype(np.int64)
+        place = (passed / LEAN_PER_REFRACTION).astype(np.int64) * _stretches(grid, position_m) + stretch
     if published:
         scatter_m2, before_m2 = shot_m2, np.zeros(len(row), np.float32)
     else:
@@ -252,8 +269,18 @@ def _cells(
         "before_m2": before_m2,
         "intensity": reference.intensity[rows][known],
         "usual": reference.seen[rows][known],
+        "place": place,
         "trait": trait,
     }
+
+
+def _stretches(grid: Grid, position_m: Position) -> int:
+    """Return how many stretches of range a grid has, from the scanner to its farthest cell."""
+    east_m, north_m = (
+        np.abs(axis_m - here_m).max()
+        for axis_m, here_m in zip((grid.x_m, grid.y_m), position_m[:2], strict=True)
+    )
+    return int(math.hypot(east_m, north_m) / STRETCH_M) + 1
 
 
 def _looked_at(grid: Grid, cell: Array, stable: Bools) -> tuple[Bools, tuple[int, int]]:

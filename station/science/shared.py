@@ -278,11 +278,13 @@ def sensitivities(
     assumed one. Source: EQUATIONS 6.1.
     """
     x_m, y_m, z_m = offset_m
-    horizontal_m = np.maximum(np.sqrt(x_m**2 + y_m**2), 1e-6)  # np.hypot takes five times as long
-    along_m = z_m - east_gradient * x_m - north_gradient * y_m  # n_u · P
-    range_m = np.sqrt(horizontal_m**2 + z_m**2)
-    rise_m = horizontal_m + z_m * (east_gradient * x_m + north_gradient * y_m) / horizontal_m  # F
-    one = np.ones_like(x_m)
+    away_m2 = x_m**2 + y_m**2  # np.hypot takes five times as long
+    range_m2 = away_m2 + z_m**2
+    horizontal_m = np.maximum(np.sqrt(away_m2), 1e-6)
+    slope_m = east_gradient * x_m + north_gradient * y_m
+    along_m = z_m - slope_m  # n_u · P
+    rise_m = horizontal_m + z_m * slope_m / horizontal_m  # F
+    refraction_m = horizontal_m * rise_m / (2 * EARTH_RADIUS_M)
     turns_m = (
         -(y_m + north_gradient * z_m),
         x_m + east_gradient * z_m,
@@ -293,7 +295,7 @@ def sensitivities(
     u = of.axis
     up_m = u[0] * x_m + u[1] * y_m + u[2] * z_m
     about_axis_m = u[0] * turns_m[0] + u[1] * turns_m[1] - u[2] * turns_m[2]
-    out_m = np.sqrt(np.maximum(range_m**2 - up_m**2, 1e-12))
+    out_m = np.sqrt(np.maximum(range_m2 - up_m**2, 1e-12))
     return Sensitivities(
         of=of,
         globals_=np.stack(
@@ -301,14 +303,14 @@ def sensitivities(
                 *turns_m,
                 east_gradient,
                 north_gradient,
-                -one,
-                along_m / range_m,
+                np.full_like(x_m, -1.0),
+                along_m / np.sqrt(np.maximum(range_m2, 1e-12)),
                 along_m * 1e-6,
-                horizontal_m * rise_m / (2 * EARTH_RADIUS_M),
+                refraction_m,
             ]
         ),
         lean=-rise_m,
-        refraction=horizontal_m * rise_m / (2 * EARTH_RADIUS_M),
+        refraction=refraction_m,
         across=-up_m * about_axis_m / out_m,
         passed=of.knots_before(offset_m) if passed is None else passed,
     )

@@ -12,7 +12,7 @@ import numpy as np
 
 from station.quantities import Bools, Floats, Habits, Ints, Ints32, Measurement
 from station.science.adjustment import Adjustment
-from station.science.outlook import Outlook, Trait
+from station.science.outlook import STRETCH_M, Outlook, Trait
 from station.science.shared import LEAN_KNOT_RAD, LEAN_PER_REFRACTION
 
 MOST_REFUSED = 0.3  # of the stable ground, before an adjustment is doubted
@@ -22,7 +22,6 @@ BLIND = 0.02  # of it; less is nothing to work with
 THROUGH = 0.9  # of the best range; there the air is clear enough to miss a sector
 GONE = 0.05  # of what is usually seen in a sector or at a range; less is nothing
 FEWEST_CELLS = 30  # that scans usually see, to miss them
-STRETCH_M = 200.0  # of range that are counted together
 CELLS_MOST = 500_000  # that are counted; of more a part
 SCATTERED = 3.0  # sigmas by which stable ground that no fit has seen may scatter
 OFF = 5.0  # the same of a scan that is not adjusted; more, and its sigma holds nothing
@@ -50,26 +49,16 @@ class View:
 
 def view(count: Ints32, outlook: Outlook) -> View:
     """Count the cells that a scan saw, of `count` (n,) points, against what the reference's saw."""
-    of, grid, position_m = outlook.of, outlook.grid, outlook.position_m
-    if of is None or position_m is None:
+    of = outlook.of
+    if of is None:
         raise ValueError("without a place nothing is looked at")
-    sectors = of.intervals // LEAN_PER_REFRACTION
-    reach_m = max(
-        np.hypot(x - position_m[0], y - position_m[1]) for x in grid.x_m[[0, -1]] for y in grid.y_m[[0, -1]]
-    )
-    stretches = int(reach_m / STRETCH_M) + 1
+    shape = sectors, stretches = outlook.places
     every = 1 + int(outlook.bounds[-1]) // CELLS_MOST
     known = slice(None, outlook.bounds[-1], every)
-    cell, height_m, passed, share = (
-        outlook.cells[name][known] for name in ("cell", "height_m", "passed", "usual")
-    )
-    east_m, north_m, _ = outlook.offset_m(cell, height_m)
-    stretch = (np.hypot(east_m, north_m) / np.float32(STRETCH_M)).astype(np.int64)
-    key = (passed / LEAN_PER_REFRACTION).astype(np.int64) * stretches + stretch
-    usual = np.bincount(key, np.nan_to_num(share), sectors * stretches).astype(np.float64)
+    place, share = (outlook.cells[name][known] for name in ("place", "usual"))
+    usual = np.bincount(place, np.nan_to_num(share), sectors * stretches).astype(np.float64)
     there = (share > 0) & (count[known] > 0)
-    found = np.bincount(key, there, sectors * stretches).astype(np.float64)
-    shape = (sectors, stretches)
+    found = np.bincount(place, there, sectors * stretches).astype(np.float64)
     edges = of.start_rad + LEAN_KNOT_RAD * LEAN_PER_REFRACTION * np.arange(sectors + 1)
     return View(usual.reshape(shape) * every, found.reshape(shape) * every, np.degrees(edges))
 

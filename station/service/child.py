@@ -38,8 +38,7 @@ PRELOAD = (
     "station.service.child",
     "typer",  # of the command that a child, too, has as its main module
     "PIL.WebPImagePlugin",  # without it, each child brings those of all kinds of pictures to write one
-    "laspy",
-    "lazrs",
+    "station.readers.las",
     "netCDF4",
 )
 # Two cores decode, all else of a scan is one core's work; and every further thread of a BLAS reserves address

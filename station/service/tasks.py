@@ -50,7 +50,7 @@ from station.service.inbox import Arrival
 from station.service.pictures import Watched
 
 Progress = Callable[[], None]
-CELLS_MOST = 500_000  # that the figures of a scan are of; of more, some
+CELLS_MOST = 100_000  # that the figures of a scan are of; of more, some
 MOST_REFUSED = 0.6  # of the stable ground; then the filtered log alone is safer
 
 
