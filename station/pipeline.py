@@ -23,7 +23,6 @@ from station.quantities import (
 )
 from station.science import ground, prior, shared
 from station.science.adjustment import Adjustment, adjust, turned
-from station.science.air import AirCorrection, refraction_rise
 from station.science.grid import Gridder
 from station.science.measuring import Judge, measured
 from station.science.normals import LineLog
@@ -43,7 +42,6 @@ class Pose:
 
     frame: Frame | None
     tilt: Tilt | None
-    air: AirCorrection | None
 
     @cached_property
     def upright(self) -> Turning:
@@ -73,18 +71,12 @@ def survey(gridder: Gridder, blocks: Iterable[Shots], pose: Pose, progress: Call
 
 
 def to_map(shots: Shots, pose: Pose) -> Points:
-    """Easting, northing and height of shots [m]: lean, SOP, air, map."""
+    """Easting, northing and height of shots [m]: lean, SOP, then air and map."""
     points = shots.x_m, shots.y_m, shots.z_m
     if pose.frame is None:
         return points
-    x_m, y_m, z_m = pose.upright.turned(
-        points, np.zeros(len(shots)) if shots.time_s is None else shots.time_s
-    )
-    if pose.air is not None:
-        scale = pose.air.range_scale(z_m)
-        x_m, y_m, z_m = x_m * scale, y_m * scale, z_m * scale
-        z_m -= refraction_rise(x_m**2 + y_m**2, pose.air.refraction_coefficient)
-    return pose.frame.to_map((x_m, y_m, z_m))
+    time_s = np.zeros(len(shots)) if shots.time_s is None else shots.time_s
+    return pose.frame.to_map(pose.upright.turned(points, time_s))
 
 
 def lay(gridder: Gridder, points: Points, intensity: Floats | None = None) -> None:

@@ -66,7 +66,7 @@ def scanned(shots, reference, unknown=None, stable=NOWHERE, **settings):
     setup = Setup(VZ6000, GRID, SCANNER, **settings)
     seen_from = reference and outlook_on(reference, setup, stable)
     gridder = gridder_for(setup, seen_from)
-    survey(gridder, [shots], Pose(frame_in_local_map(sop), None, None), lambda: None)
+    survey(gridder, [shots], Pose(frame_in_local_map(sop), None), lambda: None)
     return Laid(measure(deepcopy(gridder), setup, unknown, seen_from)), gridder, setup, seen_from
 
 
@@ -198,7 +198,7 @@ def test_blocks_and_order_change_nothing():
         gridder = gridder_for(setup, None)
         columns = [np.split(axis[order], splits) for axis in (shots.x_m, shots.y_m, shots.z_m, time_s)]
         blocks = [Shots(*block) for block in zip(*columns, strict=True)]
-        survey(gridder, blocks, Pose(frame, tilt, air), lambda: None)
+        survey(gridder, blocks, Pose(frame.after(air.corrected, 6000.0), tilt), lambda: None)
         made.append(Laid(measure(gridder, setup, None, None)))
     assert (made[0].count > 0).mean() > 0.3
     for name in ("elevation_m", "count", "spread_m"):

@@ -104,6 +104,12 @@ class AirCorrection:
         rise_km = rise_m * 1e-3
         return 1.0 + 1e-6 * (constant + rise_km * (linear + rise_km * square))
 
+    def corrected(self, seen_m: tuple[Floats, Floats, Floats]) -> tuple[Floats, Floats, Floats]:
+        """Where targets (n,) are that are seen there, eastward, northward and up from the scanner [m]."""
+        scale = self.range_scale(seen_m[2])
+        x_m, y_m, z_m = (axis_m * scale for axis_m in seen_m)
+        return x_m, y_m, z_m - refraction_rise(x_m**2 + y_m**2, self.refraction_coefficient)
+
 
 def air_correction(air: Air, assumed: Air | None, wavelength_um: float) -> AirCorrection:
     """Return what turns ranges measured under an assumed air into ranges through the real one.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TypeVar
 
@@ -11,9 +12,11 @@ from numpy.polynomial import chebyshev
 from pyproj import CRS, Transformer
 
 from station.quantities import Floats, Floats32, Ints, Tilt
+from station.science.view import Points
 
 KNOT_RAD = 3e-5  # of lean, apart
 SHORTEST_S = 1e-9  # between knots
+LEAST_M = 0.25e-3  # of a term on the way to the map, to be heeded
 GEOCENTRIC = "EPSG:4978"  # WGS84, where a POP leads
 GEOGRAPHIC = "EPSG:4979"  # WGS84 with ellipsoidal height
 
@@ -58,7 +61,7 @@ class Turning:
     matrix: Floats  # (k, 3, 3) from that moment on …
     per_s: Floats  # (k, 3, 3) … and what each second adds to it
 
-    def turned(self, xyz_m: tuple[Floats, Floats, Floats], time_s: Floats) -> tuple[Floats, Floats, Floats]:
+    def turned(self, xyz_m: Points, time_s: Floats) -> Points:
         """Coordinates (n,) of shots [m], each turned as at its moment. Fastest where they come in turn."""
         turned_m = np.empty_like(time_s), np.empty_like(time_s), np.empty_like(time_s)
         if not len(time_s):
@@ -128,7 +131,7 @@ class Frame:
     powers: Ints
     coefficients: Floats
 
-    def to_map(self, local_m: tuple[Floats, Floats, Floats]) -> tuple[Floats, Floats, Floats]:
+    def to_map(self, local_m: Points) -> Points:
         """Easting, northing and height [m] of points in the local frame."""
         # What bends and scales is metres: 24 bits hold it to a micrometre, at half the cost.
         x, y, z = (axis_m.astype(np.float32) for axis_m in local_m)
@@ -140,8 +143,19 @@ class Frame:
                     np.multiply(monomials[tuple(power)], coefficient_m, out=scratch)
                     np.add(axis_m, scratch, out=axis_m)
         ways_m = zip(local_m, self.position_m, bent_m, strict=True)
-        east_m, north_m, height_m = (local + origin + bent for local, origin, bent in ways_m)
+        east_m, north_m, height_m = (
+            bent.astype(np.float64) + local + origin for local, origin, bent in ways_m
+        )
         return east_m, north_m, height_m
+
+    def after(self, seen: Callable[[Points], Points], reach_m: float) -> Frame:
+        """Return the way of points that are not where they seem to be in the local frame: `seen` tells where.
+
+        They may be aside by little, and smoothly: that becomes part of the polynomial, good to 0.1 mm within
+        reach where it is a metre.
+        """
+        x_m, y_m, z_m = local_m = _nodes(reach_m)
+        return _fitted(self.position_m, self.to_local, local_m, np.array(self.to_map(seen((x_m, y_m, z_m)))))
 
 
 def _monomials(x: Axis, y: Axis, z: Axis, powers: Ints) -> Monomials[Axis]:
@@ -233,22 +247,37 @@ def level_frame(geocentric_m: Floats, crs: str) -> Floats:
 
 
 def _frame(level: Floats, to_local: Floats, crs: str, reach_m: float) -> Frame:
-    """Fit the way from a `level_frame` (4, 4) to the map by a polynomial of fourth degree.
-
-    What that leaves out is 0.02 mm at 6 km; terms that never reach a twentieth of a millimetre go too.
-    """
+    """Return the way through a `level_frame` (4, 4) to the map."""
     to_map = Transformer.from_crs(GEOCENTRIC, horizontal_crs(crs), always_xy=True)
-    nodes = chebyshev.chebpts1(9)
-    x, y, z = (axis.ravel() for axis in np.meshgrid(nodes, nodes, nodes, indexing="ij"))
-    local_m = np.stack([x, y, z, np.full_like(x, 1 / reach_m)]) * reach_m
-    mapped_m = np.stack(to_map.transform(*(level @ local_m)[:3]), axis=-1)
-    position_m = np.array(to_map.transform(*level[:3, 3]))
+    east_m, north_m, height_m = (float(axis_m) for axis_m in to_map.transform(*level[:3, 3]))
+    local_m = _nodes(reach_m)
+    mapped_m = to_map.transform(*level[:3, :3] @ local_m + level[:3, 3:])
+    return _fitted((east_m, north_m, height_m), to_local, local_m, np.array(mapped_m))
+
+
+def _nodes(reach_m: float) -> Floats:
+    """Return points (3, n) in a local frame [m] that tell all of a way within reach, half as far upward."""
+    axes = np.meshgrid(*[chebyshev.chebpts1(9)] * 3, indexing="ij")
+    return np.stack([axis.ravel() for axis in axes]) * [[reach_m], [reach_m], [reach_m / 2]]
+
+
+def _fitted(
+    position_m: tuple[float, float, float],
+    to_local: Floats,
+    local_m: Floats,
+    mapped_m: Floats,
+) -> Frame:
+    """Return the way that leads the nodes (3, n) to where they are on the map, a polynomial of fourth degree.
+
+    What that leaves out is 0.02 mm at 6 km; terms that never reach a quarter of a millimetre go too.
+    """
     powers = np.array([(i, j, k) for i in range(5) for j in range(5 - i) for k in range(5 - i - j)][1:])
+    far_m = np.abs(local_m).max(axis=1)
+    x, y, z = local_m / far_m[:, None]
     monomials = _monomials(x, y, z, powers)
     design = np.stack([monomials[i, j, k] for i, j, k in powers.tolist()], axis=-1)
-    coefficients = np.linalg.lstsq(design, mapped_m - position_m - local_m[:3].T, rcond=None)[0]
-    coefficients[np.abs(coefficients) < 5e-5] = 0.0
-    coefficients /= reach_m ** powers.sum(axis=1, keepdims=True).astype(np.float64)
+    coefficients = np.linalg.lstsq(design, (mapped_m - local_m).T - position_m, rcond=None)[0]
+    coefficients[np.abs(coefficients) < LEAST_M] = 0.0
+    coefficients /= np.prod(far_m**powers, axis=1, keepdims=True)
     used = np.any(coefficients != 0.0, axis=1)
-    east_m, north_m, height_m = (float(v) for v in position_m)
-    return Frame((east_m, north_m, height_m), to_local, powers[used], coefficients[used])
+    return Frame(position_m, to_local, powers[used], coefficients[used])

@@ -79,7 +79,7 @@ def gather(
             unadjusted = partial(
                 prior.covariance_without_adjustment, of, lines, None, LEVEL, Habits(), weather_known=False
             )
-        return Gathered(setup, Pose(None, None, None), unadjusted, told, None, None, (), {})
+        return Gathered(setup, Pose(None, None), unadjusted, told, None, None, (), {})
     sop = sop_for(site.sop, start)
     frame, sop_id = frame_of(site, sop), sop_identity(sop)
     lacking: list[str] = []
@@ -106,18 +106,18 @@ def gather(
         assumed_rad = prior.turn_of(lean.tilt, rotation, lines.time_s)
         if track is not None:
             line_log = prior.line_log(of, lines, lean, zero or LEVEL, rotation)
-    correction = None
     if site.air is not None:
         setting = site.air.scanner_setting
         assumed = air if setting == "weather" else setting.air
-        correction = air_correction(
+        led = air_correction(
             air, assumed if site.air.scanner_corrects else None, site.instrument.wavelength_um
         )
+        frame = frame.after(led.corrected, site.scanner.range_max_m)
     provenance = {"sop_id": sop_id, "lean_zero": json.dumps(asdict(zero)) if zero else ""}
     tilt = lean.tilt if lean is not None else None
     return Gathered(
         setup,
-        Pose(frame, tilt, correction),
+        Pose(frame, tilt),
         partial(
             prior.covariance_without_adjustment,
             of,

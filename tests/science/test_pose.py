@@ -7,8 +7,9 @@ import pytest
 from pyproj import Transformer
 from scipy.spatial.transform import Rotation
 
-from station.quantities import Tilt
+from station.quantities import Air, Tilt
 from station.science import pose
+from station.science.air import air_correction
 
 HEF = (46.7958, 10.7828, 3245.0)
 REACH_M = 6000.0
@@ -152,3 +153,16 @@ def test_the_lean_stays_as_it_is_before_and_after_its_log_and_shots_may_come_in_
         assert np.array_equal(
             told_m[:, at], np.ravel(turning.turned(tuple(points[:, at : at + 1]), time_s[at : at + 1]))
         )
+
+
+@pytest.mark.parametrize("crs", [None, "EPSG:32632"])
+@pytest.mark.parametrize("assumed", [Air(-25.0, 640.0, 90.0), None])
+def test_the_air_on_the_way_to_the_map_is_that_of_each_point(crs, assumed):
+    """Made part of the way, it leads each point where it leads it alone, though it moves them by 1 m."""
+    air = air_correction(Air(15.0, 1013.25, 0.0), assumed, 1.064)
+    sop = np.eye(4)
+    frame = pose.frame_by_origin(sop, HEF, crs, REACH_M) if crs else pose.frame_in_local_map(sop)
+    local_m = tuple(everywhere())
+    through_air_m = np.array(frame.after(air.corrected, REACH_M).to_map(local_m))
+    assert np.abs(through_air_m - np.array(frame.to_map(air.corrected(local_m)))).max() < 1e-4
+    assert np.abs(through_air_m - np.array(frame.to_map(local_m))).max() > 0.5
