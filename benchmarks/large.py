@@ -15,6 +15,7 @@ import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from datetime import UTC, datetime
+from importlib import import_module
 from pathlib import Path
 
 import laspy
@@ -171,6 +172,8 @@ def _measure(site_file: Path, *, adjusted: bool) -> Callable[[Path], int]:
     from station.service import tasks  # noqa: PLC0415
     from station.service.inbox import Arrival  # noqa: PLC0415
 
+    for module in child.PRELOAD:
+        import_module(module)
     site = read_site(site_file)
     if not adjusted:
         site = site.model_copy(update={"adjustment": site.adjustment.model_copy(update={"method": "none"})})

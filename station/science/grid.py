@@ -108,7 +108,7 @@ class Gridder:
 
     def numbered(self, column: Floats, row: Floats) -> Ints32:
         """Number (n,) of the cell of each point; cells that had none are given the next."""
-        cell = row.astype(np.int64) * self.grid.nx + column.astype(np.int64)
+        cell = (row.astype(np.int32) * np.int32(self.grid.nx) + column.astype(np.int32)).astype(np.intp)
         numbers = self.number.reshape(-1)
         number = numbers.take(cell)
         new = np.flatnonzero(number < 0)
@@ -125,7 +125,9 @@ class Gridder:
         """Height (n,) that the residual of each point is taken from [m]: of the reference, or the datum."""
         if self._ground is None:
             return np.full(len(number), self.datum_m)
-        return np.where(number < self.known, self._ground.height(column, row), self.datum_m)
+        below_m = self._ground.height(column, row)
+        below_m[np.flatnonzero(number >= self.known)] = self.datum_m
+        return below_m
 
     def is_empty(self) -> bool:
         """Tell whether no point has come."""
@@ -142,9 +144,10 @@ class Gridder:
         steps = np.rint(residual_m * QUANTUM)
         at = np.multiply(number, 3, dtype=np.int64)
         tally = ONE if intensity is None else ONE + np.rint(intensity * BRIGHTEST).astype(np.int64)
+        squares = np.rint(steps * steps * (1 / QUANTUM))
         np.add.at(sums, at, tally)
-        np.add.at(sums, at + 1, steps.astype(np.int64))
-        np.add.at(sums, at + 2, np.rint(steps * steps / QUANTUM).astype(np.int64))
+        np.add.at(sums[1:], at, steps.astype(np.int64))
+        np.add.at(sums[2:], at, squares.astype(np.int64))
 
     def sums(self, first: int, end: int) -> Sums:
         """Take a copy of the cells with some numbers."""
