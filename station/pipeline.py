@@ -116,7 +116,7 @@ def _cells(gridder: Gridder, outlook: Outlook) -> Iterator[Cells]:
     """Give the cells that an adjustment looks at, as the head comes by."""
     for first, whole in outlook.sectors(looked_at=True):
         sums = gridder.sums(first, first + len(whole))
-        seen = np.flatnonzero(sums.count)
+        seen = np.flatnonzero(sums.count > 0)
         if not len(seen):
             continue
         sector, sums = whole.some(seen), sums.some(seen)

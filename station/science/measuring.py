@@ -51,7 +51,7 @@ def measured(gridder: Gridder, outlook: Outlook | None, judge: Judge) -> Measure
         for first, whole in outlook.sectors():
             sums = gridder.sums(first, first + len(whole))
             made.clear(first + np.flatnonzero(sums.count == 0))
-            seen = np.flatnonzero(sums.count)  # which is four times as fast to choose by as a mask
+            seen = np.flatnonzero(sums.count > 0)  # by numbers: to choose by a mask takes four times as long
             sector, sums = whole.some(seen), sums.some(seen)
             made.put(first + seen, sums, judge.known(sector, sums, outlook))
     for fringe in _fringes(gridder, setup, outlook):

@@ -234,7 +234,7 @@ class Sensitivities:
             return variance_m2
         columns = self._columns()
         weighted = np.empty_like(columns)
-        for first, end in pairwise([0, *(np.flatnonzero(np.diff(knot)) + 1).tolist(), len(knot)]):
+        for first, end in pairwise([0, *(np.flatnonzero(knot[1:] > knot[:-1]) + 1).tolist(), len(knot)]):
             felt = of.felt_after(int(knot[first]))
             covariance = unknown.covariance[np.ix_(felt, felt)].astype(columns.dtype)
             np.matmul(covariance, columns[:, first:end], out=weighted[:, first:end])
