@@ -102,14 +102,15 @@ class Basis:
             *["rad"] * self.refraction_count,
         )  # fmt: skip
 
-    def felt_after(self, knot: int) -> list[int]:
-        """Parameters felt after a knot of the lean: the globals, and of all others the two beside."""
+    def felt_after(self, knot: Ints) -> Ints:
+        """Parameters (m, 15) felt after knots (m,) of the lean: the globals, of all others the two beside."""
         bend = knot // LEAN_PER_REFRACTION
         bends = bend, (bend + 1) % self.refraction_count
         first, leans = len(GLOBAL), (knot, (knot + 1) % self.lean_count)
         last, beyond = first + self.lean_count, first + self.lean_count + self.refraction_count
-        parts = (0, range(first)), (first, leans), (last, bends), (beyond, bends)
-        return [start + at for start, part in parts for at in part]
+        parts = (first, leans), (last, bends), (beyond, bends)
+        others = [start + at for start, both in parts for at in both]
+        return np.stack([*np.broadcast_arrays(*range(first), *others)], axis=-1)
 
     def knots_before(self, offset_m: tuple[Reals, Reals, Reals]) -> Reals:
         """How many knots of the lean the head has passed when it looks there (n,), in fractions of knots."""
@@ -234,9 +235,10 @@ class Sensitivities:
             return variance_m2
         columns = self._columns()
         weighted = np.empty_like(columns)
-        for first, end in pairwise([0, *(np.flatnonzero(knot[1:] > knot[:-1]) + 1).tolist(), len(knot)]):
-            felt = of.felt_after(int(knot[first]))
-            covariance = unknown.covariance[np.ix_(felt, felt)].astype(columns.dtype)
+        edges = [0, *(np.flatnonzero(knot[1:] > knot[:-1]) + 1).tolist(), len(knot)]
+        felt = of.felt_after(knot[edges[:-1]].astype(np.int64))
+        covariances = unknown.covariance[felt[:, :, None], felt[:, None, :]].astype(columns.dtype)
+        for covariance, (first, end) in zip(covariances, pairwise(edges), strict=True):
             np.matmul(covariance, columns[:, first:end], out=weighted[:, first:end])
         # Rounding may take it below nought where the covariance is singular.
         told_m2 = np.maximum(np.einsum("ij,ij->j", columns, weighted), 0.0)

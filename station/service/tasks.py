@@ -224,14 +224,12 @@ def _measure(
         raise ScanError("no point falls on the grid: wrong scans.frame, SOP, CRS or units?")
     progress()
     levelled = levelled_to(site, gridder, gathered, outlook)
-    give_back()
     flag = flag_of(site, start.timestamp(), end.timestamp())
     found = levelled[1] if levelled else None
     if levelled is not None and levelled[1].refused > MOST_REFUSED:
         levelled = None
     unknown = levelled[1].shared() if levelled is not None else gathered.unknown
     doubts, late = _log_against_ground(levelled, reference)
-    give_back()
     measured = measure(gridder, gathered.setup, unknown, outlook, levelled)
     progress()
     numbers = _numbers(measured, gathered, reader.header.point_count)
@@ -287,7 +285,9 @@ def levelled_to(
     """Adjust a scan to the reference, where the site asks for it and there is one to adjust to."""
     if not site.adjusts or gathered.told is None or outlook is None:
         return None
-    return gathered.told, level(gridder, gathered.setup, gathered.told, outlook)
+    found = level(gridder, gathered.setup, gathered.told, outlook)
+    give_back()
+    return gathered.told, found
 
 
 def _log_against_ground(
@@ -301,6 +301,7 @@ def _log_against_ground(
         return [], {}
     doubts = sensor.off_habit(expected)
     late = sensor.lateness(expected, reference.habits, len(reference.scan_ids))
+    give_back()
     if late is None:
         return doubts, {}
     return doubts + late.words(), {"log_lateness": late.late_s, "log_lateness_uncertainty": late.sigma_s}
