@@ -10,7 +10,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from enum import IntFlag
 from math import radians
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,6 +20,7 @@ Floats32 = NDArray[np.float32]
 Reals = NDArray[np.floating[Any]]  # of either precision
 Ints = NDArray[np.int64]
 Ints32 = NDArray[np.int32]
+Numbers = TypeVar("Numbers", Ints, Ints32)
 Bools = NDArray[np.bool_]
 
 
@@ -132,6 +133,11 @@ class Grid:
     def y_m(self) -> Floats:
         """Northings of the cell centres (ny,), descending."""
         return np.asarray(self.north_m - (np.arange(self.ny) + 0.5) * self.cell_m, dtype=np.float64)
+
+    def row_and_column(self, cell: Numbers) -> tuple[Numbers, Numbers]:
+        """Row and column of cells (n,) of the flattened grid; `np.divmod` takes six times as long."""
+        row = cell // self.nx
+        return row, cell - row * self.nx
 
 
 @dataclass(frozen=True)

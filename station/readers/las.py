@@ -27,7 +27,7 @@ from station.readers.scan import WEEK_S, ScanHeader, foreign_code
 
 NEEDED = DecompressionSelection.base().decompress_z().decompress_gps_time()  # heeded in formats 6 and up
 BRIGHT = NEEDED.decompress_intensity()
-BLOCKS_AT_ONCE = 4  # decoded together, a chunk a core; conversion still goes block by block, in the cache
+BLOCKS_AT_ONCE = 8  # decoded together, some chunks a core; conversion still goes block by block, in the cache
 LONGEST_SCAN_S = 86_400.0
 PLACES = 200  # where a scan is looked at that has no chunks, or few
 SKIP = 50_000  # points decoded at a time only to pass them

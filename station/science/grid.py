@@ -41,7 +41,7 @@ class Sums:
 
     def some(self, chosen: Ints) -> Sums:
         """Return those of the chosen cells (n,)."""
-        return Sums(self.tally[chosen], self.residual[chosen], self.square[chosen])
+        return Sums(self.tally.take(chosen), self.residual.take(chosen), self.square.take(chosen))
 
     def mean_residual(self) -> Floats:
         """Mean height above reference or datum (ny, nx) [m], NaN in empty cells.

@@ -100,7 +100,7 @@ def _fringe(gridder: Gridder, setup: Setup, heights: _Heights, rows: slice) -> _
     if setup.position_m is not None:
         around_m, inner = heights.around(rows)
         if len(cell):
-            row, column = np.divmod(cell, setup.grid.nx)
+            row, column = setup.grid.row_and_column(cell)
             gradient = gradient_in(around_m, setup.grid.cell_m, inner.start + row, column)
             east, north = (np.nan_to_num(one.astype(np.float64)) for one in gradient)
     return _Fringe(numbers[cell], rows.start * setup.grid.nx + cell, east, north)
@@ -179,7 +179,7 @@ class _Made:
         enough = sums.count >= self.min_points
         few = np.flatnonzero(~enough)
         cells = np.empty(len(number), MEASURED)
-        kept_m = np.rint(told.elevation_m / KEPT_M).astype(np.float32)
+        kept_m = np.rint(told.elevation_m * (1 / KEPT_M)).astype(np.float32)
         kept_m *= KEPT_M
         for name, values in (
             ("elevation_m", kept_m),
@@ -243,7 +243,7 @@ class Judge:
             random_m2 = np.maximum(spread_m2, setup.scanner.range_sigma_m**2) / count
             sigma_m = self._total(random_m2)
             return _Judged(height_m, nothing_m, sigma_m, np.sqrt(random_m2), flags, {})
-        row, column = np.divmod(fringe.cell, setup.grid.nx)
+        row, column = setup.grid.row_and_column(fringe.cell)
         points = setup.grid.x_m[column], setup.grid.y_m[row], height_m
         view = View.of(points, setup.position_m, fringe.east_gradient, fringe.north_gradient)
         flags |= Quality.HIGH_INCIDENCE * (view.cos_incidence < HIGH_INCIDENCE_COS).view(np.uint8)

@@ -77,9 +77,9 @@ class Sector:
         """Return how many cells there are."""
         return len(self.cell)
 
-    def some(self, chosen: Ints | slice) -> Sector:
+    def some(self, chosen: Ints) -> Sector:
         """Return the chosen cells."""
-        return Sector(*(getattr(self, one.name)[chosen] for one in fields(self)))
+        return Sector(*(getattr(self, one.name).take(chosen) for one in fields(self)))
 
     def having(self, trait: Trait) -> Bools:
         """Tell which cells have a trait."""
@@ -141,10 +141,10 @@ class Outlook:
     def offset_m(self, cell: Ints32, height_m: Floats32) -> tuple[Floats32, Floats32, Floats32]:
         """Way from the scanner to cells (n,) of such a height, eastward, northward and up [m]."""
         assert self.position_m is not None  # noqa: S101 - the callers' case
-        row, column = np.divmod(cell, np.int32(self.grid.nx))
+        row, column = self.grid.row_and_column(cell)
         return (
-            self._east_m[column],
-            self._north_m[row],
+            self._east_m.take(column),
+            self._north_m.take(row),
             height_m + np.float32(self.datum_m - self.position_m[2]),
         )
 
@@ -288,7 +288,7 @@ def _looked_at(grid: Grid, cell: Array, stable: Bools) -> tuple[Bools, tuple[int
 
     And tell one in how many that is, of the others and of the stable ones.
     """
-    row, column = np.divmod(cell, np.int32(grid.nx))
+    row, column = grid.row_and_column(cell)
     step = 1 + int(np.count_nonzero(stable)) // STABLE_MOST
     every = 1 + len(row) // (step * MOVING_MOST)
     chosen = (row % step == 0) & (stable | ((row // step + column) % every == 0))
