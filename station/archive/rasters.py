@@ -8,8 +8,7 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
-from functools import cached_property, lru_cache, partial
+from functools import cached_property, lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +23,6 @@ from station.archive.variables import FILL, Variable
 from station.errors import StoreError
 
 LEVEL = 1
-TOGETHER = 2  # rasters deflated at once, of one band
 BESIDE = 8  # chunks that are shuffled together
 KEPT_BANDS = 2  # rows of chunks that are kept unpacked: of a band of cells and what is around it
 
@@ -35,8 +33,9 @@ def write_rasters(path: Path, rows: Sequence[Variable], band: Callable[[slice], 
     """Write rasters into the variables that a file has for them, as the first time.
 
     `band` gives some rows (r, nx) of each of them, as `rounded`. Chunks without any value are left unwritten.
+    One after the other: threads would spend a tenth of it on waiting for each other.
     """
-    with h5py.File(path, "r+") as file, ThreadPoolExecutor(TOGETHER) as pool:
+    with h5py.File(path, "r+") as file:
         held = [h5py.h5d.open(file.id, row.name.encode()) for row in rows]
         for row, dataset in zip(rows, held, strict=True):
             if row.dims[0] == "time":
@@ -44,10 +43,9 @@ def write_rasters(path: Path, rows: Sequence[Variable], band: Callable[[slice], 
         ny = held[0].shape[-2]
         *_, height, width = chunk = held[0].get_create_plist().get_chunk()
         for top in range(0, ny, height):
-            packed = pool.map(partial(_deflated, (height, width)), band(slice(top, min(top + height, ny))))
-            for dataset, chunks in zip(held, packed, strict=True):
-                for left, one in chunks.items():
-                    dataset.write_direct_chunk((0, top, left)[-len(chunk) :], one)
+            for dataset, values in zip(held, band(slice(top, min(top + height, ny))), strict=True):
+                for left, packed in _deflated((height, width), values):
+                    dataset.write_direct_chunk((0, top, left)[-len(chunk) :], packed)
 
 
 def rounded(row: Variable, values: Array) -> Array:
@@ -61,11 +59,10 @@ def rounded(row: Variable, values: Array) -> Array:
     return values.astype(row.dtype, copy=False)
 
 
-def _deflated(size: tuple[int, int], band: Array) -> dict[int, bytes]:
-    """Return the chunks of a band of a raster that hold something, by their first column."""
+def _deflated(size: tuple[int, int], band: Array) -> Iterator[tuple[int, bytes]]:
+    """Give the chunks of a band of a raster that hold something, each with its first column."""
     height, width = size
     fill = FILL if band.dtype.kind == "f" else 0
-    packed = {}
     for first in range(0, band.shape[1], BESIDE * width):
         part = band[:, first : first + BESIDE * width]
         lacks = height - part.shape[0], -part.shape[1] % width
@@ -75,8 +72,7 @@ def _deflated(size: tuple[int, int], band: Array) -> dict[int, bytes]:
         chunks = np.array(side_by_side, order="C").reshape(-1, height * width)
         holds, shuffled = chunks.min(axis=1) < FILL, _shuffled(chunks)
         for at in np.flatnonzero(holds).tolist():
-            packed[first + at * width] = isal_zlib.compress(shuffled[at], LEVEL)
-    return packed
+            yield first + at * width, isal_zlib.compress(shuffled[at], LEVEL)
 
 
 def _shuffled(chunks: Array) -> NDArray[np.uint8]:
