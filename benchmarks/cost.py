@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import json
 import os
 import subprocess
@@ -70,9 +71,11 @@ def job_cost(
 def run_job(jobs: dict[str, Any]) -> None:
     """Be the process of one job: the arguments are its name and what it is told, as JSON.
 
-    It ends as the children of a service do: to take an interpreter down is no work on a scan.
+    It begins and ends as the children of a service do: to look through what is loaded for garbage, or to take
+    an interpreter down, is no work on a scan.
     """
     name, told = sys.argv[1:]
+    gc.freeze()
     ready()
     figures = jobs[name](**json.loads(told))
     print(json.dumps(figures | {"startup_s": _startup_s[-1]}), flush=True)

@@ -61,18 +61,25 @@ def rounded(row: Variable, values: Array) -> Array:
 
 def _deflated(size: tuple[int, int], band: Array) -> Iterator[tuple[int, bytes]]:
     """Give the chunks of a band of a raster that hold something, each with its first column."""
-    height, width = size
-    fill = FILL if band.dtype.kind == "f" else 0
+    width = size[1]
     for first in range(0, band.shape[1], BESIDE * width):
-        part = band[:, first : first + BESIDE * width]
-        lacks = height - part.shape[0], -part.shape[1] % width
-        if any(lacks):
-            part = np.pad(part, [(0, lack) for lack in lacks], constant_values=fill)
-        side_by_side = part.reshape(height, -1, width).swapaxes(0, 1)
-        chunks = np.array(side_by_side, order="C").reshape(-1, height * width)
+        chunks = _side_by_side(band[:, first : first + BESIDE * width], size)
         holds, shuffled = chunks.min(axis=1) < FILL, _shuffled(chunks)
         for at in np.flatnonzero(holds).tolist():
             yield first + at * width, isal_zlib.compress(shuffled[at], LEVEL)
+
+
+def _side_by_side(part: Array, size: tuple[int, int]) -> Array:
+    """Lay a part of a band out chunk by chunk (n, height * width), with nothing beyond its edges."""
+    (rows, columns), (height, width) = part.shape, size
+    count, over = divmod(columns, width)
+    chunks = np.empty((count + (over > 0), height, width), part.dtype)
+    if over or rows < height:
+        chunks[:] = FILL if part.dtype.kind == "f" else 0
+    chunks[:count, :rows] = part[:, : count * width].reshape(rows, count, width).swapaxes(0, 1)
+    if over:
+        chunks[count, :rows, :over] = part[:, count * width :]
+    return chunks.reshape(-1, height * width)
 
 
 def _shuffled(chunks: Array) -> NDArray[np.uint8]:
