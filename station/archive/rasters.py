@@ -54,7 +54,7 @@ def rounded(row: Variable, values: Array) -> Array:
         if row.digits is not None:
             steps = values.dtype.type(2.0 ** math.ceil(row.digits * math.log2(10)))  # netCDF4's own rounding
             values = np.rint(steps * values)
-            values /= steps
+            values *= 1 / steps
         values = np.fmin(values, values.dtype.type(FILL))  # of NaN: ten times as fast as to ask for it
     return values.astype(row.dtype, copy=False)
 
