@@ -130,9 +130,8 @@ class _Heights:
         gridder, outlook = self._gridder, self._outlook
         numbers = gridder.number[rows]
         height_m = np.full(numbers.shape, np.nan, np.float32)
-        if (
-            outlook is not None
-        ):  # what it knows of cells is better; NaN is a number of all bits, for all others
+        if outlook is not None:
+            # What it knows of cells is better. All others become a number of all bits, which is NaN.
             others = numbers.view(np.uint32) >= np.uint32(gridder.known)
             others_bits = np.negative(others.view(np.int8), dtype=np.int32)
             np.bitwise_or(outlook.rise_m[rows].view(np.int32), others_bits, out=height_m.view(np.int32))
