@@ -51,7 +51,7 @@ def work(site: str, scan: str, before: str) -> dict[str, Any]:
     assert frame is not None  # noqa: S101 - the scan is in the scanner's frame
     corners_m = np.hstack([np.zeros((3, 1)), np.eye(3)])
     turned_m = frame.to_local[:3, :3] @ corners_m
-    mapped_m = np.stack(frame.to_map((turned_m[0], turned_m[1], turned_m[2])))
+    mapped_m = frame.to_map(turned_m)
     mapped_m -= np.array([[grid.west_m], [grid.north_m - grid.ny * grid.cell_m], [0.0]])
     matrix = np.eye(4)
     matrix[:3, :3], matrix[:3, 3] = mapped_m[:, 1:] - mapped_m[:, :1], mapped_m[:, 0]
@@ -93,7 +93,8 @@ def _millions(path: Path) -> Iterator[Shots]:
     with laspy.open(path, laz_backend=laspy.LazBackend.Lazrs) as scan:
         for chunk in scan.chunk_iterator(CHUNK):
             brightness = np.asarray(chunk.intensity) / 65535
-            yield Shots(*(np.asarray(chunk[axis]) for axis in "xyz"), np.asarray(chunk.gps_time), brightness)
+            xyz_m = np.stack([np.asarray(chunk[axis]) for axis in "xyz"])
+            yield Shots(xyz_m, np.asarray(chunk.gps_time), brightness)
 
 
 def epoch(site: str, scan: str) -> dict[str, Any]:

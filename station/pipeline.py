@@ -30,7 +30,6 @@ from station.science.outlook import Outlook, Trait, look
 from station.science.patches import Cells, collect
 from station.science.pose import Frame, Turning, turning
 from station.science.shared import Basis, Sensitivities
-from station.science.view import Points
 
 NORMAL_MAD = 0.6744897501960817  # of a normal distribution with a standard deviation of one
 FEW_STABLE = 20  # cells, that say nothing of a spread
@@ -70,20 +69,19 @@ def survey(gridder: Gridder, blocks: Iterable[Shots], pose: Pose, progress: Call
     gridder.complete()
 
 
-def to_map(shots: Shots, pose: Pose) -> Points:
-    """Easting, northing and height of shots [m]: lean, SOP, then air and map."""
-    points = shots.x_m, shots.y_m, shots.z_m
+def to_map(shots: Shots, pose: Pose) -> Floats:
+    """Easting, northing and height (3, n) of shots [m]: lean, SOP, then air and map."""
     if pose.frame is None:
-        return points
+        return shots.xyz_m
     time_s = np.zeros(len(shots)) if shots.time_s is None else shots.time_s
-    return pose.frame.to_map(pose.upright.turned(points, time_s))
+    return pose.frame.to_map(pose.upright.turned(shots.xyz_m, time_s))
 
 
-def lay(gridder: Gridder, points: Points, intensity: Floats | None = None) -> None:
-    """Add points on the map to the grid, as residuals to the reference where it is known."""
-    inside, column, row = gridder.cells(points[0], points[1])
+def lay(gridder: Gridder, points_m: Floats, intensity: Floats | None = None) -> None:
+    """Add points (3, n) on the map to the grid, as residuals to the reference where it is known."""
+    inside, column, row = gridder.cells(points_m[0], points_m[1])
     number = gridder.numbered(column, row)
-    residual_m = points[2][inside] - gridder.below(number, column, row)
+    residual_m = points_m[2][inside] - gridder.below(number, column, row)
     gridder.add(number, residual_m, None if intensity is None else intensity[inside])
 
 

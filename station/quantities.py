@@ -34,15 +34,13 @@ class Shots:
     `time_s` is in the scan's own time base, the one its inclination log uses; None where the scan has none.
     """
 
-    x_m: Floats  # (n,)
-    y_m: Floats  # (n,)
-    z_m: Floats  # (n,)
+    xyz_m: Floats  # (3, n)
     time_s: Floats | None  # (n,)
     intensity: Floats | None = None  # (n,) how bright, 0-1; None where the scan does not tell
 
     def __len__(self) -> int:
         """Return how many echoes there are."""
-        return len(self.x_m)
+        return self.xyz_m.shape[1]
 
 
 @dataclass(frozen=True)

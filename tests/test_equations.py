@@ -43,9 +43,7 @@ def test_refraction_coefficients():
         assert told == pytest.approx(wanted, abs=2e-3)
     assert air.refraction_rise(array(3421.0, 4500.0) ** 2, 0.1) == pytest.approx([0.09, 0.16], abs=0.003)
     led = air.AirCorrection((50.0, 0.0, 0.0), 0.13)  # 3421 m to the north-east, 500 m down
-    east_m, north_m, up_m = led.corrected(
-        (array(3421 / math.sqrt(2)), array(3421 / math.sqrt(2)), array(-500.0))
-    )
+    east_m, north_m, up_m = led.corrected(np.array([[3421 / math.sqrt(2)], [3421 / math.sqrt(2)], [-500.0]]))
     assert np.hypot(east_m, north_m) == pytest.approx(3421 + 0.171, abs=1e-3)
     assert up_m == pytest.approx(-500 - 0.025 - 0.1194, abs=1e-3)
 

@@ -35,7 +35,7 @@ def shots_at(x_m, y_m, seed=0, *, noise=True):
     true = np.stack([x_m, y_m, height(x_m, y_m)]) - np.array(SCANNER)[:, None]
     range_m = np.linalg.norm(true, axis=0)
     if not noise:
-        return Shots(*true, None)
+        return Shots(true, None)
     along = true / range_m
     side = np.cross(along.T, [0, 0, 1]).T
     side /= np.linalg.norm(side, axis=0)
@@ -44,7 +44,11 @@ def shots_at(x_m, y_m, seed=0, *, noise=True):
     jitter[1] += rng.normal(0, math.radians(0.0008), len(x_m))
     recorded = along + jitter[0] * side + jitter[1] * upward
     recorded *= (range_m + rng.normal(0, 0.010, len(x_m))) / np.linalg.norm(recorded, axis=0)
-    return Shots(*recorded, None)
+    return Shots(recorded, None)
+
+
+def raised(shots, rise_m):
+    return Shots(shots.xyz_m + np.array([[0.0], [0.0], [1.0]]) * rise_m, None)
 
 
 def spots(count, seed):
@@ -130,7 +134,7 @@ def test_roughness_within_cells_is_found():
     stack = Stack(GRID)
     for seed in range(3):
         shots = shots_at(*spots(300_000, seed), seed=seed)
-        rough = Shots(shots.x_m, shots.y_m, shots.z_m + rng.normal(0, 0.2, len(shots)), None)
+        rough = raised(shots, rng.normal(0, 0.2, len(shots)))
         _, gridder, _, seen_from = scanned(rough, made)
         stack.add(gridder, on_reference(gridder, seen_from, None))
     several = stack.count > 10
@@ -196,7 +200,7 @@ def test_blocks_and_order_change_nothing():
         (rng.permutation(len(shots)), sorted(rng.integers(0, len(shots), 7))),
     ):
         gridder = gridder_for(setup, None)
-        columns = [np.split(axis[order], splits) for axis in (shots.x_m, shots.y_m, shots.z_m, time_s)]
+        columns = [np.split(one[..., order], splits, axis=-1) for one in (shots.xyz_m, time_s)]
         blocks = [Shots(*block) for block in zip(*columns, strict=True)]
         survey(gridder, blocks, Pose(frame.after(air.corrected, 6000.0), tilt), lambda: None)
         made.append(Laid(measure(gridder, setup, None, None)))
@@ -228,9 +232,8 @@ def test_bands_change_nothing(rows, monkeypatch):
 def test_a_real_change_is_found_and_flagged():
     x_m, y_m = spots(150_000, 6)
     shots = shots_at(x_m, y_m, seed=6)
-    raised = (x_m > 1700) & (x_m < 1800) & (np.abs(y_m) < 50)
-    shots = Shots(shots.x_m, shots.y_m, shots.z_m + np.where(raised, 0.5, 0.0), None)
-    measured, *_ = scanned(shots, truth())
+    square = (x_m > 1700) & (x_m < 1800) & (np.abs(y_m) < 50)
+    measured, *_ = scanned(raised(shots, np.where(square, 0.5, 0.0)), truth())
     inside = measured.change_m[140:160, 55:70]
     assert np.nanmean(inside) == pytest.approx(0.5, abs=0.02)
     flagged = (measured.quality & Quality.CHANGE_SIGNIFICANT) > 0
@@ -241,7 +244,7 @@ def test_a_real_change_is_found_and_flagged():
 def test_a_part_of_much_stable_ground_says_nearly_what_all_of_it_says(monkeypatch):
     """Shots 30 mm too high, seen by every, every second, third and thirteenth row of rock."""
     shots = shots_at(*spots(150_000, 7))
-    sunk = Shots(shots.x_m, shots.y_m, shots.z_m + 0.030, None)
+    sunk = raised(shots, 0.030)
     of = basis(GRID, SCANNER)
     told = Told(of, lines_of(of, np.eye(3), None), np.zeros((3, of.line_count)), None, weather_known=True)
     known = replace(truth(), habits=Habits(translation_m=0.1))

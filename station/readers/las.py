@@ -128,7 +128,7 @@ class LasScan:
         time_s, x_m, y_m = self._glance
         if 0 < self._layout.chunks < FEW_CHUNKS:
             blocks = self.blocks(max(self._layout.count // PLACES, 1), brightness=False)
-            firsts = [(one.time_s[0], one.x_m[0], one.y_m[0]) for one in blocks if one.time_s is not None]
+            firsts = [(one.time_s[0], *one.xyz_m[:2, 0]) for one in blocks if one.time_s is not None]
             time_s, x_m, y_m = np.array(firsts).T
         time_s, first = np.unique(time_s, return_index=True)
         if len(time_s) < 2:
@@ -148,7 +148,7 @@ class LasScan:
         records = np.frombuffer(b"".join(seen), layout.record)
         shots = _Check(layout, self._range_max_m).shots(records, timed=True)
         assert shots.time_s is not None  # noqa: S101 - asked for
-        return shots.time_s, shots.x_m, shots.y_m
+        return shots.time_s, shots.xyz_m[0], shots.xyz_m[1]
 
     @contextmanager
     def _points(self, layers: DecompressionSelection, *, all_cores: bool) -> Iterator[_Points]:
@@ -224,19 +224,23 @@ class _Check:
 
     def shots(self, records: Records, *, timed: bool, brightness: bool = False) -> Shots:
         """Give the echoes of some records, contiguous (n,), with their times if `timed`."""
-        x_m, y_m, z_m = (self._coordinate(records, axis) for axis in range(3))
+        xyz_m = np.empty((3, len(records)))
+        for axis, axis_m in enumerate(xyz_m):
+            self._lay(records, axis, axis_m)
         if self._range_max_m is not None:
-            farthest_m = float(np.sqrt((x_m * x_m + y_m * y_m + z_m * z_m).max()))
+            farthest_m = float(np.sqrt((xyz_m**2).sum(axis=0).max()))
             if farthest_m > self._range_max_m:
                 raise ScanError(
                     f"an echo {farthest_m:,.0f} m away, beyond scanner.range_max_m = {self._range_max_m:g}:"
                     " corrupt, or another unit, frame or scanner than the site file says"
                 )
         bright = records["intensity"] * BRIGHTEST if brightness else None
-        return Shots(x_m, y_m, z_m, self._times(records) if timed else None, bright)
+        return Shots(xyz_m, self._times(records) if timed else None, bright)
 
-    def _coordinate(self, records: Records, axis: int) -> Floats:
-        values = records["XYZ"[axis]] * self._layout.scale[axis]
+    def _lay(self, records: Records, axis: int, values: Floats) -> None:
+        """Lay the coordinates (n,) along an axis into `values` [m]."""
+        values[:] = records["XYZ"[axis]]
+        values *= self._layout.scale[axis]
         values += self._layout.offset[axis]
         if values.min() < self._low_m[axis] or values.max() > self._high_m[axis]:
             raise ScanError(
@@ -244,7 +248,6 @@ class _Check:
                 f" {values.max():.3f} m leaves the header's {self._layout.low_m[axis]:.3f} to"
                 f" {self._layout.high_m[axis]:.3f} m"
             )
-        return np.asarray(values)
 
     def _times(self, records: Records) -> Floats:
         time_s = np.ascontiguousarray(records["gps_time"], dtype=np.float64)

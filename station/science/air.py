@@ -104,11 +104,11 @@ class AirCorrection:
         rise_km = rise_m * 1e-3
         return 1.0 + 1e-6 * (constant + rise_km * (linear + rise_km * square))
 
-    def corrected(self, seen_m: tuple[Floats, Floats, Floats]) -> tuple[Floats, Floats, Floats]:
-        """Where targets (n,) are that are seen there, eastward, northward and up from the scanner [m]."""
-        scale = self.range_scale(seen_m[2])
-        x_m, y_m, z_m = (axis_m * scale for axis_m in seen_m)
-        return x_m, y_m, z_m - refraction_rise(x_m**2 + y_m**2, self.refraction_coefficient)
+    def corrected(self, seen_m: Floats) -> Floats:
+        """Where targets (3, n) are that are seen there, eastward, northward and up from the scanner [m]."""
+        there_m = seen_m * self.range_scale(seen_m[2])
+        there_m[2] -= refraction_rise(there_m[0] ** 2 + there_m[1] ** 2, self.refraction_coefficient)
+        return np.asarray(there_m)
 
 
 def air_correction(air: Air, assumed: Air | None, wavelength_um: float) -> AirCorrection:

@@ -12,7 +12,6 @@ from numpy.polynomial import chebyshev
 from pyproj import CRS, Transformer
 
 from station.quantities import Floats, Floats32, Ints, Tilt
-from station.science.view import Points
 
 KNOT_RAD = 3e-5  # of lean, apart
 SHORTEST_S = 1e-9  # between knots
@@ -61,37 +60,29 @@ class Turning:
     matrix: Floats  # (k, 3, 3) from that moment on …
     per_s: Floats  # (k, 3, 3) … and what each second adds to it
 
-    def turned(self, xyz_m: Points, time_s: Floats) -> Points:
-        """Coordinates (n,) of shots [m], each turned as at its moment. Fastest where they come in turn."""
-        turned_m = np.empty_like(time_s), np.empty_like(time_s), np.empty_like(time_s)
+    def turned(self, xyz_m: Floats, time_s: Floats) -> Floats:
+        """Coordinates (3, n) of shots [m], each turned as at its moment. Fastest where they come in turn."""
+        turned_m = np.empty_like(xyz_m)
         if not len(time_s):
             return turned_m
         if np.any(time_s[1:] < time_s[:-1]):
             order = np.argsort(time_s, kind="stable")
-            x_m, y_m, z_m = (axis_m[order] for axis_m in xyz_m)
-            for axis_m, sorted_m in zip(turned_m, self.turned((x_m, y_m, z_m), time_s[order]), strict=True):
-                axis_m[order] = sorted_m
+            turned_m[:, order] = self.turned(xyz_m.take(order, axis=1), time_s[order])
             return turned_m
         first, last = np.searchsorted(self.time_s[1:], (time_s[0], time_s[-1]), side="right").tolist()
         edges = [0, *np.searchsorted(time_s, self.time_s[first + 1 : last + 1]).tolist(), len(time_s)]
-        product = np.empty_like(time_s)
         for knot, part in zip(range(first, last + 1), map(slice, edges, edges[1:]), strict=False):
-            since_s = np.maximum(time_s[part] - self.time_s[knot], 0.0)
-            here_m = [axis_m[part] for axis_m in xyz_m]
-            for axis_m, row, row_per_s in zip(turned_m, self.matrix[knot], self.per_s[knot], strict=True):
-                total_m = axis_m[part]
-                np.multiply(here_m[0], row_per_s[0], out=total_m)
-                _add(total_m, here_m[1:], row_per_s[1:], product[part])
-                np.multiply(total_m, since_s, out=total_m)
-                _add(total_m, here_m, row, product[part])
+            here_m = _product(self.per_s[knot], xyz_m[:, part])
+            here_m *= np.maximum(time_s[part] - self.time_s[knot], 0.0)
+            np.add(here_m, _product(self.matrix[knot], xyz_m[:, part]), out=turned_m[:, part])
         return turned_m
 
 
-def _add(total_m: Floats, axes_m: list[Floats], shares: Floats, product: Floats) -> None:
-    """Add shares of coordinates (n,) to a total, without memory of its own: to take that is a third of it."""
-    for axis_m, share in zip(axes_m, shares.tolist(), strict=True):
-        np.multiply(axis_m, share, out=product)
-        np.add(total_m, product, out=total_m)
+def _product(matrix: Floats, points_m: Floats) -> Floats:
+    """Return a matrix (3, 3) times points (3, n), the same of each whatever is beside it."""
+    if points_m.shape[1] == 1:  # which BLAS multiplies in another way, with another last digit
+        return _product(matrix, points_m.repeat(2, axis=1))[:, :1]
+    return np.asarray(matrix @ points_m)
 
 
 def turning(tilt: Tilt | None, then: Floats) -> Turning:
@@ -131,31 +122,30 @@ class Frame:
     powers: Ints
     coefficients: Floats
 
-    def to_map(self, local_m: Points) -> Points:
-        """Easting, northing and height [m] of points in the local frame."""
+    def to_map(self, local_m: Floats) -> Floats:
+        """Easting, northing and height (3, n) [m] of points (3, n) in the local frame."""
         # What bends and scales is metres: 24 bits hold it to a micrometre, at half the cost.
-        x, y, z = (axis_m.astype(np.float32) for axis_m in local_m)
+        x, y, z = local_m.astype(np.float32)
         monomials, scratch = _monomials(x, y, z, self.powers), np.empty_like(x)
-        bent_m = [np.zeros_like(x) for _ in local_m]
+        bent_m = np.zeros(local_m.shape, np.float32)
         for power, row_m in zip(self.powers.tolist(), self.coefficients.tolist(), strict=True):
             for axis_m, coefficient_m in zip(bent_m, row_m, strict=True):
                 if coefficient_m:
                     np.multiply(monomials[tuple(power)], coefficient_m, out=scratch)
                     np.add(axis_m, scratch, out=axis_m)
-        ways_m = zip(local_m, self.position_m, bent_m, strict=True)
-        east_m, north_m, height_m = (
-            bent.astype(np.float64) + local + origin for local, origin, bent in ways_m
-        )
-        return east_m, north_m, height_m
+        mapped_m = bent_m.astype(np.float64)
+        mapped_m += local_m
+        mapped_m += np.array(self.position_m)[:, None]
+        return mapped_m
 
-    def after(self, seen: Callable[[Points], Points], reach_m: float) -> Frame:
+    def after(self, seen: Callable[[Floats], Floats], reach_m: float) -> Frame:
         """Return the way of points that are not where they seem to be in the local frame: `seen` tells where.
 
         They may be aside by little, and smoothly: that becomes part of the polynomial, good to 0.1 mm within
         reach where it is a metre.
         """
-        x_m, y_m, z_m = local_m = _nodes(reach_m)
-        return _fitted(self.position_m, self.to_local, local_m, np.array(self.to_map(seen((x_m, y_m, z_m)))))
+        local_m = _nodes(reach_m)
+        return _fitted(self.position_m, self.to_local, local_m, self.to_map(seen(local_m)))
 
 
 def _monomials(x: Axis, y: Axis, z: Axis, powers: Ints) -> Monomials[Axis]:

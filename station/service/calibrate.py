@@ -110,7 +110,7 @@ def _shots(site: Site, path: Path) -> tuple[Floats, Floats]:
     count = 0
     with open_scan(path, range_max_m=site.scanner.range_max_m) as reader:
         for block in reader.blocks():
-            points.append(np.stack([block.x_m, block.y_m, block.z_m], axis=1))
+            points.append(block.xyz_m.T)
             bright.append(np.ones(len(block)) if block.intensity is None else block.intensity)
             count += len(block)
             if count >= MOST_SHOTS:

@@ -160,7 +160,7 @@ def check_scan(path, dice):
     assert sum(len(block) for block in blocks) == scan.header.point_count, "another count than its header's"
     slack_m = 1.0  # no scale is larger
     for block in blocks:
-        points_m = np.stack([block.x_m, block.y_m, block.z_m], axis=1)
+        points_m = block.xyz_m.T
         assert np.isfinite(points_m).all(), "points that are no numbers"
         assert (points_m >= np.array(scan.header.low_m) - slack_m).all(), "points outside of the box"
         assert (points_m <= np.array(scan.header.high_m) + slack_m).all(), "points outside of the box"

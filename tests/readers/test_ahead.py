@@ -49,7 +49,7 @@ def test_every_echo_comes_as_without_it(a_sweep, tmp_path):
         import numpy as np
         blocks = []
         for block in LasScan(Path(sys.argv[1])).blocks(1000):
-            blocks.append([block.x_m, block.y_m, block.z_m, block.time_s, block.intensity])
+            blocks.append([*block.xyz_m, block.time_s, block.intensity])
             if len(blocks) == 1:
                 assert len(children()) == 1  # or this test tests nothing
         assert not children()
@@ -58,7 +58,7 @@ def test_every_echo_comes_as_without_it(a_sweep, tmp_path):
     done = run(script, path, tmp_path / "seen.npy")
     assert done.returncode == 0, done.stderr.decode()
     shots = LasScan(path).blocks(30_001)
-    wanted = [[one.x_m, one.y_m, one.z_m, one.time_s, one.intensity] for one in shots]
+    wanted = [[*one.xyz_m, one.time_s, one.intensity] for one in shots]
     assert np.array_equal(np.load(tmp_path / "seen.npy"), np.concatenate(wanted, axis=1))
 
 

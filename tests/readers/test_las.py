@@ -27,7 +27,7 @@ FORMS = [
 def everything(scan, size=50_000):
     blocks = list(scan.blocks(size))
     assert all(len(block) == size for block in blocks[:-1])
-    columns = [[block.x_m, block.y_m, block.z_m] for block in blocks]
+    columns = [[*block.xyz_m] for block in blocks]
     times = None if blocks[0].time_s is None else np.concatenate([block.time_s for block in blocks])
     return np.concatenate(columns, axis=1), times
 
@@ -53,7 +53,7 @@ def test_blocks_of_any_size_hold_the_same(a_sweep, size):
 
 def test_blocks_are_contiguous_doubles(a_sweep):
     block = next(LasScan(a_sweep("s.laz", 3000)).blocks(1000))
-    for column in (block.x_m, block.y_m, block.z_m, block.time_s):
+    for column in (*block.xyz_m, block.time_s):
         assert column.dtype == np.float64
         assert column.flags.c_contiguous
 
@@ -115,7 +115,7 @@ def test_passes_may_overlap(a_sweep):
     first = next(blocks)
     scan.head_track()
     rest = list(blocks)
-    assert np.array_equal(np.concatenate([first.x_m, *(block.x_m for block in rest)]), alone[0])
+    assert np.array_equal(np.concatenate([first.xyz_m[0], *(block.xyz_m[0] for block in rest)]), alone[0])
 
 
 def test_memory_does_not_grow_with_the_scan(a_sweep):

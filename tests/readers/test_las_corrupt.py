@@ -203,7 +203,7 @@ def test_flipped_bits_never_do_worse_than_a_wrong_point(tmp_path, seed, name, he
     assert sum(len(block) for block in blocks) == scan.header.point_count
     for block in blocks:
         assert block.time_s is None or np.isfinite(block.time_s).all()
-        for axis, values in enumerate((block.x_m, block.y_m, block.z_m)):
+        for axis, values in enumerate(block.xyz_m):
             assert values.min() >= scan.header.low_m[axis] - 1
             assert values.max() <= scan.header.high_m[axis] + 1
 

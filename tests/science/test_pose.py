@@ -21,7 +21,7 @@ def test_rotation_is_omega_then_phi_then_kappa():
 
 
 def upright(tilt, points, time_s):
-    return pose.turning(tilt, np.eye(3)).turned(tuple(points), time_s)
+    return pose.turning(tilt, np.eye(3)).turned(points, time_s)
 
 
 def test_lean_turns_roll_first():
@@ -29,7 +29,7 @@ def test_lean_turns_roll_first():
     roll, pitch = math.radians(5.0), math.radians(5.0)
     tilt = Tilt(np.array([0.0, 10.0]), np.array([roll, roll]), np.array([pitch, pitch]))
     points = np.random.default_rng(1).normal(size=(3, 20))
-    leaning = np.array(upright(tilt, points, np.full(20, 5.0)))
+    leaning = upright(tilt, points, np.full(20, 5.0))
     assert leaning == pytest.approx(Rotation.from_euler("xy", [roll, pitch]).as_matrix() @ points)
 
 
@@ -56,7 +56,7 @@ def test_map_from_origin_within_a_millimetre(crs):
     sop[:3, :3] = pose.rotation(0.02, -0.01, 2.0)
     frame = pose.frame_by_origin(sop, HEF, crs, REACH_M)
     scanner_m = everywhere()
-    told_m = np.array(frame.to_map(tuple(frame.to_local[:3, :3] @ scanner_m)))
+    told_m = frame.to_map(frame.to_local[:3, :3] @ scanner_m)
     latitude, longitude, height_m = HEF
     origin_m = Transformer.from_crs("EPSG:4979", "EPSG:4978", always_xy=True).transform(
         longitude, latitude, height_m
@@ -70,7 +70,7 @@ def test_map_from_origin_within_a_millimetre(crs):
 def test_curvature_and_scale_are_not_optional():
     """At 4.5 km a rigid map frame is wrong by 1.6 m in height and 2.9 m in distance (EQUATIONS 2.6)."""
     frame = pose.frame_by_origin(np.eye(4), HEF, "EPSG:32632", REACH_M)
-    east_m, north_m, height_m = frame.to_map((np.array([0.0, 4500.0]), np.zeros(2), np.zeros(2)))
+    east_m, north_m, height_m = frame.to_map(np.array([[0.0, 4500.0], [0.0, 0.0], [0.0, 0.0]]))
     assert height_m[1] - height_m[0] == pytest.approx(4500**2 / 2 / 6.388e6, abs=0.01)
     assert math.hypot(*np.diff([east_m, north_m])[:, 0]) - 4500 == pytest.approx(-2.9, abs=0.2)
 
@@ -78,20 +78,15 @@ def test_curvature_and_scale_are_not_optional():
 def test_sop_straight_to_the_map_knows_grid_north():
     """The same scanner told by its map position and by its origin stands and looks the same."""
     by_origin = pose.frame_by_origin(np.eye(4), HEF, "EPSG:32632", REACH_M)
-    away_m = (np.array([0.0, 100.0, 3000.0]), np.array([3000.0, 100.0, 0.0]), np.array([0.0, 50.0, -500.0]))
-    wanted_m = np.array(by_origin.to_map(away_m))
-    convergence = math.atan2(
-        *(
-            np.array(by_origin.to_map((np.zeros(1), np.ones(1), np.zeros(1))))[:2, 0]
-            - by_origin.position_m[:2]
-        )
-    )
+    away_m = np.array([[0.0, 100.0, 3000.0], [3000.0, 100.0, 0.0], [0.0, 50.0, -500.0]])
+    wanted_m = by_origin.to_map(away_m)
+    north_m = by_origin.to_map(np.array([[0.0], [1.0], [0.0]]))
+    convergence = math.atan2(*(north_m[:2, 0] - by_origin.position_m[:2]))
     sop = np.eye(4)
     sop[:3, :3] = Rotation.from_euler("z", -convergence).as_matrix()  # scanner's y is true north
     sop[:3, 3] = by_origin.position_m
     frame = pose.frame_on_map(sop, "EPSG:32632", REACH_M)
-    local_m = frame.to_local[:3, :3] @ np.array(away_m)
-    assert np.abs(np.array(frame.to_map(tuple(local_m))) - wanted_m).max() < 1e-3
+    assert np.abs(frame.to_map(frame.to_local[:3, :3] @ away_m) - wanted_m).max() < 1e-3
 
 
 def test_local_map_is_plain_matrix_algebra():
@@ -100,7 +95,7 @@ def test_local_map_is_plain_matrix_algebra():
     sop[:3, 3] = (10.0, 20.0, 30.0)
     frame = pose.frame_in_local_map(sop)
     points = np.random.default_rng(3).normal(size=(3, 50))
-    told = np.array(frame.to_map(tuple(frame.to_local[:3, :3] @ points)))
+    told = frame.to_map(frame.to_local[:3, :3] @ points)
     assert told == pytest.approx(sop[:3, :3] @ points + sop[:3, 3:])
 
 
@@ -110,7 +105,7 @@ def test_real_mammoth_matrices(shared_data, season):
     sop, pop = (np.loadtxt(shared_data / "mammoth" / f"{season}-{kind}.dat") for kind in ("SOP", "POP"))
     frame = pose.frame_by_pop(sop, pop, "EPSG:26911", REACH_M)
     scanner_m = everywhere(seed=5)
-    told_m = np.array(frame.to_map(tuple(frame.to_local[:3, :3] @ scanner_m)))
+    told_m = frame.to_map(frame.to_local[:3, :3] @ scanner_m)
     assert np.abs(told_m - by_pyproj(pop @ sop, scanner_m, "EPSG:26911")).max() < 1e-3
     lean_deg = math.degrees(math.acos(frame.to_local[2, 2]))
     assert 29.0 < lean_deg < 35.0
@@ -124,7 +119,7 @@ def test_axes_are_those_of_the_map(crs):
     frame = pose.frame_by_origin(sop, HEF, crs, REACH_M)
     beams = np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [-0.6, 0.8, 0.0]]).T
     local_m = 500.0 * frame.to_local[:3, :3] @ beams
-    east_m, north_m, _ = (a - b for a, b in zip(frame.to_map(tuple(local_m)), frame.position_m, strict=True))
+    east_m, north_m, _ = (a - b for a, b in zip(frame.to_map(local_m), frame.position_m, strict=True))
     assert np.arctan2(local_m[0], local_m[1]) == pytest.approx(np.arctan2(east_m, north_m), abs=2e-5)
 
 
@@ -133,7 +128,7 @@ def test_a_lean_that_jumps_between_its_knots_turns_as_its_angle_does():
     tilt = Tilt(np.array([0.0, 1.0, 2.0]), np.radians([0.0, 0.5, -30.0]), np.radians([0.2, -0.3, 5.0]))
     time_s = np.linspace(0, 2, 301)
     far_m = np.array([4000.0, -3000.0, 800.0])
-    leant = np.stack(upright(tilt, np.repeat(far_m[:, None], 301, axis=1), time_s), axis=-1)
+    leant = upright(tilt, np.repeat(far_m[:, None], 301, axis=1), time_s).T
     for at_s, found_m in zip(time_s, leant, strict=True):
         roll, pitch = (np.interp(at_s, tilt.time_s, angle) for angle in (tilt.roll_rad, tilt.pitch_rad))
         assert found_m == pytest.approx(pose.rotation_y(pitch) @ pose.rotation_x(roll) @ far_m, abs=1e-6)
@@ -145,14 +140,13 @@ def test_the_lean_stays_as_it_is_before_and_after_its_log_and_shots_may_come_in_
     tilt = Tilt(np.array([10.0, 12.0, 15.0]), rng.normal(0, 1e-3, 3), rng.normal(0, 1e-3, 3))
     sop, points, time_s = pose.rotation(0.1, -0.2, 2.0), everywhere(count=500), rng.uniform(5, 20, 500)
     turning = pose.turning(tilt, sop)
-    told_m = np.array(turning.turned(tuple(points), time_s))
+    told_m = turning.turned(points, time_s)
     for at in range(500):
         roll, pitch = (np.interp(time_s[at], tilt.time_s, angle) for angle in (tilt.roll_rad, tilt.pitch_rad))
         wanted_m = sop @ pose.rotation_y(pitch) @ pose.rotation_x(roll) @ points[:, at]
         assert told_m[:, at] == pytest.approx(wanted_m, abs=1e-6)
-        assert np.array_equal(
-            told_m[:, at], np.ravel(turning.turned(tuple(points[:, at : at + 1]), time_s[at : at + 1]))
-        )
+        alone = slice(at, at + 1)
+        assert np.array_equal(told_m[:, alone], turning.turned(points[:, alone], time_s[alone]))
 
 
 @pytest.mark.parametrize("crs", [None, "EPSG:32632"])
@@ -162,7 +156,7 @@ def test_the_air_on_the_way_to_the_map_is_that_of_each_point(crs, assumed):
     air = air_correction(Air(15.0, 1013.25, 0.0), assumed, 1.064)
     sop = np.eye(4)
     frame = pose.frame_by_origin(sop, HEF, crs, REACH_M) if crs else pose.frame_in_local_map(sop)
-    local_m = tuple(everywhere())
-    through_air_m = np.array(frame.after(air.corrected, REACH_M).to_map(local_m))
-    assert np.abs(through_air_m - np.array(frame.to_map(air.corrected(local_m)))).max() < 1e-4
-    assert np.abs(through_air_m - np.array(frame.to_map(local_m))).max() > 0.5
+    local_m = everywhere()
+    through_air_m = frame.after(air.corrected, REACH_M).to_map(local_m)
+    assert np.abs(through_air_m - frame.to_map(air.corrected(local_m))).max() < 1e-4
+    assert np.abs(through_air_m - frame.to_map(local_m)).max() > 0.5
