@@ -127,7 +127,7 @@ def _cells(gridder: Gridder, outlook: Outlook) -> Iterator[Cells]:
                 sector.having(Trait.STABLE),
                 sector.having(Trait.WITHHELD),
                 sector.having(Trait.SMOOTH),
-                ground.looks_unlike(sums.intensity(), sector.intensity),
+                ground.looks_unlike(sums.intensity(), outlook.intensity(first + seen)),
             ),
             sums.mean_residual(),
             sector.scatter_m2 / sums.count + sector.before_m2,

@@ -40,7 +40,7 @@ class Shots:
 
     def __len__(self) -> int:
         """Return how many echoes there are."""
-        return self.xyz_m.shape[1]
+        return len(self.xyz_m[0])
 
 
 @dataclass(frozen=True)

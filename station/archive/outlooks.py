@@ -25,7 +25,7 @@ from station.archive.reference import held_at
 from station.errors import StoreError
 from station.quantities import Ints, Reference
 from station.science import shared
-from station.science.outlook import CELLS, Outlook, Position
+from station.science.outlook import CELLS, COUNTED, COUNTED_MOST, Outlook, Position
 
 ROWS = 128  # of the grid, that a checksum covers
 KEPT = 2  # at a time, of one station: a scanner that was moved may still have old scans to be done again
@@ -46,7 +46,16 @@ def kept_outlook(
     `place` of the scanner and its axis; `made_with` tells everything else that it depends on.
     """
     status = held_at(series, reference.version).stat()
-    told = __version__, [*CELLS], reference.version, status.st_size, status.st_mtime_ns, place, made_with
+    told = (
+        __version__,
+        [*CELLS],
+        COUNTED_MOST,
+        reference.version,
+        status.st_size,
+        status.st_mtime_ns,
+        place,
+        made_with,
+    )
     path = series.folder / f".outlook-{sha256(repr(told).encode()).hexdigest()[:16]}.h5"
     if not path.is_file():
         made = look()
@@ -65,7 +74,7 @@ def _write(path: Path, made: Outlook) -> bool:
     try:
         with h5py.File(beside, "w") as file:
             for name, values in (dense | dict(made.cells)).items():
-                edges = _edges(len(values)) if name in DENSE else made.bounds
+                edges = _edges(name, len(values), made.bounds)
                 held = file.create_dataset(name, data=values)
                 held.attrs["crc"] = [_crc(values[a:b]) for a, b in pairwise(edges)]
             datum = np.float64(made.datum_m).view(np.int64)
@@ -92,7 +101,7 @@ def _open(path: Path, reference: Reference, position_m: Position | None, axis: P
                 raise _damaged(path)
             bounds, datum_m = frame[:-3], float(frame[-1:].view(np.float64)[0])
             held = {
-                name: _Plain(path, kept, file[name], _edges(len(file[name])) if name in DENSE else bounds)
+                name: _Plain(path, kept, file[name], _edges(name, len(file[name]), bounds))
                 for name in file
                 if name != "bounds"
             }
@@ -130,10 +139,6 @@ class _Plain:
     def __getitem__(self, rows: slice) -> Array:
         """Return some rows."""
         first, stop, step = rows.indices(self._shape[0])
-        if step > 1:  # part by part: whole they would be the most that a scan needs
-            inner = self._edges[(self._edges > first) & (self._edges < stop)].tolist()
-            parts = pairwise([first, *inner, stop])
-            return np.concatenate([self[begin:end][-(begin - first) % step :: step] for begin, end in parts])
         values = np.empty((stop - first) * self._row_bytes, np.uint8)
         try:
             read = os.preadv(self._kept.descriptor, [values.data], self._at + first * self._row_bytes)
@@ -145,7 +150,7 @@ class _Plain:
             begin, end = (int(row - first) * self._row_bytes for row in self._edges[number : number + 2])
             if end <= len(values) and _crc(values[begin:end]) != self._crc[number]:
                 raise _damaged(self._path)
-        return values.view(self._dtype).reshape(-1, *self._shape[1:])
+        return values.view(self._dtype).reshape(-1, *self._shape[1:])[::step]
 
     def __array__(self, dtype: Any = None, copy: bool | None = None) -> Array:  # noqa: ANN401, FBT001 - numpy's
         """Return all of it, where the system keeps the file, to be read only; or a copy."""
@@ -165,8 +170,11 @@ class _Plain:
         return np.asarray(values.reshape(self._shape), dtype=dtype)
 
 
-def _edges(rows: int) -> Ints:
-    return np.append(np.arange(0, rows, ROWS), rows)
+def _edges(name: str, rows: int, bounds: Ints) -> Ints:
+    """Return where the parts of an array begin that have a checksum each, and where the last ends."""
+    if name in DENSE:
+        return np.append(np.arange(0, rows, ROWS), rows)
+    return np.array([0, rows]) if name in COUNTED else bounds
 
 
 def _crc(values: Array) -> int:

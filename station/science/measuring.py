@@ -52,8 +52,10 @@ def measured(gridder: Gridder, outlook: Outlook | None, judge: Judge) -> Measure
             sums = gridder.sums(first, first + len(whole))
             made.clear(first + np.flatnonzero(sums.count == 0))
             seen = np.flatnonzero(sums.count > 0)  # by numbers: to choose by a mask takes four times as long
-            sector, sums = whole.some(seen), sums.some(seen)
-            made.put(first + seen, sums, judge.known(sector, sums, outlook))
+            if not len(seen):
+                continue
+            sector, sums, number = whole.some(seen), sums.some(seen), first + seen
+            made.put(number, sums, judge.known(number, sector, sums, outlook))
     for fringe in _fringes(gridder, setup, outlook):
         sums = gridder.at(fringe.number)
         made.put(fringe.number, sums, judge.beyond(fringe, sums, gridder.datum_m))
@@ -208,8 +210,8 @@ class Judge:
     own: Shared | None
     correction: Callable[[Sensitivities], Reals] | None
 
-    def known(self, sector: Sector, sums: Sums, outlook: Outlook) -> _Judged:
-        """Judge cells (n,) that the reference knows."""
+    def known(self, number: Ints, sector: Sector, sums: Sums, outlook: Outlook) -> _Judged:
+        """Judge cells (n,) that the reference knows, some of a sector."""
         count = sums.count.astype(np.float32)
         random_m2 = sector.scatter_m2 / count + sector.before_m2
         shared_m2, correction_m, terms = np.zeros_like(count), np.zeros_like(count), dict[str, Floats]()
@@ -225,7 +227,7 @@ class Judge:
         flags |= Quality.HIGH_INCIDENCE * sector.having(Trait.GRAZED).view(np.uint8)
         flags |= Quality.CHANGE_SIGNIFICANT * change.significant(change_m, sigma_m).view(np.uint8)
         if self.correction is not None:
-            unlike = ground.looks_unlike(sums.intensity(), sector.intensity)
+            unlike = ground.looks_unlike(sums.intensity(), outlook.intensity(number))
             flags |= Quality.STABLE_GROUND * (sector.having(Trait.STABLE) & ~unlike).view(np.uint8)
         elevation_m = outlook.datum_m + (sector.height_m.astype(np.float64) + change_m)
         return _Judged(elevation_m, change_m, sigma_m, np.sqrt(random_m2), flags, terms)

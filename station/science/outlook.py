@@ -26,6 +26,7 @@ MOVING_MOST = 400_000  # cells of moving ground that an adjustment looks at
 STABLE_MOST = 800_000  # the same of stable ground, in whole rows; so many tell all there is to tell
 TOGETHER = 50_000  # cells of a sector where nobody knows the head
 STRETCH_M = 200.0  # of range, whose cells are counted together
+COUNTED_MOST = 500_000  # cells that are counted of what scans usually see; of more a part
 HIGH_INCIDENCE_COS = float(np.cos(np.radians(80.0)))
 
 SINGLES = [
@@ -45,6 +46,7 @@ CELLS = {  # of an outlook
     "place": np.int32,
     "trait": np.uint8,
 }
+COUNTED = ("usual", "place")  # of these, that are of the cells that are counted
 
 Position = tuple[float, float, float]
 Array = NDArray[Any]
@@ -70,7 +72,6 @@ class Sector:
     passed: Floats32  # knots of the lean before it, in fractions
     scatter_m2: Floats32  # random variance of one shot and of roughness, as scans have shown it
     before_m2: Floats32  # random variance of the reference
-    intensity: Floats32  # of the reference
     trait: NDArray[np.uint8]
 
     def __len__(self) -> int:
@@ -91,10 +92,10 @@ class Outlook:
     """A reference as seen from one place. No place: on the map, by others' registration.
 
     `rise_m` and `number` (ny, nx) are those of `terrain.Ground`, above `datum_m`. `cells` are, by number, the
-    fields of `Sector` (n,), and `shot_m2`, the random variance of one shot, `usual`, the share of the
-    reference's scans that saw the cell, and `place`, in which of `places` it is counted. Of these `bounds`
+    fields of `Sector` (n,), `shot_m2`, the random variance of one shot, and `intensity`. Of these `bounds`
     part the sectors, each into the cells that an adjustment looks at and the others: of very many a part
-    tells all there is to tell. Arrays may be read only as they are sliced.
+    tells all there is to tell. So it does of those that are `counted`: `usual`, the share of the reference's
+    scans that saw the cell, and `place`, in which of `places`. Arrays may be read only as they are sliced.
     """
 
     reference: Reference
@@ -119,6 +120,12 @@ class Outlook:
         assert self.position_m is not None  # noqa: S101 - the callers' case
         return self.of.intervals // LEAN_PER_REFRACTION, _stretches(self.grid, self.position_m)
 
+    @property
+    def counted(self) -> slice:
+        """Which cells are counted of what scans usually see."""
+        count = int(self.bounds[-1])
+        return slice(None, count, _every(count))
+
     def ground(self) -> Ground:
         """Return the reference as shots look it up."""
         return Ground(self.grid, self.datum_m, np.asarray(self.rise_m), self.number)
@@ -132,6 +139,11 @@ class Outlook:
         for first, end in zip(self.bounds[:-1:2].tolist(), self.bounds[last::2].tolist(), strict=True):
             if end > first:
                 yield first, Sector(**{one.name: self.cells[one.name][first:end] for one in fields(Sector)})
+
+    def intensity(self, number: Ints) -> Floats32:
+        """Brightness of the reference in cells (n,) of a sector, by rising number."""
+        first, last = number[0], number[-1]
+        return np.asarray(self.cells["intensity"][first : last + 1].take(number - first))
 
     def having(self, *traits: Trait) -> Ints:
         """Return the numbers (m,) of the cells that have all these traits."""
@@ -210,7 +222,7 @@ def look(
     order = np.argsort(place, kind="stable")
     bounds = np.searchsorted(place[order], np.arange(2 * parts + 1))
     for name in cells:  # one after the other: together they are the most that a scan needs
-        cells[name] = cells[name][order]
+        cells[name] = cells[name][order[:: _every(count)] if name in COUNTED else order]
     number = np.full(grid.shape, -1, np.int32)
     number.reshape(-1)[cells["cell"]] = np.arange(count)
     return Outlook(reference, of, position_m, below.datum_m, below.rise_m, number, bounds, one_in, cells)
@@ -272,6 +284,11 @@ def _cells(
         "place": place,
         "trait": trait,
     }
+
+
+def _every(count: int) -> int:
+    """Return of how many cells one is counted."""
+    return 1 + count // COUNTED_MOST
 
 
 def _stretches(grid: Grid, position_m: Position) -> int:

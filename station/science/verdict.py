@@ -12,7 +12,7 @@ import numpy as np
 
 from station.quantities import Bools, Floats, Habits, Ints, Ints32, Measurement
 from station.science.adjustment import Adjustment
-from station.science.outlook import STRETCH_M, Outlook, Trait
+from station.science.outlook import COUNTED, STRETCH_M, Outlook, Trait
 from station.science.shared import LEAN_KNOT_RAD, LEAN_PER_REFRACTION
 
 MOST_REFUSED = 0.3  # of the stable ground, before an adjustment is doubted
@@ -22,7 +22,6 @@ BLIND = 0.02  # of it; less is nothing to work with
 THROUGH = 0.9  # of the best range; there the air is clear enough to miss a sector
 GONE = 0.05  # of what is usually seen in a sector or at a range; less is nothing
 FEWEST_CELLS = 30  # that scans usually see, to miss them
-CELLS_MOST = 500_000  # that are counted; of more a part
 SCATTERED = 3.0  # sigmas by which stable ground that no fit has seen may scatter
 OFF = 5.0  # the same of a scan that is not adjusted; more, and its sigma holds nothing
 FEWEST_STABLE = 20
@@ -53,13 +52,12 @@ def view(count: Ints32, outlook: Outlook) -> View:
     if of is None:
         raise ValueError("without a place nothing is looked at")
     shape = sectors, stretches = outlook.places
-    every = 1 + int(outlook.bounds[-1]) // CELLS_MOST
-    known = slice(None, outlook.bounds[-1], every)
-    place, share = (outlook.cells[name][known] for name in ("place", "usual"))
+    share, place = (outlook.cells[name][:] for name in COUNTED)
     usual = np.bincount(place, np.nan_to_num(share), sectors * stretches).astype(np.float64)
-    there = (share > 0) & (count[known] > 0)
+    there = (share > 0) & (count[outlook.counted] > 0)
     found = np.bincount(place, there, sectors * stretches).astype(np.float64)
     edges = of.start_rad + LEAN_KNOT_RAD * LEAN_PER_REFRACTION * np.arange(sectors + 1)
+    every = outlook.counted.step
     return View(usual.reshape(shape) * every, found.reshape(shape) * every, np.degrees(edges))
 
 

@@ -84,7 +84,7 @@ def test_fog_and_a_partial_sweep_together():
 def test_a_part_of_a_vast_grid_tells_the_same(monkeypatch):
     seen = chance(0.9) & (AWAY < 1400)
     whole = view(seen, reference())
-    monkeypatch.setattr(verdict, "CELLS_MOST", GRID.nx * GRID.ny // 3)
+    monkeypatch.setattr("station.science.outlook.COUNTED_MOST", GRID.nx * GRID.ny // 3)
     part = view(seen, reference())
     assert part.share == pytest.approx(whole.share, rel=0.02)
     assert part.usual.sum() == pytest.approx(whole.usual.sum(), rel=0.02)
