@@ -12,6 +12,7 @@ from station.quantities import (
     MEASURED,
     Floats,
     Floats32,
+    Grid,
     Ints,
     Ints32,
     Measurement,
@@ -67,7 +68,7 @@ class _Fringe:
     """Cells (n,) beyond what a reference knows, each with the slope that the scan gives it."""
 
     number: Ints32
-    cell: Ints
+    cell: Ints32
     east_gradient: Floats
     north_gradient: Floats
 
@@ -84,35 +85,42 @@ class _Fringe:
 
 def _fringes(gridder: Gridder, setup: Setup, outlook: Outlook | None) -> Iterator[_Fringe]:
     """Give the cells beyond the reference, so many at a time that what is worked out stays in the cache."""
-    heights = _Heights(gridder, outlook, setup.min_points)
+    beyond = gridder.beyond()
+    heights = _Heights(gridder, outlook, beyond, setup.min_points)
     parts: list[_Fringe] = []
     for top in range(0, setup.grid.ny, BAND_ROWS):
         rows = slice(top, min(top + BAND_ROWS, setup.grid.ny))
-        parts.append(_fringe(gridder, setup, heights, rows))
+        parts.append(_fringe(gridder, setup, heights, rows, _in_rows(beyond, rows, setup.grid)))
         if sum(len(part.cell) for part in parts) > TOGETHER or rows.stop == setup.grid.ny:
             yield from _Fringe.of(parts).split()
             parts = []
 
 
-def _fringe(gridder: Gridder, setup: Setup, heights: _Heights, rows: slice) -> _Fringe:
-    """Return the cells of some rows that no reference knows."""
-    numbers = gridder.number[rows].reshape(-1)
-    cell = np.flatnonzero(numbers >= gridder.known)
+def _in_rows(cell: Ints32, rows: slice, grid: Grid) -> Ints32:
+    """Return those of rising cells that lie in some rows."""
+    first, end = np.searchsorted(cell, (rows.start * grid.nx, rows.stop * grid.nx))
+    return cell[first:end]
+
+
+def _fringe(gridder: Gridder, setup: Setup, heights: _Heights, rows: slice, cell: Ints32) -> _Fringe:
+    """Return the cells (n,) of some rows that no reference knows, and their slopes."""
     east, north = np.zeros((2, len(cell)))
     if setup.position_m is not None:
         around_m, inner = heights.around(rows)
         if len(cell):
             row, column = setup.grid.row_and_column(cell)
-            gradient = gradient_in(around_m, setup.grid.cell_m, inner.start + row, column)
+            row += inner.start - rows.start
+            gradient = gradient_in(around_m, setup.grid.cell_m, row, column)
             east, north = (np.nan_to_num(one.astype(np.float64)) for one in gradient)
-    return _Fringe(numbers[cell], rows.start * setup.grid.nx + cell, east, north)
+    return _Fringe(gridder.number.reshape(-1).take(cell), cell, east, north)
 
 
 class _Heights:
     """Heights above one datum row by row, read from the sums of cells before these give way."""
 
-    def __init__(self, gridder: Gridder, outlook: Outlook | None, min_points: int) -> None:
-        self._gridder, self._outlook, self._min_points = gridder, outlook, min_points
+    def __init__(self, gridder: Gridder, outlook: Outlook | None, beyond: Ints32, min_points: int) -> None:
+        """Take the cells `beyond` (n,) the reference, rising."""
+        self._gridder, self._outlook, self._beyond, self._min_points = gridder, outlook, beyond, min_points
         self._above_m = 0.0 if outlook is None else gridder.datum_m - outlook.datum_m  # the reference's datum
         self._rows = slice(0, 0)
         self._height_m = np.empty((0, gridder.grid.nx), np.float32)
@@ -129,18 +137,20 @@ class _Heights:
         return self._height_m, slice(rows.start - wanted.start, rows.stop - wanted.start)
 
     def _read(self, rows: slice) -> Floats32:
-        gridder, outlook = self._gridder, self._outlook
+        gridder, grid = self._gridder, self._gridder.grid
         numbers = gridder.number[rows]
-        height_m = np.full(numbers.shape, np.nan, np.float32)
-        if outlook is not None:
+        if self._outlook is None:
+            height_m = np.full(numbers.shape, np.nan, np.float32)
+        else:
             # What it knows of cells is better. All others become a number of all bits, which is NaN.
             others = numbers.view(np.uint32) >= np.uint32(gridder.known)
-            others_bits = np.negative(others.view(np.int8), dtype=np.int32)
-            np.bitwise_or(outlook.rise_m[rows].view(np.int32), others_bits, out=height_m.view(np.int32))
-        beyond = np.flatnonzero(numbers >= gridder.known)
-        sums = gridder.at(numbers.reshape(-1)[beyond])
+            bits = np.negative(others.view(np.int8), dtype=np.int32)
+            bits |= self._outlook.rise_m[rows].view(np.int32)
+            height_m = bits.view(np.float32)
+        cell = _in_rows(self._beyond, rows, grid) - rows.start * grid.nx
+        sums = gridder.at(numbers.reshape(-1).take(cell))
         enough = sums.count >= self._min_points
-        height_m.reshape(-1)[beyond] = np.where(enough, sums.mean_residual() + self._above_m, np.nan)
+        height_m.reshape(-1)[cell] = np.where(enough, sums.mean_residual() + self._above_m, np.nan)
         return height_m
 
 

@@ -44,7 +44,9 @@ def smooth_gradient(
     return smooth(east, cells, rows), smooth(north, cells, rows)
 
 
-def gradient_in(elevation_m: Floats32, cell_m: float, row: Ints, column: Ints) -> tuple[Floats32, Floats32]:
+def gradient_in(
+    elevation_m: Floats32, cell_m: float, row: Ints | Ints32, column: Ints | Ints32
+) -> tuple[Floats32, Floats32]:
     """Return what `smooth_gradient` is in a few cells (n,), each from the square of cells around it.
 
     A cell takes as long as ten of a whole surface.
