@@ -89,9 +89,10 @@ def _shuffled(chunks: Array) -> NDArray[np.uint8]:
     """
     shuffled = np.empty((len(chunks), chunks.itemsize, chunks.shape[1]), np.uint8)
     whole = chunks.view(f"u{chunks.itemsize}")
-    for at in range(chunks.itemsize):
-        shuffled[:, at] = whole
+    shuffled[:, 0] = whole
+    for at in range(1, chunks.itemsize):
         whole >>= whole.dtype.type(8)
+        shuffled[:, at] = whole
     return shuffled
 
 
