@@ -59,9 +59,8 @@ def make(tmp_path, warm, quiet):
 
 
 @pytest.fixture
-def dice(capsys):
-    """Return dice whose seed is told, and may be set by STATION_FAULTS_SEED."""
+def dice():
+    """Return dice whose seed is told where a test fails, and may be set by STATION_FAULTS_SEED."""
     seed = int(environ.get("STATION_FAULTS_SEED", secrets.randbits(31)))
-    with capsys.disabled():
-        print(f"\n  STATION_FAULTS_SEED={seed}")
+    print(f"STATION_FAULTS_SEED={seed}")
     return random.Random(seed)  # noqa: S311 - no secret

@@ -17,6 +17,7 @@ from pathlib import Path
 
 import netCDF4
 import numpy as np
+import pytest
 
 from benchmarks.cost import family
 from station.service.journal import Journal, State
@@ -240,11 +241,22 @@ class Station:
         return looked and self.is_done(*hours) and not self.processes()[3:]
 
     def await_(self, what, within_s=PATIENCE_S):
-        """Wait until something holds."""
+        """Wait until something holds; where it never does, say what all processes are at."""
         until_s = time.monotonic() + within_s
         while not what():
-            assert time.monotonic() < until_s, self.log()[-3000:]
+            if time.monotonic() > until_s:
+                self._tell_stacks()
+                pytest.fail(f"not within {within_s:g} s, step {self.step()}:\n{self.log()[-12_000:]}")
             nap()
+
+    def _tell_stacks(self):
+        """Have each process write to the log where it is (see hooks/boundaries.py)."""
+        if self.is_alive():
+            self.limit_files(None)
+            for pid in self.processes():
+                with suppress(ProcessLookupError):
+                    os.kill(pid, signal.SIGUSR1)
+            nap(1.0)
 
     def finish(self, *hours):
         """Have an undisturbed service bring all to an end."""

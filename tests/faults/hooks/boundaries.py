@@ -16,6 +16,7 @@ moment before and the moment after each fsync, rename, link, new folder, deletio
 from __future__ import annotations
 
 import errno
+import faulthandler
 import functools
 import json
 import multiprocessing
@@ -35,7 +36,11 @@ _append = os.O_WRONLY | os.O_APPEND | os.O_CREAT | os.O_CLOEXEC
 
 
 def install():
-    """Hook into the calls that make changes last, in this process and those forked from it."""
+    """Hook into the calls that make changes last, in this process and those forked from it.
+
+    At SIGUSR1 each of them writes to stderr what its threads are at.
+    """
+    faulthandler.register(signal.SIGUSR1)
     _state["plan"] = json.loads(os.environ["FAULTS_PLAN"])
     _state["service"] = int(os.environ.setdefault("FAULTS_SERVICE", str(os.getpid())))
     for name in ("fsync", "replace", "rename", "link", "unlink", "mkdir"):
