@@ -88,7 +88,6 @@ class Gridder:
         self.number = np.full(grid.shape, -1, np.int32) if ground is None else np.array(ground.number)
         self.known = int(self.number.max()) + 1  # cells that the reference knows have the first numbers
         self.taken = self.known
-        self._met = [np.empty(0, np.int32)]  # cells that were given the numbers after these
         # Of a cell side by side, for it is they that a shot has to wait for: number of points and brightness
         # in one, heights, and their squares.
         self._sums = np.zeros((grid.nx * grid.ny, 3), np.int64)
@@ -119,7 +118,6 @@ class Gridder:
             met = cell[numbers[cell] == np.arange(len(cell))]
             numbers[met] = np.arange(self.taken, self.taken + len(met))
             self.taken += len(met)
-            self._met.append(met.astype(np.int32))
             number[new] = numbers[cell]
         return number
 
@@ -133,7 +131,7 @@ class Gridder:
 
     def beyond(self) -> Ints32:
         """Return the cells (n,) with points that no reference knows, rising."""
-        return np.sort(np.concatenate(self._met))
+        return np.flatnonzero(self.number >= self.known).astype(np.int32)
 
     def is_empty(self) -> bool:
         """Tell whether no point has come."""
