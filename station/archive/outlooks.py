@@ -1,10 +1,13 @@
 """What the scanner looks at, kept beside the store as plain arrays: inflating it took as long as measuring.
 
-Only a memory: named after all that it was made from, and where it is gone or damaged it is made anew.
+Only a memory: named after all that it was made from, and where it is gone or damaged it is made anew. One
+array after the other, each followed by its checksums; how long they are, the first of them tells. Not by the
+HDF5 library, which on a full disk leaves a file half closed and may end the process with it.
 """
 
 from __future__ import annotations
 
+import math
 import mmap
 import os
 import weakref
@@ -15,7 +18,6 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
-import h5py
 import numpy as np
 from isal import isal_zlib
 
@@ -25,11 +27,11 @@ from station.archive.reference import held_at
 from station.errors import StoreError
 from station.quantities import Ints, Reference
 from station.science import shared
-from station.science.outlook import CELLS, COUNTED, COUNTED_MOST, Outlook, Position
+from station.science.outlook import CELLS, COUNTED, COUNTED_MOST, Outlook, Position, counted
 
 ROWS = 128  # of the grid, that a checksum covers
 KEPT = 2  # at a time, of one station: a scanner that was moved may still have old scans to be done again
-DENSE = ("rise_m", "number")
+DENSE = {"rise_m": np.float32, "number": np.int32}  # on the grid
 
 Array = np.ndarray[Any, Any]
 
@@ -56,7 +58,7 @@ def kept_outlook(
         place,
         made_with,
     )
-    path = series.folder / f".outlook-{sha256(repr(told).encode()).hexdigest()[:16]}.h5"
+    path = series.folder / f".outlook-{sha256(repr(told).encode()).hexdigest()[:16]}.bin"
     if not path.is_file():
         made = look()
         if not _write(path, made):
@@ -70,21 +72,22 @@ def kept_outlook(
 def _write(path: Path, made: Outlook) -> bool:
     """Keep what was made; tell whether there was room. No fsync: checksums tell what the power took."""
     beside = path.with_name(f".{path.name}.{os.getpid()}.part")
-    dense: dict[str, Array] = {name: getattr(made, name) for name in DENSE}
+    held: dict[str, Array] = {name: getattr(made, name) for name in DENSE} | {**made.cells}
+    datum = np.float64(made.datum_m).view(np.int64)
     try:
-        with h5py.File(beside, "w") as file:
-            for name, values in (dense | dict(made.cells)).items():
-                edges = _edges(name, len(values), made.bounds)
-                held = file.create_dataset(name, data=values)
-                held.attrs["crc"] = [_crc(values[a:b]) for a, b in pairwise(edges)]
-            datum = np.float64(made.datum_m).view(np.int64)
-            file["bounds"] = frame = np.concatenate([made.bounds, made.one_in, [datum]])
-            file["bounds"].attrs["crc"] = _crc(frame)
+        with beside.open("wb") as file:
+            frame = np.concatenate([made.bounds, made.one_in, [datum]])
+            file.write(np.array([len(frame), _crc(frame)]).data)
+            file.write(frame.data)
+            for name in (*DENSE, *CELLS):
+                file.write(np.ascontiguousarray(held[name]).data)
+                edges = _edges(name, len(held[name]), made.bounds)
+                file.write(np.array([_crc(held[name][a:b]) for a, b in pairwise(edges)]).data)
         beside.replace(path)
-        kept = sorted(path.parent.glob(".outlook-*.h5"), key=lambda one: one.stat().st_mtime_ns)
+        kept = sorted(path.parent.glob(".outlook-*"), key=lambda one: one.stat().st_mtime_ns)
         for old in kept[:-KEPT]:
             old.unlink(missing_ok=True)
-    except OSError:
+    except (OSError, RuntimeError):  # the HDF5 library has both for a full disk
         return False
     finally:
         with suppress(OSError):
@@ -94,22 +97,28 @@ def _write(path: Path, made: Outlook) -> bool:
 
 def _open(path: Path, reference: Reference, position_m: Position | None, axis: Position) -> Outlook:
     kept = _Kept(path)
+    held = {}
     try:
-        with h5py.File(path, "r") as file:
-            frame = file["bounds"][:]
-            if _crc(frame) != file["bounds"].attrs["crc"]:
+        with path.open("rb") as file:
+            length, crc = _numbers(file.read(16)).tolist()
+            frame = _numbers(file.read(8 * length))
+            if _crc(frame) != crc:
                 raise _damaged(path)
             bounds, datum_m = frame[:-3], float(frame[-1:].view(np.float64)[0])
-            held = {
-                name: _Plain(path, kept, file[name], _edges(name, len(file[name]), bounds))
-                for name in file
-                if name != "bounds"
-            }
-            rise_m, number = (held.pop(name) for name in DENSE)
+            for name, dtype in (DENSE | CELLS).items():
+                shape = reference.grid.shape if name in DENSE else (_length(name, int(bounds[-1])),)
+                at = file.tell()
+                file.seek(math.prod(shape) * np.dtype(dtype).itemsize, os.SEEK_CUR)
+                edges = _edges(name, shape[0], bounds)
+                crcs = _numbers(file.read(8 * (len(edges) - 1)))
+                if len(crcs) < len(edges) - 1:
+                    raise _damaged(path)
+                held[name] = _Plain(path, kept, at, shape, np.dtype(dtype), edges, crcs)
     except FileNotFoundError:
         raise
-    except (OSError, KeyError, RuntimeError, TypeError, ValueError) as error:
+    except (OSError, ValueError, IndexError, OverflowError, MemoryError) as error:
         raise _damaged(path) from error
+    rise_m, number = (held.pop(name) for name in DENSE)
     of = shared.basis(reference.grid, position_m, axis) if position_m else None
     one_in = int(frame[-3]), int(frame[-2])
     return Outlook(reference, of, position_m, datum_m, rise_m, number, bounds, one_in, held)  # type: ignore[arg-type] # sliced only
@@ -126,15 +135,24 @@ class _Kept:
 class _Plain:
     """An array of a file, read as it is sliced; parts with a checksum of their own are held against it."""
 
-    def __init__(self, path: Path, kept: _Kept, dataset: h5py.Dataset, edges: Ints) -> None:
+    def __init__(
+        self,
+        path: Path,
+        kept: _Kept,
+        at: int,
+        shape: tuple[int, ...],
+        dtype: np.dtype[Any],
+        edges: Ints,
+        crc: Array,
+    ) -> None:
         self._path = path
         self._kept = kept
-        self._at = dataset.id.get_offset() or 0
-        self._shape = dataset.shape
-        self._dtype = dataset.dtype if dataset.dtype.kind != "b" else np.dtype(bool)
-        self._row_bytes = int(np.prod(self._shape[1:], dtype=np.int64)) * self._dtype.itemsize
+        self._at = at
+        self._shape = shape
+        self._dtype = dtype
+        self._row_bytes = math.prod(shape[1:]) * dtype.itemsize
         self._edges = edges
-        self._crc = dataset.attrs["crc"]
+        self._crc = crc
 
     def __getitem__(self, rows: slice) -> Array:
         """Return some rows."""
@@ -168,6 +186,15 @@ class _Plain:
             raise StoreError(f"{self._path}: cannot be read: {error}") from error
         values = np.frombuffer(held, self._dtype, size // self._dtype.itemsize, skipped)
         return np.asarray(values.reshape(self._shape), dtype=dtype)
+
+
+def _numbers(raw: bytes) -> Ints:
+    return np.frombuffer(raw, np.int64)
+
+
+def _length(name: str, count: int) -> int:
+    """Return how long an array is of an outlook with so many cells."""
+    return len(range(count)[counted(count)]) if name in COUNTED else count
 
 
 def _edges(name: str, rows: int, bounds: Ints) -> Ints:

@@ -123,8 +123,7 @@ class Outlook:
     @property
     def counted(self) -> slice:
         """Which cells are counted of what scans usually see."""
-        count = int(self.bounds[-1])
-        return slice(None, count, _every(count))
+        return counted(int(self.bounds[-1]))
 
     def ground(self) -> Ground:
         """Return the reference as shots look it up."""
@@ -222,7 +221,7 @@ def look(
     order = np.argsort(place, kind="stable")
     bounds = np.searchsorted(place[order], np.arange(2 * parts + 1))
     for name in cells:  # one after the other: together they are the most that a scan needs
-        cells[name] = cells[name][order[:: _every(count)] if name in COUNTED else order]
+        cells[name] = cells[name][order[counted(count)] if name in COUNTED else order]
     number = np.full(grid.shape, -1, np.int32)
     number.reshape(-1)[cells["cell"]] = np.arange(count)
     return Outlook(reference, of, position_m, below.datum_m, below.rise_m, number, bounds, one_in, cells)
@@ -286,9 +285,9 @@ def _cells(
     }
 
 
-def _every(count: int) -> int:
-    """Return of how many cells one is counted."""
-    return 1 + count // COUNTED_MOST
+def counted(count: int) -> slice:
+    """Return which of so many cells are counted."""
+    return slice(None, count, 1 + count // COUNTED_MOST)
 
 
 def _stretches(grid: Grid, position_m: Position) -> int:

@@ -1,11 +1,12 @@
 """What the scanner looks at, kept as a file: the same as made, and never in the way."""
 
+import resource
+
 import numpy as np
 import pytest
 
-from station.archive import outlooks
 from station.archive.layout import Series
-from station.archive.outlooks import kept_outlook
+from station.archive.outlooks import KEPT, kept_outlook
 from station.archive.reference import open_reference, path_of, write_reference
 from station.errors import StoreError
 from station.quantities import Grid, Reference, Scanner
@@ -70,7 +71,7 @@ def test_other_settings_or_another_reference_are_another_outlook_and_few_are_kep
     changed = made(series, calls)("a")
     assert (changed.number[:] >= 0).all()
     assert len(calls) == 3
-    assert len(files(series)) == outlooks.KEPT
+    assert len(files(series)) == KEPT
 
 
 @pytest.mark.parametrize("place", [0.01, 0.3, 0.7, 0.95])
@@ -101,22 +102,22 @@ def test_one_that_another_process_lets_go_stays_readable(series):
     same(kept, look(open_reference(series, "1"), np.zeros(GRID.shape, bool), VZ6000, PLACE[0]))
 
 
-def test_where_there_is_no_room_it_is_made_each_time(series, monkeypatch):
+def test_where_there_is_no_room_it_is_made_each_time(series):
+    """However far its file gets."""
     calls = []
     get = made(series, calls)
-
-    opened = outlooks.h5py.File
-
-    def full(path, mode):
-        if mode == "w":
-            raise OSError(28, "No space left on device")
-        return opened(path, mode)
-
     wanted = get()
-    same(wanted, wanted)
-    files(series)[0].unlink()
-    monkeypatch.setattr(outlooks.h5py, "File", full)
-    same(get(), look(open_reference(series, "1"), np.zeros(GRID.shape, bool), VZ6000, PLACE[0]))
-    assert len(calls) == 2
-    assert files(series) == []
+    (kept,) = files(series)
+    whole = kept.stat().st_size
+    kept.unlink()
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    for size in (0, 2000, *range(whole // 8, whole, whole // 8), whole - 1):
+        resource.setrlimit(resource.RLIMIT_FSIZE, (size, before[1]))
+        try:
+            found = get()
+        finally:
+            resource.setrlimit(resource.RLIMIT_FSIZE, before)
+        same(found, wanted)
+        assert files(series) == []
+    assert len(calls) == 12
     assert path_of(series, "1").is_file()

@@ -246,7 +246,8 @@ class Station:
         while not what():
             if time.monotonic() > until_s:
                 self._tell_stacks()
-                pytest.fail(f"not within {within_s:g} s, step {self.step()}:\n{self.log()[-12_000:]}")
+                lives = "alive" if self.is_alive() else "dead"
+                pytest.fail(f"{lives}, step {self.step()}, after {within_s:g} s:\n{self.log()[-12_000:]}")
             nap()
 
     def _tell_stacks(self):

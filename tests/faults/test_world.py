@@ -41,7 +41,7 @@ def test_a_disk_that_fills_up_is_waited_out(make, quiet, dice):
         station.limit_files(dice.choice([0, 4096, 20_000]))
         harness.nap(dice.uniform(0.1, 0.6))
         station.limit_files(None)
-    assert station.is_alive()
+    assert station.is_alive(), station.log()[-12_000:]
     finish(station, quiet())
 
 

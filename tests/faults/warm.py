@@ -9,6 +9,7 @@ from __future__ import annotations
 import json
 import multiprocessing.util
 import os
+import resource
 import signal
 import sys
 import traceback
@@ -74,6 +75,13 @@ def fork_instead(_, args, keep):
         os._exit(status)
 
 
+def tell_fault():
+    """Write to the log why a service ended, also where no file of it may grow."""
+    _, most = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (most, most))
+    traceback.print_exc()
+
+
 def main():
     """Take orders until there are no more."""
     import laspy  # noqa: F401
@@ -91,8 +99,10 @@ def main():
                 be_service(json.loads(line))
             except SystemExit as ended:
                 status = ended.code or 0
+                if status:
+                    tell_fault()
             except BaseException:
-                traceback.print_exc()
+                tell_fault()
                 raise
             finally:
                 os._exit(status)
