@@ -127,7 +127,10 @@ def _run_once(
             target=_work, args=(there, task, args, int(memory_gb * 2**30)), name=task.__name__, daemon=True
         )
         with there:
-            child.start()
+            try:
+                child.start()
+            except OSError as error:  # also of stderr, which is flushed first: its disk may be full
+                raise _KilledError(f"the process for it could not be started: {error}") from error
         try:
             report = _await_report(here, time.monotonic() + timeout_s, on_progress, should_stop)
             if report is None:

@@ -7,6 +7,7 @@ import signal
 import subprocess
 import sys
 import time
+from contextlib import suppress
 from pathlib import Path
 
 import pytest
@@ -58,6 +59,16 @@ def test_a_child_has_one_thread_and_the_parent_keeps_its_environment(tasks, monk
     monkeypatch.delenv("OPENBLAS_NUM_THREADS", raising=False)
     assert run(tasks.environment, "OPENBLAS_NUM_THREADS") == ("1", 1)
     assert "OPENBLAS_NUM_THREADS" not in os.environ
+
+
+def test_while_the_disk_of_the_log_is_full_work_is_put_off(tasks, monkeypatch):
+    """What waits to be written there is flushed before each child is started."""
+    with suppress(OSError), Path("/dev/full").open("w") as full, monkeypatch.context() as meanwhile:
+        full.write("a line of the log")
+        meanwhile.setattr(sys, "stderr", full)
+        with pytest.raises(NotReadyError, match=r"could not be started: .* No space left"):
+            run(tasks.add, 2, 3)
+    assert run(tasks.add, 2, 3) == 5
 
 
 @pytest.mark.parametrize("task", ["allocate", "allocate_in_numpy"])
