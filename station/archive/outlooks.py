@@ -87,7 +87,7 @@ def _write(path: Path, made: Outlook) -> bool:
         kept = sorted(path.parent.glob(".outlook-*"), key=lambda one: one.stat().st_mtime_ns)
         for old in kept[:-KEPT]:
             old.unlink(missing_ok=True)
-    except (OSError, RuntimeError):  # the HDF5 library has both for a full disk
+    except OSError:
         return False
     finally:
         with suppress(OSError):
