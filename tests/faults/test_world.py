@@ -83,11 +83,12 @@ def test_a_really_full_disk_is_waited_out(make, quiet, small_disk):
     station.start()
     station.await_(lambda: station.is_done(*ALL[:2]))
     ballast = small_disk / "ballast"
-    with ballast.open("wb") as file:  # all there is
+    with ballast.open(
+        "wb", buffering=0
+    ) as file:  # all there is; a buffer would want to be emptied at the end
         while file.tell() < 24e6:
             try:
                 file.write(bytes(100_000))
-                file.flush()
             except OSError:
                 break
     station.await_(lambda: "service=paused" in station.log())
