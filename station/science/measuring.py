@@ -98,7 +98,8 @@ def _fringes(gridder: Gridder, setup: Setup, outlook: Outlook | None) -> Iterato
 
 def _in_rows(cell: Ints32, rows: slice, grid: Grid) -> Ints32:
     """Return those of rising cells that lie in some rows."""
-    first, end = np.searchsorted(cell, (rows.start * grid.nx, rows.stop * grid.nx))
+    edges = np.array([rows.start * grid.nx, rows.stop * grid.nx], cell.dtype)  # else all cells are converted
+    first, end = np.searchsorted(cell, edges)
     return cell[first:end]
 
 
