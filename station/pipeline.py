@@ -180,7 +180,7 @@ def stable_figures(measured: Measurement, outlook: Outlook) -> dict[str, float]:
     """Return how a scan does on stable ground it was not fitted to: number of cells, median, spread, z."""
     unused = outlook.having(Trait.STABLE, Trait.WITHHELD)
     unused = unused[(measured.quality[unused] & np.uint8(Quality.STABLE_GROUND)) > 0]
-    change_m, sigma_m = (measured.cells[name][unused] for name in ("change_m", "uncertainty_m"))
+    change_m, sigma_m = measured.change_m[unused], measured.cells["uncertainty_m"][unused]
     figures = {"stable_count": float(len(change_m))}
     if len(change_m) >= FEW_STABLE:
         figures["stable_median"] = float(np.median(change_m))

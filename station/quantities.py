@@ -226,11 +226,9 @@ LAID_TOGETHER = 32  # rows: so many stay in the cache
 MEASURED = np.dtype(
     [
         ("elevation_m", np.float32),
-        ("change_m", np.float32),  # mean residual to the reference, NaN where there is none
         ("uncertainty_m", np.float32),  # of a single cell, everything included
         ("random_uncertainty_m", np.float32),  # the part of it that averages out
         ("spread_m", np.float32),  # standard deviation of the points in the cell
-        ("count", np.int32),
     ]
 )
 
@@ -244,13 +242,15 @@ class Measurement:
     """What a scan says of the surface, and how sure that is, cell by cell; all (n,).
 
     `number` (ny, nx) tells which they are: -1 where the scan saw nothing, and even the reference knows
-    nothing. `cells` holds what `MEASURED` names, NaN (or no points) where the scan saw nothing; `terms` the
-    budget of the scan's own heights term by term, where asked for.
+    nothing. `count` is the number of points; `cells` holds what `MEASURED` names, NaN where the scan saw
+    nothing; `terms` the budget of the scan's own heights term by term, where asked for.
     """
 
     grid: Grid
     number: Ints32
+    count: Ints32
     cells: NDArray[np.void]  # of MEASURED
+    change_m: Floats32  # mean residual to the reference, NaN where there is none
     quality: NDArray[np.uint8]  # bits of Quality
     terms: dict[str, Floats32]
 
@@ -261,7 +261,9 @@ class Measurement:
         cells = np.empty(number.size, MEASURED)
         for name in MEASURED.names or ():
             cells[name] = rasters.pop(name).ravel()
-        return cls(grid, number, cells, quality.ravel(), {name: one.ravel() for name, one in rasters.items()})
+        columns = {name: one.ravel() for name, one in rasters.items()}
+        count, change_m = (columns.pop(name) for name in ("count", "change_m"))
+        return cls(grid, number, count, cells, change_m, quality.ravel(), columns)
 
     def laid(
         self,
@@ -294,7 +296,7 @@ class Measurement:
 
     def _beside(self, name: str) -> NDArray[Any] | None:
         """Return a column that is not among the cells."""
-        return self.quality if name == "quality" else self.terms.get(name)
+        return getattr(self, name) if name in ("count", "change_m", "quality") else self.terms.get(name)
 
 
 @dataclass(frozen=True)

@@ -5,7 +5,7 @@ import pytest
 from benchmarks.large import decoded, large_station, measured, prepared, referenced
 
 MOST_GB = 0.65
-GROWTH = 1.12  # forty times the points see some two million more cells, whose sums take 24 bytes each
+GROWTH = 1.1  # forty times the points see some two million more cells, whose sums take 20 bytes each
 POINTS = (1_440_000, 14_400_000, 57_600_000)
 MOST_BYTES_A_CELL = 155  # of a reference in the making: 137, and 250 where scans are added as a whole
 

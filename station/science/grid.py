@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -19,8 +18,7 @@ if TYPE_CHECKING:
 # Sums are whole numbers, of 2^-20 m (and m²), so that the order in which points come cannot matter.
 QUANTUM = 2.0**20
 BRIGHTEST = 65535.0  # intensity is of 16 bits
-BITS = 40  # of a number, in which brightness is summed up; the others count
-ONE = 1 << BITS
+LIT_MOST = 65537  # points in a cell, whose brightness 32 bits can sum up
 STEP_MOST = 6.0  # sigmas: beyond, something happened
 CLASS_STEPS = 10.0  # what the class of a cell weighs against the steps from scan to scan of its own
 ROUGHNESS_CELLS = 1.0  # one sigma of the neighbourhood that tells how rough a cell is
@@ -30,18 +28,14 @@ ROUGHNESS_CELLS = 1.0  # one sigma of the neighbourhood that tells how rough a c
 class Sums:
     """What the points of cells amount to, (ny, nx) each."""
 
-    tally: Ints  # number of points, and below `BITS` their brightness
-    residual: Ints
-    square: Ints
-
-    @cached_property
-    def count(self) -> Ints32:
-        """Points in each cell (ny, nx)."""
-        return (self.tally >> BITS).astype(np.int32)
+    count: Ints32
+    moments: Ints  # (ny, nx, 2): their residuals, and the squares of these
+    bright: NDArray[np.uint32] | None  # None where nothing tells of any
 
     def some(self, chosen: Ints) -> Sums:
-        """Return those of the chosen cells (n,)."""
-        return Sums(self.tally.take(chosen), self.residual.take(chosen), self.square.take(chosen))
+        """Return a copy of those of the chosen cells (n,)."""
+        bright = None if self.bright is None else self.bright.take(chosen)
+        return Sums(self.count.take(chosen), self.moments.take(chosen, axis=0), bright)
 
     def mean_residual(self) -> Floats:
         """Mean height above reference or datum (ny, nx) [m], NaN in empty cells.
@@ -49,23 +43,23 @@ class Sums:
         Source: Hartzell et al. (2015), Eq. 11, of residuals (EQUATIONS 6.5).
         """
         with np.errstate(invalid="ignore"):
-            return np.asarray(self.residual / (self.count * QUANTUM))
+            return np.asarray(self.moments[..., 0] / (self.count * QUANTUM))
 
     def intensity(self) -> Floats32:
-        """Mean brightness of each cell (ny, nx), 0-1, NaN in empty cells and in scans that do not tell."""
-        brightness = self.tally & (ONE - 1)
-        bright = np.full(brightness.shape, np.nan, np.float32)
-        whole = self.count * BRIGHTEST
-        np.divide(brightness, whole, out=bright, where=brightness > 0, casting="same_kind")
-        return bright
+        """Mean brightness of each cell (ny, nx), 0-1, NaN where nothing tells, or of more than `LIT_MOST`."""
+        mean = np.full(self.count.shape, np.nan, np.float32)
+        if self.bright is not None:
+            told = (self.bright > 0) & (self.count <= LIT_MOST)
+            np.divide(self.bright, self.count * BRIGHTEST, out=mean, where=told, casting="same_kind")
+        return mean
 
     def spread(self) -> Floats32:
         """Standard deviation of the points in each cell (ny, nx) [m], NaN for fewer than two."""
-        spread_m = np.full(self.tally.shape, np.nan, np.float32)
-        several = np.flatnonzero(self.tally >= 2 * ONE)
-        count = (self.tally.take(several) >> BITS).astype(np.float64)
-        mean_square = (self.residual.take(several) / QUANTUM) ** 2 / count
-        centred = self.square.take(several) / QUANTUM - mean_square
+        spread_m = np.full(self.count.shape, np.nan, np.float32)
+        several = np.flatnonzero(self.count >= 2)
+        count = self.count.take(several).astype(np.float64)
+        residual, square = self.moments.reshape(-1, 2).take(several, axis=0).T / QUANTUM
+        centred = square - residual**2 / count
         spread_m.reshape(-1)[several] = np.sqrt(np.maximum(centred, 0.0) / (count - 1))
         return spread_m
 
@@ -88,10 +82,12 @@ class Gridder:
         self.number = np.full(grid.shape, -1, np.int32) if ground is None else np.array(ground.number)
         self.known = int(self.number.max()) + 1  # cells that the reference knows have the first numbers
         self.taken = self.known
-        # Of a cell side by side, for it is they that a shot has to wait for: number of points and brightness
-        # in one, heights, and their squares.
-        self._sums = np.zeros((grid.nx * grid.ny, 3), np.int64)
-        self._empty = True
+        cells = grid.nx * grid.ny
+        self._count = np.zeros(cells, np.int32)
+        self._moments = np.zeros((cells, 2), np.int64)
+        self._bright = np.zeros(cells, np.uint32)
+        self._lit = cells if ground is None else self.known  # it is of no use beyond what can be compared
+        self._is_lit = False
 
     def cells(self, x_m: Floats, y_m: Floats) -> tuple[Ints | slice, Floats, Floats]:
         """Which points (n,) lie on the grid, and their column and row, in fractions of cells.
@@ -131,11 +127,16 @@ class Gridder:
 
     def beyond(self) -> Ints32:
         """Return the cells (n,) with points that no reference knows, rising."""
-        return np.flatnonzero(self.number >= self.known).astype(np.int32)
+        cell, first = np.empty(self.taken - self.known, np.int32), 0
+        for rows in bands(self.grid.ny):
+            found = np.flatnonzero(self.number[rows] >= self.known)
+            cell[first : first + len(found)] = found + rows.start * self.grid.nx
+            first += len(found)
+        return cell
 
     def is_empty(self) -> bool:
         """Tell whether no point has come."""
-        return self._empty
+        return not self.count.any()
 
     def complete(self) -> None:
         """No more points come: let the ground go that only they need."""
@@ -143,35 +144,50 @@ class Gridder:
 
     def add(self, number: Ints32, residual_m: Floats, intensity: Floats | None) -> None:
         """Add points (n,): number of their cell, height above reference or datum, and brightness, 0-1."""
-        self._empty &= not len(number)
-        sums = self._sums.reshape(-1)
+        at = number.astype(np.intp)
+        np.add.at(self._count, at, np.int32(1))
+        if intensity is not None:
+            self._is_lit = True
+            lit = np.flatnonzero(at < self._lit)
+            np.add.at(self._bright, at[lit], np.rint(intensity[lit] * BRIGHTEST).astype(np.uint32))
+        at *= 2
+        moments = self._moments.reshape(-1)
         steps = np.rint(residual_m * QUANTUM)
-        at = np.multiply(number, 3, dtype=np.int64)
-        tally = ONE if intensity is None else ONE + np.rint(intensity * BRIGHTEST).astype(np.int64)
         squares = np.rint(steps * steps * (1 / QUANTUM))
-        np.add.at(sums, at, tally)
-        np.add.at(sums[1:], at, steps.astype(np.int64))
-        np.add.at(sums[2:], at, squares.astype(np.int64))
+        np.add.at(moments, at, steps.astype(np.int64))
+        np.add.at(moments[1:], at, squares.astype(np.int64))
+
+    @property
+    def count(self) -> Ints32:
+        """Number of points by number of the cell (n,)."""
+        return self._count[: self.taken]
 
     def sums(self, first: int, end: int) -> Sums:
-        """Take a copy of the cells with some numbers."""
-        return Sums(*np.ascontiguousarray(self._sums[first:end].T))
+        """Look at the cells that the reference knows with some numbers."""
+        bright = self._bright[first:end] if self._is_lit else None
+        return Sums(self._count[first:end], self._moments[first:end], bright)
 
     def at(self, number: Ints32) -> Sums:
-        """Take a copy of cells (n,) by their numbers."""
-        return Sums(*np.ascontiguousarray(self._sums.take(number, axis=0).T))
+        """Take a copy of cells (n,) by their numbers; not of their brightness."""
+        return Sums(self._count.take(number), self._moments.take(number, axis=0), None)
 
     def rasters(self, rows: slice = slice(None)) -> Sums:
         """Lay out a copy of all sums on some rows of the grid, or all, (r, nx) each."""
         number = self.number[rows]
-        laid = np.zeros((3, *number.shape), np.int64)
-        there = number >= 0
-        laid[:, there] = self._sums.take(number[there], axis=0).T
-        return Sums(*laid)
+        there = np.flatnonzero(number >= 0)
+        told = self.at(number.reshape(-1).take(there))
+        count, moments = np.zeros(number.shape, np.int32), np.zeros((*number.shape, 2), np.int64)
+        count.reshape(-1)[there], moments.reshape(-1, 2)[there] = told.count, told.moments
+        bright = None
+        if self._is_lit:
+            bright, lit = np.zeros(number.shape, np.uint32), (number >= 0) & (number < self._lit)
+            bright[lit] = self._bright.take(number[lit])
+        return Sums(count, moments, bright)
 
-    def memory(self) -> NDArray[np.uint8]:
-        """Give the sums away, all that there is of each cell in turn, to be overwritten once read."""
-        return self._sums[: self.taken].reshape(-1).view(np.uint8)
+    def memory(self) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
+        """Give moments and brightness away, 16 and 4 bytes of each cell in turn, overwritten once read."""
+        moments, bright = self._moments[: self.taken], self._bright[: self.taken]
+        return moments.reshape(-1).view(np.uint8), bright.view(np.uint8)
 
 
 class Stack:

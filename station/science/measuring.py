@@ -38,8 +38,10 @@ def measured(gridder: Gridder, outlook: Outlook | None, judge: Judge) -> Measure
     """Measure the cells of a scan, in the memory of its sums."""
     setup = judge.setup
     names = budget.TERMS if setup.published_budget else (*budget.TERMS, *budget.PUBLISHED)
+    in_place, beside = gridder.memory()
     made = _Made(
-        gridder.memory().view(MEASURED),
+        in_place.view(MEASURED),
+        beside.view(np.float32),
         np.zeros(gridder.taken, np.uint8),
         {
             name: np.full(gridder.taken, np.nan, np.float32)
@@ -60,7 +62,9 @@ def measured(gridder: Gridder, outlook: Outlook | None, judge: Judge) -> Measure
     for fringe in _fringes(gridder, setup, outlook):
         sums = gridder.at(fringe.number)
         made.put(fringe.number, sums, judge.beyond(fringe, sums, gridder.datum_m))
-    return Measurement(setup.grid, gridder.number, made.cells, made.quality, made.terms)
+    return Measurement(
+        setup.grid, gridder.number, gridder.count, made.cells, made.change_m, made.quality, made.terms
+    )
 
 
 @dataclass(frozen=True)
@@ -174,20 +178,22 @@ def _as_one(cells: NDArray[np.void]) -> NDArray[np.void]:
 
 @dataclass(frozen=True)
 class _Made:
-    """Where the columns of a measurement come to be; `cells` in the memory of its sums."""
+    """Where the columns of a measurement come to be; `cells` and `change_m` in the memory of its sums."""
 
     cells: NDArray[np.void]
+    change_m: Floats32
     quality: NDArray[np.uint8]
     terms: dict[str, Floats32]
     min_points: int
 
     def clear(self, number: Ints) -> None:
         """Say that cells (m,) hold nothing."""
-        nothing = np.array((np.nan,) * 5 + (0,), MEASURED)
+        nothing = np.array((np.nan,) * 4, MEASURED)
         _as_one(self.cells)[number] = _as_one(nothing)
+        self.change_m[number] = np.nan
 
     def put(self, number: Ints | Ints32, sums: Sums, told: _Judged) -> None:
-        """Lay down cells (m,); of those with too few points no more than number and spread."""
+        """Lay down cells (m,); of those with too few points no more than the spread."""
         enough = sums.count >= self.min_points
         few = np.flatnonzero(~enough)
         cells = np.empty(len(number), MEASURED)
@@ -195,14 +201,14 @@ class _Made:
         kept_m *= KEPT_M
         for name, values in (
             ("elevation_m", kept_m),
-            ("change_m", told.change_m),
             ("uncertainty_m", told.sigma_m),
             ("random_uncertainty_m", told.random_m),
         ):
             cells[name] = values
             cells[name][few] = np.nan
-        cells["spread_m"], cells["count"] = sums.spread(), sums.count
+        cells["spread_m"] = sums.spread()
         _as_one(self.cells)[number] = _as_one(cells)
+        self.change_m[number] = np.where(enough, told.change_m, np.nan)
         self.quality[number] = np.where(enough, told.flags, 0)
         for name, values in told.terms.items():
             self.terms[name][number[enough]] = values[enough]

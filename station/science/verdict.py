@@ -121,7 +121,7 @@ def misfit(measured: Measurement, stable: Ints) -> list[str]:
     `stable` (m,) are the numbers of its cells. Half of them are off by more than the figure told, either way.
     """
     some = stable[:: 1 + len(stable) // STABLE_MOST]
-    change_m, sigma_m = (measured.cells[name][some] for name in ("change_m", "uncertainty_m"))
+    change_m, sigma_m = measured.change_m[some], measured.cells["uncertainty_m"][some]
     seen = np.isfinite(change_m)
     if np.count_nonzero(seen) < FEWEST_STABLE:
         return []
@@ -149,7 +149,7 @@ def judge(
     fatal = [f"flagged: {flag}"] if flag else []
     reasons = list(lacking)
     if outlook is not None and outlook.of is not None:
-        told = view(measured.cells["count"], outlook)
+        told = view(measured.count, outlook)
         (fatal if told.share < BLIND else reasons).extend(hidden(told))
     if found is not None and outlook is not None:
         reasons += distrust(found, outlook.reference.habits)

@@ -404,7 +404,7 @@ def _numbers(measured: Measurement, gathered: Gathered, points: int) -> dict[str
     lean, setup = gathered.lean, gathered.setup
     told = {
         "point_total": float(points),
-        "coverage": float(np.count_nonzero(measured.cells["count"]) / measured.number.size),
+        "coverage": float(np.count_nonzero(measured.count) / measured.number.size),
     }
     if setup.position_m is not None:
         told |= dict(zip(("scanner_east", "scanner_north", "scanner_height"), setup.position_m, strict=True))
@@ -433,7 +433,7 @@ def _figures(epoch: store.Epoch, seconds: float) -> dict[str, float | str]:
         "cells": round(epoch.numbers["coverage"] * measured.number.size),
     }
     part = slice(None, None, 1 + len(measured.cells) // CELLS_MOST)
-    change_m, sigma_m = (measured.cells[name][part] for name in ("change_m", "uncertainty_m"))
+    change_m, sigma_m = measured.change_m[part], measured.cells["uncertainty_m"][part]
     seen = np.isfinite(sigma_m)
     if seen.any():
         told["sigma_median_m"] = round(float(np.median(sigma_m[seen])), 4)

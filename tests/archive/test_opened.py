@@ -30,7 +30,7 @@ def stored(series, epoch):
     for hour in (1, 2, 3, 5, 30, 31):
         made = epoch(hour, terms=hour != 30)
         cells, number = made.measurement.cells, made.measurement.number
-        cells["change_m"][number[:60, 10:20]] = np.nan
+        made.measurement.change_m[number[:60, 10:20]] = np.nan
         cells["elevation_m"] = np.nan  # a variable without any chunk
         write_epoch(series, made)
     join_closed(series, datetime(2025, 11, 22, 12, tzinfo=UTC), lambda: None)

@@ -101,7 +101,7 @@ def test_what_does_not_fit_is_a_mean_with_its_sigma(series, last, small, pixels)
 def test_an_epoch_that_is_written_looks_as_it_will_in_the_store(series, small, pixels):
     epoch = small.make_epoch(11)
     number = epoch.measurement.number[21, 33]
-    epoch.measurement.cells["change_m"][number] = np.nan  # points, but no change
+    epoch.measurement.change_m[number] = np.nan  # points, but no change
     base = base_of(series, "1", pixels)
     looking = Looking(base, points=True)
     written = store.write_epoch(series, epoch, seen=looking.add)

@@ -20,12 +20,14 @@ def scatter(seed=0, count=500):
     return x_m, y_m, rng.normal(3000, 0.5, count)
 
 
-def gridded(points, reference=None, splits=()):
+def gridded(points, reference=None, splits=(), brightness=None):
     gridder = Gridder(GRID, reference, 3000.0)
-    for x_m, y_m, z_m in zip(*(np.split(axis, splits) for axis in points), strict=True):
+    parts = [np.split(axis, splits) for axis in points]
+    lit = [None] * len(parts[0]) if brightness is None else np.split(brightness, splits)
+    for x_m, y_m, z_m, bright in zip(*parts, lit, strict=True):
         inside, column, row = gridder.cells(x_m, y_m)
-        z_m = z_m[inside]  # noqa: PLW2901 - only what lies on the grid
-        gridder.add(gridder.numbered(column, row), z_m - gridder.datum_m, None)
+        heights_m = z_m[inside] - gridder.datum_m
+        gridder.add(gridder.numbered(column, row), heights_m, None if bright is None else bright[inside])
     return gridder
 
 
@@ -43,12 +45,40 @@ def test_mean_count_and_spread_against_plain_loops():
                 assert sums.spread()[row, column] == pytest.approx(heights.std(ddof=1), abs=1e-4)
 
 
+def test_mean_brightness_against_plain_loops():
+    x_m, y_m, z_m = scatter(seed=2)
+    bright = np.random.default_rng(3).integers(1, 65536, len(x_m)) / 65535
+    told = gridded((x_m, y_m, z_m), brightness=bright).rasters().intensity()
+    assert np.isnan(gridded((x_m, y_m, z_m)).rasters().intensity()).all()
+    for row, column in np.ndindex(GRID.shape):
+        north, west = GRID.north_m - row * GRID.cell_m, GRID.west_m + column * GRID.cell_m
+        inside = (x_m >= west) & (x_m < west + 2.5) & (y_m <= north) & (y_m > north - 2.5)
+        assert told[row, column] == pytest.approx(bright[inside].mean(), rel=1e-6)
+
+
+@pytest.mark.parametrize(("count", "mean"), [(65_537, 1.0), (65_538, np.nan)])
+def test_brightness_is_told_as_far_as_its_sum_holds_it(count, mean):
+    points = np.full(count, 101.0), np.full(count, 249.0), np.full(count, 3000.0)
+    sums = gridded(points, brightness=np.ones(count)).rasters()
+    assert sums.count[0, 0] == count
+    assert sums.intensity()[0, 0] == pytest.approx(mean, nan_ok=True)
+
+
+def test_beyond_the_reference_brightness_tells_nothing():
+    elevation_m = np.where(np.arange(GRID.nx) < 4, 3000.0, np.nan) * np.ones((GRID.ny, 1))
+    known = ground(Reference.given(GRID, "1", elevation_m))
+    sums = gridded(scatter(seed=4), known, brightness=np.full(500, 0.5)).rasters()
+    assert (sums.count > 0).all()
+    assert sums.intensity()[:, :4] == pytest.approx(0.5, rel=1e-4)
+    assert np.isnan(sums.intensity()[:, 4:]).all()
+
+
 @settings(max_examples=50, deadline=None)
 @given(st.permutations(range(60)), st.lists(st.integers(0, 60), max_size=5))
 def test_order_and_blocks_change_nothing_at_all(order, splits):
-    points = np.array(scatter(seed=1, count=60))
-    plain = gridded(points).rasters()
-    mixed = gridded(points[:, order], splits=sorted(splits)).rasters()
+    points, bright = np.array(scatter(seed=1, count=60)), np.linspace(0.1, 0.9, 60)
+    plain = gridded(points, brightness=bright).rasters()
+    mixed = gridded(points[:, order], splits=sorted(splits), brightness=bright[order]).rasters()
     assert np.array_equal(plain.mean_residual(), mixed.mean_residual(), equal_nan=True)
     assert np.array_equal(plain.spread(), mixed.spread(), equal_nan=True)
     assert np.array_equal(plain.intensity(), mixed.intensity(), equal_nan=True)

@@ -104,9 +104,9 @@ def measured(change_m, sigma_m, seen, outlook):
     number = np.full(GRID.shape, -1, np.int32)
     number.ravel()[cell] = np.arange(len(cell))
     cells = np.zeros(len(cell), MEASURED)
-    cells["change_m"] = np.where(seen, change_m, np.nan).ravel()[cell]
-    cells["uncertainty_m"], cells["count"] = sigma_m, seen.ravel()[cell]
-    return Measurement(GRID, number, cells, np.zeros(len(cell), np.uint8), {})
+    cells["uncertainty_m"] = sigma_m
+    count, there_m = seen.ravel()[cell].astype(np.int32), np.where(seen, change_m, np.nan).ravel()[cell]
+    return Measurement(GRID, number, count, cells, there_m, np.zeros(len(cell), np.uint8), {})
 
 
 def of_scans():
