@@ -9,6 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 
 from station.quantities import Bools, Floats, Habits
 
@@ -25,6 +26,7 @@ BESIDE = 3  # scans on either side of a step, that tell how sharp it is: a place
 QUIET = 1.5  # sigmas of one scan's noise; less between medians of scans is not worth a closer look
 BEYOND = 0.5  # of its size, where a scan is taken to lie on its far side
 ROUNDS = 5
+CLOSER = SIGMAS / 2  # at first sight, for the other rounds, which change it by a tenth
 CAUCHY = 2.385  # 95 % efficient for normal errors
 
 
@@ -53,87 +55,112 @@ def steps(time_s: Floats, pose: Floats, habit: Floats) -> list[Step]:
     `habit` (p,) is what a pose differs by from scan to scan, as thought beforehand. A step that was told is
     taken off before the next is looked for, so that it is told once.
     """
+    if len(pose) < FEWEST:
+        return []
     level = pose.astype(np.float64).copy()
     told: list[Step] = []
-    drifts: dict[int, _Drift] = {}  # by the scan they are known up to: three newest scans ask for each
+    drift = _drifts(time_s, level, habit)
+    apart = _steps_apart(level)
     for newest in range(FEWEST - 1, len(level)):
         since = told[-1].last_before + 1 if told else 0
-        found = _step_at(time_s[: newest + 1], level[: newest + 1], habit, since, drifts)
+        found = _step_at(time_s[: newest + 1], level[: newest + 1], since, drift, apart[:, newest])
         if found is not None:
             told.append(found)
             level[found.last_before + 1 :] -= found.size
-            drifts.clear()
+            drift, apart = _drifts(time_s, level, habit), _steps_apart(level)
     return told
 
 
-def _step_at(
-    time_s: Floats, level: Floats, habit: Floats, since: int, drifts: dict[int, _Drift]
-) -> Step | None:
+def _step_at(time_s: Floats, level: Floats, since: int, drifts: _Drift, apart: Floats) -> Step | None:
     """Return the sharpest of the significant steps after which just scans enough have come, if any.
 
-    `drifts` are those found before, by the last scan that each was learned from.
+    `drifts` are those known at each scan, `apart` (a, p) is what the newest scans lie beyond those before.
     """
     newest = len(level) - 1
     found: list[Step] = []
-    for after in range(AFTER[0], AFTER[1] + 1):
-        first = max(newest - after - BEFORE + 1, 0)
-        if newest - after < since:
+    for after, beyond in zip(range(AFTER[0], AFTER[1] + 1), apart, strict=True):
+        last = newest - after
+        drift = drifts.at(last)
+        if last < since or np.all(beyond**2 < QUIET**2 * drift.noise):
             continue
-        known = slice(max(newest - after + 1 - HISTORY, 0), newest - after + 1)
-        if newest - after not in drifts:
-            drifts[newest - after] = _drift(time_s[known], level[known], habit)
-        drift = drifts[newest - after]
-        apart = _median(level[newest - after + 1 :]) - _median(level[known][-LATELY:])
-        if np.all(apart**2 < QUIET**2 * drift.noise):
-            continue
-        window = slice(first, newest + 1)
-        later = np.arange(first, newest + 1) > newest - after
-        size, sigma, lasts = _fit(time_s[window], level[window], later, drift)
+        first = max(last - BEFORE + 1, 0)
+        later = np.arange(first, newest + 1) > last
+        size, sigma, lasts = _fit(time_s[first:], level[first:], later, drift)
         sigmas = float(np.max(np.where(lasts, np.abs(size) / sigma, 0.0)))
         if sigmas > SIGMAS:
-            found.append(Step(newest - after, newest, size, sigma, sigmas))
+            found.append(Step(last, newest, size, sigma, sigmas))
     if not found:
         return None
-    noise = drifts[found[-1].last_before].noise  # one for all, of the scans before any of these places
+    noise = drifts.at(found[-1].last_before).noise  # one for all, of the scans before any of these places
     return max(found, key=lambda step: _contrast(level, step.last_before, noise))
+
+
+def _steps_apart(level: Floats) -> Floats:
+    """How far the newest scans lie beyond those before (a, n, p): at each scan, some of them."""
+    before = _medians(level, LATELY)
+    return np.stack(
+        [
+            _medians(level, after) - np.concatenate([before[:1].repeat(after, axis=0), before[:-after]])
+            for after in range(AFTER[0], AFTER[1] + 1)
+        ]
+    )
 
 
 def _contrast(level: Floats, last_before: int, noise: Floats) -> float:
     """How much the poses (n, p) right after a scan differ from those up to it; one outlier does not count."""
     before, after = level[: last_before + 1][-BESIDE:], level[last_before + 1 :][:BESIDE]
-    return float(((_median(after) - _median(before)) ** 2 / noise).sum())
+    return float(((np.median(after, axis=0) - np.median(before, axis=0)) ** 2 / noise).sum())
 
 
 @dataclass(frozen=True)
 class _Drift:
-    """How a pose moves (p,): variance it gains by the second, of its noise, between odd and even scans."""
+    """How a pose moves (p,): variance it gains by the second, of its noise, between odd and even scans.
+
+    Or (n, p), as known at each of some scans.
+    """
 
     walk: Floats
     noise: Floats
     odd_even: Floats
 
+    def at(self, scan: int) -> _Drift:
+        """What is known at one scan."""
+        return _Drift(self.walk[scan], self.noise[scan], self.odd_even[scan])
 
-def _drift(time_s: Floats, level: Floats, habit: Floats) -> _Drift:
-    """Learn how a pose moves from the median differences over several lags, which outliers leave alone."""
-    lags = [lag for lag in LAGS if lag < len(level) / 2]
+
+def _drifts(time_s: Floats, level: Floats, habit: Floats) -> _Drift:
+    """Learn how a pose moves from the median differences over several lags, which outliers leave alone.
+
+    At each scan from those up to it: it means something from the longest lag on.
+    """
     both = np.column_stack([level, time_s])
-    apart = np.stack([_median(np.abs(both[lag:] - both[:-lag])) for lag in lags])
-    apart_s, found = apart[:, -1], (1.4826 * apart[:, :-1]) ** 2
-    design = np.stack([apart_s / apart_s[0], np.full(len(lags), 2.0)], axis=-1)
-    walk, noise = np.linalg.solve(design.T @ design, design.T @ found)
-    scans = len(level)
-    worth = HABITS_WORTH / (scans + HABITS_WORTH)
-    walk = np.clip(walk, 0.02 * found[0], found[0]) * (1 - worth) + habit**2 * worth
-    noise = np.maximum(noise, 0.1 * found[0]) * (1 - worth) + habit**2 * worth
-    one_apart = _median(np.abs(np.diff(level, axis=0)))
-    return _Drift(walk / apart_s[0], noise, one_apart**2 + noise)
+    apart = np.stack([_over_lag(both, lag) for lag in LAGS], axis=1)  # (n, lags, p + 1)
+    apart_s, found = apart[..., -1], (1.4826 * apart[..., :-1]) ** 2
+    design = np.stack([apart_s / apart_s[:, :1], np.full(apart_s.shape, 2.0)], axis=-1)
+    turned = design.swapaxes(1, 2)
+    walk, noise = np.linalg.solve(turned @ design, turned @ found).swapaxes(0, 1)
+    worth = HABITS_WORTH / (np.minimum(np.arange(len(level)) + 1, HISTORY) + HABITS_WORTH)[:, None]
+    walk = np.clip(walk, 0.02 * found[:, 0], found[:, 0]) * (1 - worth) + habit**2 * worth
+    noise = np.maximum(noise, 0.1 * found[:, 0]) * (1 - worth) + habit**2 * worth
+    return _Drift(walk / apart_s[:, :1], noise, _over_lag(level, 1) ** 2 + noise)
 
 
-def _median(values: Floats) -> Floats:
-    """Median over the first axis: of so few values, numpy's own takes several times as long."""
-    half, rest = divmod(len(values), 2)
-    parted = np.partition(values, half if rest else (half - 1, half), axis=0)
-    return np.asarray(parted[half] if rest else (parted[half - 1] + parted[half]) / 2)
+def _over_lag(values: Floats, lag: int) -> Floats:
+    """Median difference over a lag of the last `HISTORY` scans (n, q), at each scan."""
+    apart = np.abs(values[lag:] - values[:-lag])
+    return np.concatenate([apart[:1].repeat(lag, axis=0), _medians(apart, HISTORY - lag)])
+
+
+def _medians(values: Floats, most: int) -> Floats:
+    """Median of each row (n, q) and those before it, as many as there are up to `most` together.
+
+    By sorting them all at once: numpy's own takes several times as long for each of so few values.
+    """
+    padded = np.concatenate([np.full((most - 1, values.shape[1]), np.nan), values])  # which sorting puts last
+    ordered = np.sort(sliding_window_view(padded, most, axis=0), axis=-1)
+    count = np.minimum(np.arange(len(values)) + 1, most)[:, None, None]
+    middle = [np.take_along_axis(ordered, at, axis=-1)[..., 0] for at in ((count - 1) // 2, count // 2)]
+    return np.asarray((middle[0] + middle[1]) / 2)
 
 
 def _fit(time_s: Floats, level: Floats, later: Bools, drift: _Drift) -> tuple[Floats, Floats, Bools]:
@@ -157,6 +184,8 @@ def _fit(time_s: Floats, level: Floats, later: Bools, drift: _Drift) -> tuple[Fl
         weight = np.linalg.inv(walked + own[:, :, None] * np.eye(len(level)))
         covariance = np.linalg.inv(design.T @ weight @ design + prior)
         estimate = (covariance @ (design.T @ (weight @ level.T[:, :, None])))[:, :, 0]
+        if np.all(np.abs(estimate[:, 1]) < CLOSER * np.sqrt(covariance[:, 1, 1])):
+            break
         left = (level.T - estimate @ design.T)[:, :, None]
         own = np.maximum(noise, (own * (weight @ left)[:, :, 0]) ** 2 / CAUCHY**2)  # without the walk
     size = estimate[:, 1]
