@@ -50,7 +50,7 @@ def kept_outlook(
     status = held_at(series, reference.version).stat()
     told = (
         __version__,
-        [*CELLS],
+        [(name, np.dtype(kind).str) for name, kind in (DENSE | CELLS).items()],
         COUNTED_MOST,
         reference.version,
         status.st_size,
@@ -118,7 +118,7 @@ def _open(path: Path, reference: Reference, position_m: Position | None, axis: P
         raise
     except (OSError, ValueError, IndexError, OverflowError, MemoryError) as error:
         raise _damaged(path) from error
-    rise_m, number = (held.pop(name) for name in DENSE)
+    rise_m, number = held.pop("rise_m"), held.pop("number")
     of = shared.basis(reference.grid, position_m, axis) if position_m else None
     one_in = int(frame[-3]), int(frame[-2])
     return Outlook(reference, of, position_m, datum_m, rise_m, number, bounds, one_in, held)  # type: ignore[arg-type] # sliced only

@@ -5,6 +5,7 @@ import resource
 import numpy as np
 import pytest
 
+from station.archive import outlooks
 from station.archive.layout import Series
 from station.archive.outlooks import KEPT, kept_outlook
 from station.archive.reference import open_reference, path_of, write_reference
@@ -60,6 +61,17 @@ def test_what_is_kept_is_what_was_made_and_is_made_once(series):
     same(kept, get())
     assert len(calls) == 1
     assert len(files(series)) == 1
+
+
+@pytest.mark.parametrize("name", ["DENSE", "CELLS"])
+def test_arrays_in_another_order_are_another_outlook(series, monkeypatch, name):
+    calls = []
+    get = made(series, calls)
+    get()
+    turned = dict(reversed(getattr(outlooks, name).items()))
+    monkeypatch.setattr(outlooks, name, turned)
+    same(get(), look(open_reference(series, "1"), np.zeros(GRID.shape, bool), VZ6000, PLACE[0]))
+    assert len(calls) == 2
 
 
 def test_other_settings_or_another_reference_are_another_outlook_and_few_are_kept(series):
