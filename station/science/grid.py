@@ -86,7 +86,7 @@ class Gridder:
         self._count = np.zeros(cells, np.int32)
         self._moments = np.zeros((cells, 2), np.int64)
         self._bright = np.zeros(cells, np.uint32)
-        self._lit = cells if ground is None else self.known  # it is of no use beyond what can be compared
+        self._compared = cells if ground is None else self.known  # brightness is of no use in the others
         self._is_lit = False
 
     def cells(self, x_m: Floats, y_m: Floats) -> tuple[Ints | slice, Floats, Floats]:
@@ -148,7 +148,7 @@ class Gridder:
         np.add.at(self._count, at, np.int32(1))
         if intensity is not None:
             self._is_lit = True
-            lit = np.flatnonzero(at < self._lit)
+            lit = np.flatnonzero(at < self._compared)
             np.add.at(self._bright, at[lit], np.rint(intensity[lit] * BRIGHTEST).astype(np.uint32))
         at *= 2
         moments = self._moments.reshape(-1)
@@ -163,7 +163,7 @@ class Gridder:
         return self._count[: self.taken]
 
     def sums(self, first: int, end: int) -> Sums:
-        """Look at the cells that the reference knows with some numbers."""
+        """Look at the cells that the reference knows with some numbers, until their memory is given away."""
         bright = self._bright[first:end] if self._is_lit else None
         return Sums(self._count[first:end], self._moments[first:end], bright)
 
@@ -180,7 +180,7 @@ class Gridder:
         count.reshape(-1)[there], moments.reshape(-1, 2)[there] = told.count, told.moments
         bright = None
         if self._is_lit:
-            bright, lit = np.zeros(number.shape, np.uint32), (number >= 0) & (number < self._lit)
+            bright, lit = np.zeros(number.shape, np.uint32), (number >= 0) & (number < self._compared)
             bright[lit] = self._bright.take(number[lit])
         return Sums(count, moments, bright)
 

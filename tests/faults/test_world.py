@@ -83,9 +83,8 @@ def test_a_really_full_disk_is_waited_out(make, quiet, small_disk):
     station.start()
     station.await_(lambda: station.is_done(*ALL[:2]))
     ballast = small_disk / "ballast"
-    with ballast.open(
-        "wb", buffering=0
-    ) as file:  # all there is; a buffer would want to be emptied at the end
+    # All there is, without a buffer: that would want to be emptied at the end.
+    with ballast.open("wb", buffering=0) as file:
         while file.tell() < 24e6:
             try:
                 file.write(bytes(100_000))
