@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from station.quantities import Habits
+from station.science import motion
 from station.science.motion import steps, usual
 
 HABIT = usual(Habits())
@@ -27,6 +28,22 @@ def restless(seed, scans=120, *, walk=26.0, noise=20.0, odd_even=58.0, wrong=0.0
 
 def times(pose):
     return HOUR * np.arange(len(pose))
+
+
+@pytest.mark.parametrize("most", [1, 6, 7, 40])
+def test_running_medians_against_plain_loops(most):
+    values = restless(3, 30)
+    told = [np.median(values[max(last - most + 1, 0) : last + 1], axis=0) for last in range(len(values))]
+    assert motion._medians(values, most) == pytest.approx(np.array(told), rel=1e-12)
+
+
+def test_drift_and_noise_are_learned_as_they_are():
+    """Of a long series, where habits hardly count; between odd and even scans one more noise."""
+    pose = restless(4, 4000, walk=26.0, noise=20.0, odd_even=58.0, wrong=0.02)[:, :3]
+    learned = motion._drifts(times(pose), pose, np.full(3, 30 * URAD))
+    walk, noise = (np.median(one[500:], axis=0) for one in (learned.walk * HOUR, learned.noise))
+    assert np.sqrt(walk) / URAD == pytest.approx(26.0, rel=0.2)
+    assert np.sqrt(noise) / URAD == pytest.approx(20.0, rel=0.25)
 
 
 def test_no_alarm_from_drift_zigzag_and_single_wrong_scans():
