@@ -1,1 +1,1 @@
-"""What the station reaches, measured: accuracy against simulated truth, and time as ratios."""
+"""Benchmarks: accuracy against simulated truth, and cost as ratios to decoding a scan."""

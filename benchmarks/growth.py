@@ -1,54 +1,65 @@
-"""What a scan costs at the store's side, and how that grows with the epochs stored."""
+"""Costs of the store with few epochs and with a year of them, and of reading, compaction and start-up.
+
+python -m benchmarks.growth [--folder DIR]
+
+The epochs of a store are copies of a few rasters. A year on the full grid takes 15 GB.
+"""
 
 from __future__ import annotations
 
+import argparse
 import json
+import multiprocessing
 import os
 import shutil
+import signal
+import subprocess
+import sys
+import tempfile
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import replace
 from datetime import UTC, datetime, timedelta
 from itertools import groupby
+from multiprocessing.connection import Connection
 from pathlib import Path
 
 import netCDF4
 import numpy as np
-import xarray as xr
+from rich.console import Console
+from rich.table import Table
 from scipy import ndimage
 
-from benchmarks.cost import STEPS
-from station.archive import join, store
-from station.archive.aggregate import AreaChange
-from station.archive.areas import update_areas
-from station.archive.layout import Series
-from station.archive.layout import text as letters_of
-from station.archive.opened import open_series
-from station.archive.reference import write_reference
-from station.archive.series import build_series
-from station.archive.sources import Source, read_source
+from benchmarks.process_cost import cpu_of, family, peak_of
+from station.archive import compaction, epochs
+from station.archive.areas import AreaChange, update_areas
+from station.archive.netcdf_layout import Series, encode_text
+from station.archive.reference_files import write_reference
+from station.archive.series.epoch_reader import EpochSource, read_source
+from station.archive.series.lazy import open_series
+from station.archive.series.virtual import build_series
 from station.config import Site, read_site
-from station.quantities import Bools, Grid, Measurement, Reference, Shared
-from station.science.shared import basis
-from station.service.content import sha256_of
-from station.service.integrity import store_files
-from station.service.journal import Entry, Journal, State
-from station.service.pictures import Watched
-from station.service.show import show
-from station.service.tasks import Outcome, areas_of, series_of
-from station.service.upkeep import publish
+from station.inbox.file_hash import sha256_file
+from station.inbox.journal import Entry, Journal, State
+from station.processing.integrity import store_files
+from station.processing.previews import PreviewRecorder
+from station.processing.scan_tasks import StoredResult, load_areas, series_for
+from station.processing.store_tasks import update_series
+from station.quantities import Bools, Grid, Measurement, Reference, SharedParameters
+from station.science.uncertainty.parameters import parameter_layout
+from station.service.publishing import publish
 
 YEAR = 8760  # hourly scans
 FEW = 10
-OPEN = 37  # the most that lie by themselves where scans come hourly: a day, and until the day after is joined
+OPEN_EPOCHS = 37  # most epochs in files of their own: a day, and the hours until it is compacted
 SMALL = Grid(west_m=632_000.0, north_m=5_186_000.0, cell_m=10.0, nx=60, ny=45)
 FULL = Grid(west_m=632_000.0, north_m=5_186_000.0, cell_m=1.0, nx=4000, ny=5000)
-DISTINCT = 3  # rasters that the epochs of a store take turns with
+TEMPLATES = 3  # different rasters of a store
 ROUNDS = 3
-SHOWN = 20
-READ = ("elevation", "elevation_change")  # variables of the year on the full grid
-SEEN = 0.31  # of a grid's cells, in an epoch
-SEEN_OF_A_YEAR = 0.02  # of its cells: the rest is neither stored nor read
+PAGE_UPDATES = 20  # until all maps are drawn
+READ_VARIABLES = ("elevation", "elevation_change")  # of the year on the full grid
+COVERAGE = 0.31  # share of the cells of a grid that an epoch observes
+READ_COVERAGE = 0.02  # of the year that is read: other cells are neither stored nor read
 SITE = """
 [station]
 id = "hef"
@@ -73,27 +84,27 @@ file = "areas.geojson"
 
 
 def station_of(folder: Path, grid: Grid) -> Site:
-    """Write a site of that grid, with two areas and a reference, and no scan."""
+    """Return the site of a new station on a grid, with two areas and a reference but no scan."""
     (folder / "inbox").mkdir(parents=True)
     south_m, east_m = grid.north_m - grid.ny * grid.cell_m, grid.west_m + grid.nx * grid.cell_m
-    told = SITE.format(west=grid.west_m, south=south_m, east=east_m, north=grid.north_m, cell=grid.cell_m)
-    (folder / "site.toml").write_text(told)
+    text = SITE.format(west=grid.west_m, south=south_m, east=east_m, north=grid.north_m, cell=grid.cell_m)
+    (folder / "site.toml").write_text(text)
     np.savetxt(folder / "sop.dat", np.eye(4))
-    boxes = [_box(grid, "one", 0.1), _box(grid, "other", 0.5)]
+    boxes = [_box(grid, "first", 0.1), _box(grid, "second", 0.5)]
     (folder / "areas.geojson").write_text(json.dumps({"type": "FeatureCollection", "features": boxes}))
     site = read_site(folder / "site.toml")
     row, column = np.indices(grid.shape)
     elevation_m = 2800 + 0.2 * row + 20 * np.sin(column / 60)
-    known = replace(
-        Reference.given(grid, "1", elevation_m, elevation_m > 2820),
+    reference = replace(
+        Reference.from_elevation(grid, "1", elevation_m, elevation_m > 2820),
         random_variance_m2=np.full(grid.shape, 0.005**2, np.float32),
     )
-    write_reference(series_of(site), known)
+    write_reference(series_for(site), reference)
     return site
 
 
 def _box(grid: Grid, name: str, share: float) -> dict[str, object]:
-    """An area of a hundred metres, or of a tenth of a small grid."""
+    """Return an area with a side of 100 m, or of a tenth of a small grid."""
     side_m = min(100.0, grid.nx * grid.cell_m / 10)
     west_m = grid.west_m + share * grid.nx * grid.cell_m
     south_m = grid.north_m - share * grid.ny * grid.cell_m - side_m
@@ -106,17 +117,17 @@ def _box(grid: Grid, name: str, share: float) -> dict[str, object]:
     }
 
 
-def epoch_of(grid: Grid, start: datetime, seen: float = SEEN) -> store.Epoch:
-    """An epoch that sees so large a share of the grid, in patches, where half of the ground moved."""
+def synthetic_epoch(grid: Grid, start: datetime, coverage: float = COVERAGE) -> epochs.Epoch:
+    """Return an epoch that observes a share of the grid, in patches; half of the ground has changed."""
     random = np.random.default_rng(int(start.timestamp()) // 3600)
-    there = _patchy(np.random.default_rng(1), grid, seen)
-    random_m = np.where(there, random.uniform(0.01, 0.03, grid.shape), np.nan).astype(np.float32)
+    observed = _patches(np.random.default_rng(1), grid, coverage)
+    random_m = np.where(observed, random.uniform(0.01, 0.03, grid.shape), np.nan).astype(np.float32)
     change_m = random_m * random.normal(size=grid.shape).astype(np.float32)
-    change_m -= np.where(_patchy(np.random.default_rng(2), grid, 0.5), np.float32(0.2), np.float32(0.0))
-    count = np.where(there, random.poisson(3, grid.shape) + 1, 0).astype(np.int32)
-    measured = Measurement.of(
+    change_m -= np.where(_patches(np.random.default_rng(2), grid, 0.5), np.float32(0.2), np.float32(0.0))
+    count = np.where(observed, random.poisson(3, grid.shape) + 1, 0).astype(np.int32)
+    measurement = Measurement.from_rasters(
         grid,
-        there.astype(np.uint8),
+        observed.astype(np.uint8),
         elevation_m=2800.0 + change_m,
         change_m=change_m,
         uncertainty_m=np.hypot(random_m, 0.01),
@@ -124,21 +135,21 @@ def epoch_of(grid: Grid, start: datetime, seen: float = SEEN) -> store.Epoch:
         spread_m=random_m,
         count=count,
     )
-    of = basis(grid, (grid.west_m, grid.north_m, 3200.0))
-    size = len(of.names)
-    return store.Epoch(
+    params = parameter_layout(grid, (grid.west_m, grid.north_m, 3200.0))
+    size = len(params.names)
+    return epochs.Epoch(
         start_s=start.timestamp(),
         end_s=start.timestamp() + 900,
         scan_id=f"{start:%y%m%d_%H%M%S}",
-        measurement=measured,
-        shared=Shared(
-            of.names, of.units, random.normal(size=size) * 1e-5, np.eye(size) * 1e-10, np.zeros(size)
+        measurement=measurement,
+        shared=SharedParameters(
+            params.names, params.units, random.normal(size=size) * 1e-5, np.eye(size) * 1e-10, np.zeros(size)
         ),
         verdict="good",
         verdict_reason="",
-        numbers={
+        scalars={
             "platform_roll": 0.1, "platform_pitch": -0.2, "air_temperature": -3.5, "air_pressure": 690.0,
-            "relative_humidity": 60.0, "point_total": 1e6, "coverage": seen, "stable_median": 0.001,
+            "relative_humidity": 60.0, "point_total": 1e6, "coverage": coverage, "stable_median": 0.001,
             "stable_nmad": 0.02, "stable_z_std": 1.02, "scanner_east": grid.west_m,
             "scanner_north": grid.north_m, "scanner_height": 3200.0, "scanner_axis_east": 0.0,
             "scanner_axis_north": 0.0,
@@ -150,8 +161,8 @@ def epoch_of(grid: Grid, start: datetime, seen: float = SEEN) -> store.Epoch:
     )  # fmt: skip
 
 
-def _patchy(random: np.random.Generator, grid: Grid, share: float) -> Bools:
-    """Cells in patches of a fiftieth of the grid, so large a share of all."""
+def _patches(random: np.random.Generator, grid: Grid, share: float) -> Bools:
+    """Return a share of the cells (ny, nx), in patches of a fiftieth of the grid."""
     side = max(grid.nx // 50, 1)
     shape = grid.ny // side + 1, grid.nx // side + 1
     coarse = ndimage.gaussian_filter(random.normal(size=shape), 1.5)
@@ -159,58 +170,63 @@ def _patchy(random: np.random.Generator, grid: Grid, share: float) -> Bools:
     return np.asarray(fine >= np.quantile(coarse, 1 - share))
 
 
-def fill(site: Site, epochs: int, *, joined_seen: float = SEEN, until: datetime | None = None) -> datetime:
-    """Store so many hourly epochs, the older ones joined as the service does; return the next one's start.
+def fill(
+    site: Site, count: int, *, compacted_coverage: float = COVERAGE, until: datetime | None = None
+) -> datetime:
+    """Store `count` hourly epochs, the older ones compacted as by the service; return the next start.
 
-    They take their rasters from a few epochs, joined ones from those that see so large a share of the grid.
+    Their rasters are those of a few epochs; `compacted_coverage` is the share of the grid that the compacted
+    ones observe.
     """
-    series = series_of(site)
+    series = series_for(site)
     end = (until or datetime.now(UTC)).replace(minute=0, second=0, microsecond=0) - timedelta(hours=2)
-    starts = [end - timedelta(hours=back) for back in range(epochs, 0, -1)]
-    by_themselves = starts[-OPEN:]
-    joined = starts[:-OPEN]
-    for kind, stamp, group in _closed(joined):
+    starts = [end - timedelta(hours=back) for back in range(count, 0, -1)]
+    open_starts = starts[-OPEN_EPOCHS:]
+    compacted = starts[:-OPEN_EPOCHS]
+    for kind, stamp, group in _closed_periods(compacted):
         place = series.folder / kind / group[0].strftime("%Y/%m" if kind == "days" else "%Y")
         name = group[0].strftime(stamp)
-        held = list((_days if kind == "months" else _turns)(series, group, joined_seen))
-        join.write_joined(series, held, place / f"{series.station_id}_{name}_r1.nc", name, lambda: None)
-    for source, start in zip(_turns(series, by_themselves, SEEN), by_themselves, strict=True):
-        alone(series, source.path, start)
+        sources = list((_days if kind == "months" else _hours)(series, group, compacted_coverage))
+        compaction.write_compacted(
+            series, sources, place / f"{series.station_id}_{name}_r1.nc", name, lambda: None
+        )
+    for source, start in zip(_hours(series, open_starts, COVERAGE), open_starts, strict=True):
+        copy_epoch(series, source.path, start)
     with Journal(site.station.data / "journal.sqlite") as journal:
-        journal.adopt(_entry(series, start) for start in starts)
-        journal.note_files(
-            {str(path.relative_to(series.folder)): sha256_of(path) for path in store_files(series)}
+        journal.import_entries(_entry(series, start) for start in starts)
+        journal.add_checksums(
+            {str(path.relative_to(series.folder)): sha256_file(path) for path in store_files(series)}
         )
     build_series(series)
-    update_areas(series, areas_of(site), _Quick(), lambda: None)
-    publish(site, lambda: None)
-    for _ in range(SHOWN):  # until all maps are drawn
-        show(site, None, lambda: None)
+    update_areas(series, load_areas(site), _InstantAggregator(), lambda: None)
+    update_series(site, lambda: None)
+    for _ in range(PAGE_UPDATES):
+        publish(site, None, lambda: None)
     return end
 
 
-def alone(series: Series, like: Path, start: datetime) -> None:
-    """Store an epoch file that is another of another time, as quickly as it is copied."""
-    path = store.epoch_folder(series, start) / f"{series.station_id}_{start:{store.STAMP}}.nc"
+def copy_epoch(series: Series, template: Path, start: datetime) -> None:
+    """Store a copy of an epoch file under another time."""
+    path = epochs.epoch_folder(series, start) / f"{series.station_id}_{start:{epochs.TIME_FORMAT}}.nc"
     path.parent.mkdir(parents=True, exist_ok=True)
-    shutil.copyfile(like, path)
+    shutil.copyfile(template, path)
     with netCDF4.Dataset(path, "a") as file:
         file["time"][:] = start.timestamp() + 450
         file["time_bnds"][:] = (start.timestamp(), start.timestamp() + 900)
-        file["epoch_file"][0] = letters_of([path.name], "text")[0]
+        file["epoch_file"][0] = encode_text([path.name], "text")[0]
 
 
-class _Quick:
-    """Tells of areas without looking."""
+class _InstantAggregator:
+    """Aggregator that reads no epoch."""
 
-    def area(self, cells: Bools, row: store.Row) -> AreaChange:
-        """How an area changed, by the time alone."""
-        value_m = row.time_s % 1e5 / 1e5 + cells[0, 0]
+    def area(self, cells: Bools, epoch: epochs.EpochRef) -> AreaChange:
+        """Return a change that depends on the time only."""
+        value_m = epoch.time_s % 1e5 / 1e5 + cells[0, 0]
         return AreaChange(value_m, 0.01, value_m, 0.01, 1.0)
 
 
-def _closed(starts: list[datetime]) -> Iterator[tuple[str, str, list[datetime]]]:
-    """Group what is closed by months, and the newest month by days."""
+def _closed_periods(starts: list[datetime]) -> Iterator[tuple[str, str, list[datetime]]]:
+    """Yield kind, name format and epochs of each closed period: months, and the days of the newest month."""
     if not starts:
         return
     newest = starts[-1].strftime("%Y%m")
@@ -222,128 +238,122 @@ def _closed(starts: list[datetime]) -> Iterator[tuple[str, str, list[datetime]]]
                 yield "days", "%Y%m%d", list(day)
 
 
-def _turns(
-    series: Series, starts: list[datetime], seen: float, names: tuple[str, ...] | None = None
-) -> Iterator[Source]:
-    """Give sources for epochs at these starts, which take turns with a few rasters."""
-    made = replace(series, folder=series.folder.parent / f"templates-{seen:g}")
-    for at, start in enumerate(starts):
-        like = datetime(2020, 1, 1, at % DISTINCT, tzinfo=UTC)
-        path = store.epoch_folder(made, like) / f"{series.station_id}_{like:{store.STAMP}}.nc"
+def _hours(
+    series: Series, starts: list[datetime], coverage: float, names: tuple[str, ...] | None = None
+) -> Iterator[EpochSource]:
+    """Yield sources of epochs at these starts, which repeat a few rasters."""
+    templates = replace(series, folder=series.folder.parent / f"templates-{coverage:g}")
+    for index, start in enumerate(starts):
+        template = datetime(2020, 1, 1, index % TEMPLATES, tzinfo=UTC)
+        path = (
+            epochs.epoch_folder(templates, template)
+            / f"{series.station_id}_{template:{epochs.TIME_FORMAT}}.nc"
+        )
         if not path.is_file():
-            store.write_epoch(made, epoch_of(series.grid, like, seen))
-        yield _only(_dated(read_source(path, 0, at, 1), series, [start]), names)
+            epochs.write_epoch(templates, synthetic_epoch(series.grid, template, coverage))
+        yield _select(_dated(read_source(path, 0, index, 1), series, [start]), names)
 
 
 def _days(
-    series: Series, starts: list[datetime], seen: float, names: tuple[str, ...] | None = None
-) -> Iterator[Source]:
-    """Give sources for the days of a month, each of which is the same day that was joined before."""
-    path = series.folder.parent / f"templates-{seen:g}" / "day.nc"
+    series: Series, starts: list[datetime], coverage: float, names: tuple[str, ...] | None = None
+) -> Iterator[EpochSource]:
+    """Yield sources of the days of a month, all copies of one compacted day."""
+    path = series.folder.parent / f"templates-{coverage:g}" / "day.nc"
     if not path.is_file():
         day = [datetime(2020, 1, 1, hour, tzinfo=UTC) for hour in range(24)]
-        join.write_joined(series, list(_turns(series, day, seen, names)), path, "a day", lambda: None)
-    at = 0
+        compaction.write_compacted(
+            series, list(_hours(series, day, coverage, names)), path, "a day", lambda: None
+        )
+    index = 0
     for _, group in groupby(starts, lambda start: start.date()):
         day = list(group)
-        yield _dated(read_source(path, 0, at, len(day)), series, day)
-        at += len(day)
+        yield _dated(read_source(path, 0, index, len(day)), series, day)
+        index += len(day)
 
 
-def _dated(source: Source, series: Series, starts: list[datetime]) -> Source:
-    """Return a source as if its epochs were of these starts."""
-    words, start_s = dict(source.words), np.array([start.timestamp() for start in starts])
-    words["time"], words["time_bnds"] = start_s + 450, np.stack([start_s, start_s + 900], axis=-1)
+def _dated(source: EpochSource, series: Series, starts: list[datetime]) -> EpochSource:
+    """Return a source with other start times of its epochs."""
+    scalars, start_s = dict(source.scalars), np.array([start.timestamp() for start in starts])
+    scalars["time"], scalars["time_bnds"] = start_s + 450, np.stack([start_s, start_s + 900], axis=-1)
     for name, values in (
-        ("epoch_file", [f"{series.station_id}_{start:{store.STAMP}}.nc" for start in starts]),
+        ("epoch_file", [f"{series.station_id}_{start:{epochs.TIME_FORMAT}}.nc" for start in starts]),
         ("scan_id", [f"{start:%y%m%d_%H%M%S}" for start in starts]),
-        ("scan_sha256", [np.random.default_rng(int(one)).bytes(32).hex() for one in start_s]),
+        ("scan_sha256", [np.random.default_rng(int(second)).bytes(32).hex() for second in start_s]),
     ):
-        words[name] = letters_of(values, "text")
-    return replace(source, words=words)
+        scalars[name] = encode_text(values, "text")
+    return replace(source, scalars=scalars)
 
 
 def _entry(series: Series, start: datetime) -> Entry:
-    name = f"{series.station_id}_{start:{store.STAMP}}.nc"
+    name = f"{series.station_id}_{start:{epochs.TIME_FORMAT}}.nc"
     return Entry(
-        name=f"{start:%y%m%d_%H%M%S}.laz", size=1, mtime_ns=1, state=State.STORED, waits_for="", reason="",
-        sha256=None, log_sha256="", outcome=State.STORED, verdict="good",
+        name=f"{start:%y%m%d_%H%M%S}.laz", size=1, mtime_ns=1, state=State.STORED, waiting_reason="",
+        reason="", sha256=None, log_sha256="", outcome=State.STORED, verdict="good",
         epoch=f"epochs/{start:%Y/%m/%d}/{name}", start_utc_s=start.timestamp(), revision=1, reference="1",
-        figures={"points": 1_000_000, "sigma_median_m": 0.02, "seconds": 3.0}, attempts=0,
-        next_try_utc_s=None, seen_utc_s=start.timestamp(), changed_utc_s=start.timestamp(),
+        metrics={"points": 1_000_000, "sigma_median_m": 0.02, "seconds": 3.0}, attempts=0,
+        next_try_utc_s=None, first_seen_utc_s=start.timestamp(), changed_utc_s=start.timestamp(),
     )  # fmt: skip
 
 
 def cost(site: Site, start: datetime) -> dict[str, float]:
-    """Return CPU seconds of what the store, the areas and the page take for an epoch, the best of a few.
+    """Return CPU seconds of storing an epoch, the best of a few, by step.
 
-    Its file, with a look at it for the page; series and areas; the page.
+    `write_s`: its file, with the preview for the page; `update_s`: series and areas; `publish_s`: the page.
     """
-    taken: dict[str, list[float]] = {}
-    for one in range(ROUNDS + 1):
-        epoch = epoch_of(site.grid_cells, start + timedelta(hours=one))
-        stored = list[Outcome]()
-        steps: list[Callable[[], object]] = [
-            lambda epoch=epoch, stored=stored: stored.append(_written(site, epoch)),
-            lambda: publish(site, lambda: None),
-            lambda stored=stored: show(site, stored[0], lambda: None),
-        ]
-        for name, step in zip(STEPS, steps, strict=True):
-            began_s = time.process_time()
-            step()
-            taken.setdefault(name, []).append(time.process_time() - began_s)
-    return {name: min(found[1:]) for name, found in taken.items()}
+    seconds: dict[str, list[float]] = {"write_s": [], "update_s": [], "publish_s": []}
+    for hour in range(ROUNDS + 1):
+        epoch = synthetic_epoch(site.grid_cells, start + timedelta(hours=hour))
+        ends_s = [time.process_time()]
+        stored = _write(site, epoch)
+        ends_s.append(time.process_time())
+        update_series(site, lambda: None)
+        ends_s.append(time.process_time())
+        publish(site, stored, lambda: None)
+        ends_s.append(time.process_time())
+        for values, step_s in zip(seconds.values(), np.diff(ends_s), strict=True):
+            values.append(float(step_s))
+    return {name: min(values[1:]) for name, values in seconds.items()}
 
 
-def _written(site: Site, epoch: store.Epoch) -> Outcome:
-    series = series_of(site)
-    watched = Watched(site, series, "1")
-    path = store.write_epoch(series, epoch, seen=watched.add).path
+def _write(site: Site, epoch: epochs.Epoch) -> StoredResult:
+    series = series_for(site)
+    preview = PreviewRecorder(site, series, "1")
+    path = epochs.write_epoch(series, epoch, on_rows=preview.add).path
     name = str(path.relative_to(series.folder))
-    return Outcome(epoch.start_s, "", name, 1, "good", "", "1", {}, "", "", watched.look)
+    return StoredResult(epoch.start_s, "", name, 1, "good", "", "1", {}, "", "", preview.overview)
 
 
 def reading(folder: Path) -> dict[str, float]:
-    """Return how long a map and a year of a 100 m box take on the full grid, where few cells are seen."""
+    """Return time to read a map, and a year of a 100 m box, on the full grid with few observed cells [s]."""
     series = Series(folder / "data", "hef", FULL, "EPSG:32632")
     end = datetime(2026, 7, 1, tzinfo=UTC)
     starts = [end - timedelta(hours=back) for back in range(YEAR, 0, -1)]
-    for kind, stamp, group in _closed(starts):
+    for kind, stamp, group in _closed_periods(starts):
         name = group[0].strftime(stamp)
         path = series.folder / kind / f"{series.station_id}_{name}_r1.nc"
-        made = _days if kind == "months" else _turns
-        held = list(made(series, group, SEEN_OF_A_YEAR, READ))
-        join.write_joined(series, held, path, name, lambda: None)
+        sources = (_days if kind == "months" else _hours)(series, group, READ_COVERAGE, READ_VARIABLES)
+        compaction.write_compacted(series, list(sources), path, name, lambda: None)
     build_series(series)
-    measured = epoch_of(FULL, starts[0], SEEN_OF_A_YEAR).measurement
-    seen = np.isfinite(measured.laid("change_m")[0])
-    share = ndimage.uniform_filter(seen.astype(np.float32), 100)
-    row, column = np.unravel_index(np.argmax(share), FULL.shape)  # where all is seen
-    box = slice(row - 50, row + 50), slice(column - 50, column + 50)
+    measurement = synthetic_epoch(FULL, starts[0], READ_COVERAGE).measurement
+    observed = np.isfinite(measurement.to_rasters("change_m")[0])
+    share = ndimage.uniform_filter(observed.astype(np.float32), 100)
+    row, column = np.unravel_index(np.argmax(share), FULL.shape)  # a box that is observed completely
+    box = slice(None), slice(row - 50, row + 50), slice(column - 50, column + 50)
 
-    def a_map(told: xr.Dataset) -> None:
-        told.elevation_change[YEAR // 2].load()
-
-    def a_box(told: xr.Dataset) -> None:
-        told.elevation_change[:, box[0], box[1]].load()
-
-    def plainly(path: Path) -> xr.Dataset:
-        return xr.open_dataset(path / "series.nc", decode_timedelta=False)
-
-    found = {}
-    for name, opened, work in (
-        ("map", open_series, a_map), ("box_year", open_series, a_box), ("box_year_plain", plainly, a_box)
-    ):  # fmt: skip
+    figures = {}
+    for name, selection in (("map", (YEAR // 2,)), ("box_year", box)):
         forget(series.folder)
         for state in ("cold", "warm"):
-            found |= {
-                f"{name}_{state}_{key}": value for key, value in _took(opened, series.folder, work).items()
-            }
-    return found
+            start_s, start_cpu_s = time.monotonic(), time.process_time()
+            with open_series(series.folder) as dataset:
+                dataset.elevation_change[selection].load()
+            figures[f"{name}_{state}_s"] = time.monotonic() - start_s
+            figures[f"{name}_{state}_cpu_s"] = time.process_time() - start_cpu_s
+    return figures
 
 
 def forget(folder: Path) -> None:
-    """Have the kernel let go of what it keeps of files: they are read from the disk again."""
+    """Drop files from the page cache, so that they are read from the disk again."""
     for path in folder.rglob("*.nc"):
         file = os.open(path, os.O_RDONLY)
         os.fsync(file)
@@ -351,18 +361,96 @@ def forget(folder: Path) -> None:
         os.close(file)
 
 
-def _took(
-    opened: Callable[[Path], xr.Dataset], folder: Path, work: Callable[[xr.Dataset], None]
-) -> dict[str, float]:
-    began_s, used_s = time.monotonic(), time.process_time()
-    with opened(folder) as told:
-        work(told)
-    return {"s": time.monotonic() - began_s, "cpu_s": time.process_time() - used_s}
+def compacting(folder: Path) -> dict[str, float]:
+    """Return time and peak memory of compacting a day on the full grid."""
+    series = Series(folder / "data", "hef", FULL, "EPSG:32632")
+    templates = replace(series, folder=folder / "templates")
+    day = datetime(2026, 7, 1, tzinfo=UTC)
+    for hour in range(TEMPLATES):
+        epochs.write_epoch(templates, synthetic_epoch(FULL, day + timedelta(hours=hour)))
+    for hour in range(24):
+        template = epochs.epoch_files(templates)[hour % TEMPLATES].path
+        copy_epoch(series, template, day + timedelta(hours=hour))
+    build_series(series)
+    context = multiprocessing.get_context("spawn")
+    receiver, sender = context.Pipe()
+    child = context.Process(target=_compact_once, args=(series, sender))
+    child.start()
+    sender.close()  # so that a failed child is an error here
+    figures = receiver.recv()
+    child.join()
+    return dict(zip(("compact_day_s", "compact_day_cpu_s", "compact_day_gb"), figures, strict=True))
 
 
-def _only(source: Source, names: tuple[str, ...] | None) -> Source:
-    return (
-        source
-        if names is None
-        else replace(source, shapes={name: shape for name, shape in source.shapes.items() if name in names})
+def _compact_once(series: Series, sender: Connection) -> None:
+    start_s, start_cpu_s = time.monotonic(), time.process_time()
+    compaction.compact(series, datetime(2026, 7, 3, tzinfo=UTC), lambda: None)
+    sender.send((time.monotonic() - start_s, time.process_time() - start_cpu_s, peak_of(os.getpid())))
+
+
+def starting(site_file: Path) -> dict[str, float]:
+    """Return time until the service is ready, and CPU time of all its processes [s].
+
+    `cold`: the files of the store are read from the disk.
+    """
+    figures = {}
+    for state in ("cold", "warm"):
+        if state == "cold":
+            forget(site_file.parent)
+        start_s = time.monotonic()
+        command = [sys.executable, "-m", "station", "run", str(site_file)]
+        with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as service:
+            assert service.stderr is not None  # noqa: S101 - it is a pipe
+            if not any("service=running" in line for line in service.stderr):
+                raise RuntimeError(f"the service does not start: {site_file}")
+            figures[f"ready_{state}_s"] = time.monotonic() - start_s
+            figures[f"ready_{state}_cpu_s"] = cpu_of(family(service.pid))
+            service.send_signal(signal.SIGTERM)
+            service.communicate()
+    return figures
+
+
+def store_costs(folder: Path) -> dict[str, float]:
+    """Return the cost of an epoch with few and with a year stored, of reading, compaction and start-up."""
+    figures: dict[str, float] = {}
+    # On the full grid the rasters of compacted epochs are empty: storing an epoch does not read them.
+    for grid, coverage, size in ((SMALL, COVERAGE, "small"), (FULL, 0.0, "full")):
+        for word, count in (("few", FEW), ("year", YEAR)):
+            place = folder / f"{size}-{word}"
+            shutil.rmtree(place, ignore_errors=True)
+            site = station_of(place, grid)
+            costs = cost(site, fill(site, count, compacted_coverage=coverage))
+            figures |= {f"{name}_{size}_{word}": value for name, value in costs.items()}
+    figures |= starting(folder / "small-year" / "site.toml")
+    for work in (compacting, reading):
+        place = folder / work.__name__
+        shutil.rmtree(place, ignore_errors=True)
+        figures |= work(place)
+    return figures
+
+
+def main() -> None:
+    """Print all costs of the store."""
+    parser = argparse.ArgumentParser(
+        description="Costs of the store with few epochs and with a year of them."
     )
+    parser.add_argument("--folder", type=Path, help="folder that keeps the stores")
+    arguments = parser.parse_args()
+    with tempfile.TemporaryDirectory() as temporary:
+        figures = store_costs(arguments.folder or Path(temporary))
+    table = Table("figure", "value", title="Growth")
+    for name, value in figures.items():
+        table.add_row(name, f"{value:.3g}")
+    Console(width=100).print(table)
+
+
+def _select(source: EpochSource, names: tuple[str, ...] | None) -> EpochSource:
+    """Return a source of some of its rasters; None for all."""
+    if names is None:
+        return source
+    shapes = {name: shape for name, shape in source.raster_shapes.items() if name in names}
+    return replace(source, raster_shapes=shapes)
+
+
+if __name__ == "__main__":
+    main()

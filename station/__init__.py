@@ -1,13 +1,15 @@
 """A permanently mounted laser scanner as a measuring instrument.
 
-`station.open(site_or_folder)` gives the whole series of a station as one lazy `xarray.Dataset`;
-`station.variance(site_or_folder, weights, epoch)` how sure any mean, volume or difference of it is;
-`station.volume(site_or_folder, area, epoch)` a volume, and which cells make it unsure.
+`station.open(site_or_folder)` returns the whole series of a station as one lazy `xarray.Dataset`,
+`station.variance(site_or_folder, weights, epoch)` the variance of any mean, volume or difference in it, and
+`station.volume(site_or_folder, area, epoch)` a volume with its uncertainty and each cell's share in it.
 """
 
 from __future__ import annotations
 
 from typing import TYPE_CHECKING
+
+from station._version import __version__ as __version__
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -19,15 +21,13 @@ if TYPE_CHECKING:
 
     Epoch = int | str | np.datetime64
 
-__version__ = "0.1.0"
-
 
 def open(site_or_folder: str | Path) -> xr.Dataset:  # noqa: A001 - reads well as station.open(...)
-    """Return the whole series of a station: one lazy dataset, at any moment, also while it is written.
+    """Return the whole series of a station as one lazy dataset, also while the service is writing.
 
-    Takes a site file or the station's data folder; raises StoreError where there is no series yet.
+    Takes a site file or the station's data folder. Raises StoreError if there is no series yet.
     """
-    from station.archive.opened import open_series  # noqa: PLC0415 - importing station stays cheap
+    from station.archive.series.lazy import open_series
 
     return open_series(site_or_folder)
 
@@ -35,34 +35,35 @@ def open(site_or_folder: str | Path) -> xr.Dataset:  # noqa: A001 - reads well a
 def variance(
     site_or_folder: str | Path, weights: npt.ArrayLike, epoch: Epoch, epoch2: Epoch | None = None
 ) -> float:
-    """Variance of a weighted sum of the elevation change in an epoch, or of its difference to a second one.
+    """Return the variance of a weighted sum of elevation change [m² times squared weights].
 
-    `weights` (y, x), rows from north to south, nought outside: 1/n in n cells for a mean, a cell's size for a
-    volume. An epoch is its place in the series or a time (the nearest is taken). What all cells of a scan
-    share is in it, at every scale. Raises StoreError where there is no series or no reference yet, ValueError
-    where the weights are not on its grid.
-    Source: EQUATIONS 6.2.
+    The sum is over one epoch, or over its difference to a second epoch. `weights` (y, x), rows from north to
+    south, are zero outside the area: 1/n in each of n cells gives a mean, the cell size a volume. An epoch is
+    an index in the series or a time (the nearest epoch is used). Errors that all cells of a scan share are
+    included at every scale. Raises StoreError if there is no series or no reference yet, ValueError if the
+    weights do not fit the grid.
+    Source: equations.md, 6.2.
     """
-    import numpy as np  # noqa: PLC0415
+    import numpy as np
 
-    from station.archive.aggregate import Aggregates  # noqa: PLC0415
-    from station.archive.store import series_in  # noqa: PLC0415
+    from station.archive.series.index import series_in
+    from station.queries.aggregates import Aggregates
 
-    found = Aggregates(series_in(site_or_folder))
-    other = None if epoch2 is None else found.row(epoch2)
-    return found.variance(np.asarray(weights, dtype=np.float64), found.row(epoch), other)
+    aggregates = Aggregates(series_in(site_or_folder))
+    other = None if epoch2 is None else aggregates.find_epoch(epoch2)
+    return aggregates.variance(np.asarray(weights, dtype=np.float64), aggregates.find_epoch(epoch), other)
 
 
-def coarsened(site_or_folder: str | Path, epoch: Epoch, cells: int) -> xr.Dataset:
-    """Elevation change of an epoch in blocks of cells × cells, with its uncertainty, for cells of few points.
+def coarsen(site_or_folder: str | Path, epoch: Epoch, cells: int) -> xr.Dataset:
+    """Return the elevation change of an epoch in blocks of `cells` × `cells`, with its uncertainty [m].
 
-    Raises StoreError where there is no series.
+    Meant for cells with few points. Raises StoreError if there is no series.
     """
-    from station.archive.aggregate import Aggregates  # noqa: PLC0415
-    from station.archive.store import series_in  # noqa: PLC0415
+    from station.archive.series.index import series_in
+    from station.queries.aggregates import Aggregates
 
-    found = Aggregates(series_in(site_or_folder))
-    return found.coarsened(found.row(epoch), cells)
+    aggregates = Aggregates(series_in(site_or_folder))
+    return aggregates.coarsen(aggregates.find_epoch(epoch), cells)
 
 
 def volume(
@@ -71,36 +72,38 @@ def volume(
     epoch: Epoch,
     epoch2: Epoch | None = None,
 ) -> xr.Dataset:
-    """Volume of the change over an area in an epoch, or of its difference to a second one, with its sigmas.
+    """Return the volume change of an area with its uncertainty [m³].
 
-    `area` is cells (y, x), rows from north to south, or a polygon on the map. With what cells share, and as
-    Hartzell et al. (2015) have it, each cell's error its own; and as maps which cell adds how much to the
-    variance. Cells without a change are interpolated, as in `areas.nc`. Raises StoreError where there is no
-    series, no reference or no change.
+    The volume is that of one epoch, or of its difference to a second epoch. `area` is a mask (y, x), rows
+    from north to south, or a polygon in map coordinates. One sigma is given with the shared errors included
+    and once as in Hartzell et al. (2015), with every cell's error independent; maps hold the share of each
+    cell in the variance. Cells without a change are interpolated, as in `areas.nc`. Raises StoreError if
+    there is no series, no reference or no change.
     """
-    from station.archive.store import series_in  # noqa: PLC0415
-    from station.archive.volume import Volumes, cells_of  # noqa: PLC0415
+    from station.archive.series.index import series_in
+    from station.queries.volumes import Volumes, area_mask
 
     series = series_in(site_or_folder)
-    found = Volumes(series)
-    other = None if epoch2 is None else found.row(epoch2)
-    return found.change(cells_of(area, series.grid), found.row(epoch), other)
+    volumes = Volumes(series)
+    other = None if epoch2 is None else volumes.find_epoch(epoch2)
+    return volumes.volume_change(area_mask(area, series.grid), volumes.find_epoch(epoch), other)
 
 
 def point_covariance(site: str | Path, points_m: npt.ArrayLike, epoch: Epoch) -> npt.NDArray[np.float64]:
-    """Covariance (n, 3, 3) of points (n, 3) on the map, as the scan of an epoch measures them [m²].
+    """Return the covariance (n, 3, 3) of map points (n, 3) as measured by the scan of an epoch [m²].
 
-    Of the shot: range, beam, encoder. Of all shots alike: pose, lean, ranges and air as the adjustment of the
-    epoch leaves them, against the reference. `station.science.beam.error_ellipse` draws it. It is a site file
-    that is wanted, for the scanner; raises StoreError where there is no series.
-    Source: Hartzell et al. (2015), Eq. 9; EQUATIONS 6.2.
+    It is the sum of the independent error of each shot (range, beam, encoder) and the error all shots share
+    (pose, tilt, range, air): the posterior of the epoch's adjustment, relative to the reference. `site` must
+    be a site file, because the scanner model is read from it. `beam.error_ellipse` turns the result into
+    error ellipses. Raises StoreError if there is no series.
+    Source: Hartzell et al. (2015), Eq. 9; equations.md, 6.2.
     """
-    import numpy as np  # noqa: PLC0415
+    import numpy as np
 
-    from station.archive.store import series_in  # noqa: PLC0415
-    from station.archive.volume import Volumes  # noqa: PLC0415
-    from station.config import read_site  # noqa: PLC0415
+    from station.archive.series.index import series_in
+    from station.config import read_site
+    from station.queries.volumes import Volumes
 
-    found = Volumes(series_in(site))
+    volumes = Volumes(series_in(site))
     points = np.atleast_2d(np.asarray(points_m, dtype=np.float64))
-    return found.point_covariance(points, found.row(epoch), read_site(site).instrument)
+    return volumes.point_covariance(points, volumes.find_epoch(epoch), read_site(site).instrument)

@@ -1,6 +1,6 @@
-"""The site file: read, checked, explained.
+"""Reading and checking the site file.
 
-One TOML file describes one station. Unknown keys are refused with the nearest right one, all errors are
+One TOML file describes one station. An unknown key is rejected with the closest valid one, all errors are
 listed at once, paths are relative to the file.
 """
 
@@ -19,6 +19,8 @@ from station.errors import ConfigError
 from station.quantities import Grid, Scanner
 from station.sections import Section, SiteFile
 
+SCHEMA_NAME = "station-site.schema.json"  # next to the site file, whose first line refers to it
+
 
 class Site(SiteFile):
     """A checked site file whose paths are absolute."""
@@ -27,28 +29,28 @@ class Site(SiteFile):
 
     @property
     def grid_cells(self) -> Grid:
-        """The fixed raster as a quantity."""
+        """The grid of the products."""
         ny, nx = self.grid.shape
         return Grid(self.grid.bounds_m.west, self.grid.bounds_m.north, self.grid.cell_m, nx, ny)
 
     @property
     def instrument(self) -> Scanner:
-        """The scanner as a quantity, angles in radians."""
+        """The scanner, angles in radians."""
         return self.scanner.instrument
 
     @property
     def adjusts(self) -> bool:
-        """Whether scans are adjusted to the reference: asked for, and the scanner's place is known."""
-        placed = self.scans.frame == "scanner" or self.map.origin is not None
-        return self.adjustment.method == "joint" and placed
+        """True if scans are adjusted to the reference: requested, and the scanner's position is known."""
+        position_known = self.scans.frame == "scanner" or self.map.origin is not None
+        return self.adjustment.method == "joint" and position_known
 
     @property
     def science_hash(self) -> str:
-        """Identify the settings that change numbers of every epoch (16 hex digits).
+        """Hash of the settings that change the numbers of every epoch (16 hex digits).
 
-        What an epoch names itself is left out: its SOP, the air it was measured in, the flag on it.
+        It excludes what each epoch records itself: its SOP, its air, its flag.
         """
-        told = self.model_dump(
+        settings = self.model_dump(
             mode="json",
             include={
                 "scans": {"frame", "point_time"},
@@ -64,81 +66,97 @@ class Site(SiteFile):
             },
         )
         if self.map.pop:
-            told["pop"] = _sha256(self.map.pop)
+            settings["pop"] = _sha256(self.map.pop)
         if isinstance(self.adjustment.stable, Path):
-            told["adjustment"]["stable"] = _sha256(self.adjustment.stable)
+            settings["adjustment"]["stable"] = _sha256(self.adjustment.stable)
         if isinstance(self.reference.scans, Path):
-            told["reference"]["scans"] = _sha256(self.reference.scans)
-        return hashlib.sha256(json.dumps(told, sort_keys=True).encode()).hexdigest()[:16]
+            settings["reference"]["scans"] = _sha256(self.reference.scans)
+        return hashlib.sha256(json.dumps(settings, sort_keys=True).encode()).hexdigest()[:16]
 
 
 def _sha256(path: Path) -> str:
     return hashlib.sha256(path.read_bytes()).hexdigest()
 
 
+def site_schema() -> str:
+    """Return the JSON Schema of the site file, from which editors complete and check keys.
+
+    In the terms of draft 7, which editors of TOML support (taplo, Even Better TOML).
+    """
+    schema = {"$schema": "http://json-schema.org/draft-07/schema#", **SiteFile.model_json_schema()}
+    schema |= {"title": "Site file of a station", "description": "One TOML file describes one station."}
+    text = json.dumps(schema, indent=2, ensure_ascii=False) + "\n"
+    return text.replace("$defs", "definitions").replace('"prefixItems"', '"items"')
+
+
 def write_site(folder: Path, like: str) -> Path:
-    """Write the commented site file of a known station as `site.toml`; raise ConfigError if one is there."""
+    """Write the commented site file of a known station as `site.toml`, and its JSON Schema for editors.
+
+    Returns the path of the site file; raises ConfigError if it exists.
+    """
     names = {"hef": "hintereisferner", "mammoth": "mammoth"}
     if like not in names:
-        raise ConfigError(f"--like {like}: take one of {', '.join(names)}")
+        raise ConfigError(f"--like {like}: choose from {', '.join(names)}")
     installed = Path(__file__).parent / "sites"
     source = installed if installed.is_dir() else Path(__file__).parents[1] / "config"
     path = folder / "site.toml"
     try:
         folder.mkdir(parents=True, exist_ok=True)
         with path.open("x", encoding="utf-8") as file:
+            file.write(f"#:schema ./{SCHEMA_NAME}\n")
             file.write((source / f"{names[like]}.toml").read_text(encoding="utf-8"))
+        (folder / SCHEMA_NAME).write_text(site_schema(), encoding="utf-8")
     except FileExistsError as error:
-        raise ConfigError(f"{path}: is there already; nothing is overwritten") from error
+        raise ConfigError(f"{path}: already exists; nothing is overwritten") from error
     except OSError as error:
         raise ConfigError(f"{path}: cannot be written: {error.strerror}") from error
     return path
 
 
 def read_site(path: str | Path) -> Site:
-    """Read and check a site file; raise ConfigError with every fault found, one a line."""
+    """Return a checked site file; raise ConfigError with all faults, one per line."""
     path = Path(path).absolute()
     if path.is_dir():
-        raise ConfigError(f"{path} is a folder: name the site file in it")
+        raise ConfigError(f"{path} is a folder: give the site file in it")
     try:
-        given = tomllib.loads(path.read_text(encoding="utf-8"))
+        document = tomllib.loads(path.read_text(encoding="utf-8"))
     except OSError as error:
         raise ConfigError(f"{path}: cannot be read: {error.strerror}") from error
     except (tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as error:
         raise ConfigError(f"{path}: not valid TOML: {error}") from error
     try:
-        site = Site.model_validate({**given, "path": path})
+        site = Site.model_validate({**document, "path": path})
     except ValidationError as error:
         faults = [_explain(fault) for fault in error.errors()]
-        raise ConfigError("\n".join([f"{path}: {len(faults)} to mend", *faults])) from error
+        raise ConfigError("\n".join([f"{path}: {len(faults)} to fix", *faults])) from error
     site = _absolute(site, path.parent)
-    faults = [f"  {key}: no such file: {file}" for key, file in _must_exist(site) if not file.is_file()]
+    faults = [f"  {key}: no such file: {file}" for key, file in _required_files(site) if not file.is_file()]
     if faults:
-        raise ConfigError("\n".join([f"{path}: {len(faults)} to mend", *faults]))
+        raise ConfigError("\n".join([f"{path}: {len(faults)} to fix", *faults]))
     return site
 
 
 def _absolute(site: Site, folder: Path) -> Site:
-    """Return the site with every path taken from the folder of its file."""
+    """Return the site with absolute paths, resolved from the folder of its file."""
 
-    def settle(section: Section) -> Section:
+    def resolve(section: Section) -> Section:
         changed: dict[str, Any] = {}
         for key in type(section).model_fields:
             value = getattr(section, key)
             if isinstance(value, Path):
                 changed[key] = folder / value.expanduser()
             elif isinstance(value, Section):
-                changed[key] = settle(value)
+                changed[key] = resolve(value)
             elif isinstance(value, tuple):
-                changed[key] = tuple(settle(one) if isinstance(one, Section) else one for one in value)
+                changed[key] = tuple(resolve(item) if isinstance(item, Section) else item for item in value)
         return section.model_copy(update=changed)
 
-    settled = settle(site)
-    assert isinstance(settled, Site)  # noqa: S101 - settle keeps the type
-    return settled
+    resolved = resolve(site)
+    assert isinstance(resolved, Site)  # noqa: S101 - resolve keeps the type
+    return resolved
 
 
-def _must_exist(site: Site) -> list[tuple[str, Path]]:
+def _required_files(site: Site) -> list[tuple[str, Path]]:
     files = [(f"sop[{i}].file", sop.file) for i, sop in enumerate(site.sop)]
     if site.map.pop:
         files.append(("map.pop", site.map.pop))
@@ -154,30 +172,30 @@ def _must_exist(site: Site) -> list[tuple[str, Path]]:
 
 
 def _explain(fault: Any) -> str:  # noqa: ANN401 - pydantic's ErrorDetails, a plain dict
-    place = ".".join(str(part) for part in fault["loc"] if not _is_union_branch(part))
+    location = ".".join(str(part) for part in fault["loc"] if not _is_union_branch(part))
     if fault["type"] == "extra_forbidden":
-        known = _keys_beside(fault["loc"])
-        near = difflib.get_close_matches(str(fault["loc"][-1]), known, n=1, cutoff=0.5)
-        hint = f"did you mean {near[0]!r}?" if near else f"known here: {', '.join(known)}"
-        return f"  {place}: no such key; {hint}"
+        valid_keys = _sibling_keys(fault["loc"])
+        closest = difflib.get_close_matches(str(fault["loc"][-1]), valid_keys, n=1, cutoff=0.5)
+        hint = f"did you mean {closest[0]!r}?" if closest else f"valid keys: {', '.join(valid_keys)}"
+        return f"  {location}: no such key; {hint}"
     if fault["type"] == "missing":
-        return f"  {place}: missing"
+        return f"  {location}: missing"
     message = fault["msg"].removeprefix("Value error, ")
-    shown = "" if isinstance(fault["input"], dict) else f" (given: {fault['input']!r})"
-    return f"  {place or 'site file'}: {message}{shown}"
+    given_text = "" if isinstance(fault["input"], dict) else f" (given: {fault['input']!r})"
+    return f"  {location or 'site file'}: {message}{given_text}"
 
 
 def _is_union_branch(part: object) -> bool:
-    """Tell pydantic's own path steps (class names, constraint names) from keys of the file."""
+    """Return True for path steps of pydantic (class and constraint names), False for keys of the file."""
     return isinstance(part, str) and (not part.islower() or "[" in part or part in {"float", "int", "path"})
 
 
-def _keys_beside(place: tuple[str | int, ...]) -> list[str]:
+def _sibling_keys(location: tuple[str | int, ...]) -> list[str]:
     model: type[BaseModel] = SiteFile
-    for part in place[:-1]:
+    for part in location[:-1]:
         field = model.model_fields.get(str(part)) if isinstance(part, str) else None
-        found = _models_in(field.annotation) if field else []
-        model = found[0] if found else model
+        models = _models_in(field.annotation) if field else []
+        model = models[0] if models else model
     return [field.alias or name for name, field in model.model_fields.items() if name != "path"]
 
 

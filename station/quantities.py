@@ -1,7 +1,7 @@
-"""The words of the science: frozen dataclasses of arrays, with the unit in every name.
+"""Data types of the science: frozen dataclasses of arrays, with the unit in every name.
 
-Angles are radians, lengths metres, temperatures °C, pressures hPa. `(n,)` counts shots, `(ny, nx)` cells
-with row 0 in the north.
+Angles are in radians, lengths in metres, temperatures in °C, pressures in hPa. Arrays over shots have the
+shape `(n,)`, arrays over cells `(ny, nx)` with row 0 in the north.
 """
 
 from __future__ import annotations
@@ -23,29 +23,28 @@ Ints32 = NDArray[np.int32]
 Numbers = TypeVar("Numbers", Ints, Ints32)
 Bools = NDArray[np.bool_]
 
-
-UPRIGHT = (0.0, 0.0, 1.0)
+VERTICAL_AXIS = (0.0, 0.0, 1.0)  # east, north, up
 
 
 @dataclass(frozen=True)
 class Shots:
-    """A block of laser echoes, in the frame of the scan (scanner's own or map).
+    """A block of laser echoes, in the frame of the scan (the scanner's or the map).
 
-    `time_s` is in the scan's own time base, the one its inclination log uses; None where the scan has none.
+    `time_s` is in the time base of the scan, which its inclination log shares; None if the scan has no times.
     """
 
     xyz_m: Floats  # (3, n)
     time_s: Floats | None  # (n,)
-    intensity: Floats | None = None  # (n,) how bright, 0-1; None where the scan does not tell
+    intensity: Floats | None = None  # (n,) 0-1; None if the scan has none
 
     def __len__(self) -> int:
-        """Return how many echoes there are."""
+        """Return the number of echoes."""
         return len(self.xyz_m[0])
 
 
 @dataclass(frozen=True)
 class Scanner:
-    """What the instrument's maker and the papers say of it."""
+    """Specifications of an instrument, from its maker and the papers."""
 
     model: str
     wavelength_um: float
@@ -54,16 +53,16 @@ class Scanner:
     range_sigma_m: float  # of one shot
     angle_resolution_rad: float  # full width of one encoder step
     inclination_sigma_rad: float  # of one sample of the inclination log
-    inclination_range_rad: float  # farthest lean its sensor tells, either way
+    inclination_range_rad: float  # largest tilt its sensor measures, in either direction
     range_max_m: float
     beam_origin_m: tuple[float, float, float] = (0.0, 0.0, 0.0)  # forward, left, up from the frame's origin
 
 
 @dataclass(frozen=True)
 class InclinationLog:
-    """The lean of the scanner as its sensor wrote it, about 1 Hz, uncleaned.
+    """Tilt of the scanner as logged by its inclination sensor at about 1 Hz, not cleaned.
 
-    Roll turns about the scanner's x axis, pitch about its y axis.
+    Roll is the rotation about the scanner's x axis, pitch about its y axis.
     """
 
     time_s: Floats  # (k,) in the scan's time base
@@ -72,16 +71,16 @@ class InclinationLog:
 
 
 @dataclass(frozen=True)
-class HeadTrack:
-    """Where the scanner's head looked when: azimuth about the scanner's z axis, counter-clockwise from x."""
+class AzimuthTrack:
+    """Azimuth of the scan head over time, about the scanner's z axis, counter-clockwise from x."""
 
     time_s: Floats  # (k,) increasing
     azimuth_rad: Floats  # (k,) unwrapped
 
 
 @dataclass(frozen=True)
-class Tilt:
-    """The lean to apply to each shot, by time in the scan's time base."""
+class TiltSeries:
+    """Tilt to apply to each shot, by time in the time base of the scan."""
 
     time_s: Floats  # (k,) increasing
     roll_rad: Floats  # (k,)
@@ -90,7 +89,7 @@ class Tilt:
 
 @dataclass(frozen=True)
 class Air:
-    """The air at the scanner."""
+    """Air at the scanner."""
 
     temperature_c: float
     pressure_hpa: float
@@ -119,7 +118,7 @@ class Grid:
 
     @property
     def shape(self) -> tuple[int, int]:
-        """Rows and columns."""
+        """Number of rows and columns."""
         return (self.ny, self.nx)
 
     @property
@@ -133,23 +132,23 @@ class Grid:
         return np.asarray(self.north_m - (np.arange(self.ny) + 0.5) * self.cell_m, dtype=np.float64)
 
     def row_and_column(self, cell: Numbers) -> tuple[Numbers, Numbers]:
-        """Row and column of cells (n,) of the flattened grid; `np.divmod` takes six times as long."""
+        """Return row and column of cells (n,) of the flattened grid, six times as fast as `np.divmod`."""
         row = cell // self.nx
         return row, cell - row * self.nx
 
 
 @dataclass(frozen=True)
-class Setup:
-    """What stays the same from scan to scan.
+class ScanGeometry:
+    """What does not change from scan to scan: scanner, grid, position and settings.
 
-    `position_m` is the scanner's place on the map, None where a map-frame scan does not tell it; `axis` the
-    direction (east, north, up) its head turns about.
+    `position_m` is the scanner's position on the map, None if scans in the map frame do not contain it;
+    `axis` is the head's axis of rotation (east, north, up).
     """
 
     scanner: Scanner
     grid: Grid
     position_m: tuple[float, float, float] | None
-    axis: tuple[float, float, float] = UPRIGHT
+    axis: tuple[float, float, float] = VERTICAL_AXIS
     min_points: int = 1
     published_budget: bool = False  # Voordendag et al. (2023) instead of the corrected form
     registration_sigma_m: float = 0.0  # of the published budget
@@ -158,46 +157,47 @@ class Setup:
 
 @dataclass(frozen=True)
 class ChangeErrors:
-    """What the change of the moving ground makes wrong in an estimate; scans after like change share it.
+    """Errors of an estimate due to change of the moving ground; scans with similar change share them.
 
-    `modes` are errors of the parameters in their own units, one sigma each and independent of each other.
-    `pattern` is the change that was found, by sector round the scanner, in sigmas of what was allowed for.
+    `modes` are errors of the parameters in their own units, one sigma each and mutually independent.
+    `polar_change` is the estimated change by azimuth sector around the scanner, in sigmas of its prior.
     """
 
     modes: Floats  # (p, m)
-    pattern: Floats  # (s,)
+    polar_change: Floats  # (s,)
 
 
 @dataclass(frozen=True)
-class Shared:
-    """What all points of a scan have in common and nobody knows exactly (EQUATIONS 6.1).
+class SharedParameters:
+    """Estimate and covariance of the parameters that all points of a scan share (equations.md, 6.1).
 
-    `estimate` and `covariance` are in the parameters' own units, given by `units`. `noise_variance` is what
-    each group of scan lines has of its own beyond the parameter of its place; nought but for the lean.
-    `change` is a part of the covariance, that which other scans may have in common with this one.
+    `estimate` and `covariance` are in the parameters' own units, given by `units`. `line_tilt_variance` is
+    the independent variance of each group of scan lines about the parameter of its knot; zero except for the
+    tilt. `change_errors` is the part of the covariance that other scans may have in common with this one.
     """
 
     names: tuple[str, ...]
     units: tuple[str, ...]
     estimate: Floats  # (p,)
     covariance: Floats  # (p, p)
-    noise_variance: Floats  # (p,)
-    change: ChangeErrors | None = None
+    line_tilt_variance: Floats  # (p,)
+    change_errors: ChangeErrors | None = None
 
-    def __add__(self, other: Shared) -> Shared:
-        """Return what a sum or difference of two independent surfaces leaves unknown."""
+    def __add__(self, other: SharedParameters) -> SharedParameters:
+        """Return the shared parameters of a sum or difference of two independent surfaces."""
         return replace(
             self,
             covariance=self.covariance + other.covariance,
-            noise_variance=self.noise_variance + other.noise_variance,
+            line_tilt_variance=self.line_tilt_variance + other.line_tilt_variance,
         )
 
 
 @dataclass(frozen=True)
-class Habits:
-    """How much a station's scans differ from what is assumed, one sigma each.
+class VarianceComponents:
+    """A priori standard deviations of the parameters of a station's scans, one sigma each.
 
-    Start values: EQUATIONS 6.4; the tilt of a mount: ADJUSTMENT. A station learns its own.
+    Initial values: equations.md, 6.4; tilt of a mount: adjustment.md, 4. A station estimates its own from its
+    scans.
     """
 
     tilt_rad: float = radians(0.008)
@@ -207,103 +207,103 @@ class Habits:
     range_scale_ppm: float = 0.8
     refraction: float = 0.08
     refraction_by_azimuth: float = 0.02
-    slow_motion_rad: float = radians(0.0018)
-    fast_motion_rad: float = radians(0.0010)
-    line_motion_rad: float = radians(0.0008)
+    tilt_drift_rad: float = radians(0.0018)
+    tilt_jitter_rad: float = radians(0.0010)
+    line_jitter_rad: float = radians(0.0008)
 
 
 class Quality(IntFlag):
-    """What to know of a cell before using it."""
+    """Quality flags of a cell."""
 
-    FEW_POINTS = 1  # fewer than three
-    HIGH_INCIDENCE = 2  # the beam grazes the surface at more than 80°
-    OUTSIDE_REFERENCE = 4  # seen, but there is nothing to measure its change from
+    FEW_POINTS = 1  # fewer than three points
+    HIGH_INCIDENCE = 2  # incidence above 80°
+    OUTSIDE_REFERENCE = 4  # observed, but without a reference to measure change from
     STABLE_GROUND = 8
     CHANGE_SIGNIFICANT = 16  # at the 95 % level
 
 
-LAID_TOGETHER = 32  # rows: so many stay in the cache
-MEASURED = np.dtype(
+ROWS_PER_BLOCK = 32  # of the grid: few enough to stay in the processor's cache
+CELL_DTYPE = np.dtype(
     [
         ("elevation_m", np.float32),
         ("uncertainty_m", np.float32),  # of a single cell, everything included
-        ("random_uncertainty_m", np.float32),  # the part of it that averages out
+        ("random_uncertainty_m", np.float32),  # its random part, which averages out
         ("spread_m", np.float32),  # standard deviation of the points in the cell
     ]
 )
 
 
-def _as_it_is(_name: str, column: NDArray[Any]) -> NDArray[Any]:
+def _identity(_name: str, column: NDArray[Any]) -> NDArray[Any]:
     return column
 
 
 @dataclass(frozen=True)
 class Measurement:
-    """What a scan says of the surface, and how sure that is, cell by cell; all (n,).
+    """Height, change and uncertainty of the cells of a scan; columns have the shape (n,).
 
-    `number` (ny, nx) tells which they are: -1 where the scan saw nothing, and even the reference knows
-    nothing. `count` is the number of points; `cells` holds what `MEASURED` names, NaN where the scan saw
-    nothing; `terms` the budget of the scan's own heights term by term, where asked for.
+    `cell_index` (ny, nx) maps the grid to the columns: -1 where neither scan nor reference has a height.
+    `count` is the number of points; `cells` has the fields of `CELL_DTYPE`, NaN where the scan observed
+    nothing; `terms` is the error budget of the scan's own heights by term, if requested.
     """
 
     grid: Grid
-    number: Ints32
+    cell_index: Ints32
     count: Ints32
-    cells: NDArray[np.void]  # of MEASURED
+    cells: NDArray[np.void]  # of CELL_DTYPE
     change_m: Floats32  # mean residual to the reference, NaN where there is none
     quality: NDArray[np.uint8]  # bits of Quality
     terms: dict[str, Floats32]
 
     @classmethod
-    def of(cls, grid: Grid, quality: NDArray[np.uint8], **rasters: NDArray[Any]) -> Measurement:
-        """Take rasters (ny, nx), of terms too, in which every cell has its number."""
-        number = np.arange(grid.nx * grid.ny, dtype=np.int32).reshape(grid.shape)
-        cells = np.empty(number.size, MEASURED)
-        for name in MEASURED.names or ():
+    def from_rasters(cls, grid: Grid, quality: NDArray[np.uint8], **rasters: NDArray[Any]) -> Measurement:
+        """Return a measurement from rasters (ny, nx), including those of terms; every cell has an index."""
+        cell_index = np.arange(grid.nx * grid.ny, dtype=np.int32).reshape(grid.shape)
+        cells = np.empty(cell_index.size, CELL_DTYPE)
+        for name in CELL_DTYPE.names or ():
             cells[name] = rasters.pop(name).ravel()
-        columns = {name: one.ravel() for name, one in rasters.items()}
+        columns = {name: raster.ravel() for name, raster in rasters.items()}
         count, change_m = (columns.pop(name) for name in ("count", "change_m"))
-        return cls(grid, number, count, cells, change_m, quality.ravel(), columns)
+        return cls(grid, cell_index, count, cells, change_m, quality.ravel(), columns)
 
-    def laid(
+    def to_rasters(
         self,
         *names: str,
         rows: slice = slice(None),
-        made: Callable[[str, NDArray[Any]], NDArray[Any]] = _as_it_is,
+        transform: Callable[[str, NDArray[Any]], NDArray[Any]] = _identity,
     ) -> list[NDArray[Any]]:
-        """Lay columns out on some rows of the grid, or all: NaN, or nought, where there is nothing.
+        """Return columns as rasters on some rows of the grid, or on all; NaN or 0 in empty cells.
 
-        `made` turns the values of a column into what is laid out, NaN or nought for nothing too.
+        `transform(name, values)` converts the values of a column, and its fill value too.
         """
-        number = self.number[rows]
-        rasters = [np.full(number.shape, made(name, self._nothing(name))) for name in names]
-        for first in range(0, len(number), LAID_TOGETHER):
-            part = slice(first, first + LAID_TOGETHER)
-            there = np.flatnonzero(number[part] >= 0)
-            chosen = number[part].reshape(-1)[there]
-            cells = self.cells.take(chosen)  # at once: it is the cells that have to be waited for
+        cell_index = self.cell_index[rows]
+        rasters = [np.full(cell_index.shape, transform(name, self._empty(name))) for name in names]
+        for first in range(0, len(cell_index), ROWS_PER_BLOCK):
+            block = slice(first, first + ROWS_PER_BLOCK)
+            present = np.flatnonzero(cell_index[block] >= 0)
+            selected = cell_index[block].reshape(-1)[present]
+            cells = self.cells.take(selected)  # all fields at once: fetching the cells takes the time
             for name, raster in zip(names, rasters, strict=True):
-                column = self._beside(name)
-                values = cells[name] if column is None else column.take(chosen)
-                raster[part].reshape(-1)[there] = made(name, values)
+                column = self._column(name)
+                values = cells[name] if column is None else column.take(selected)
+                raster[block].reshape(-1)[present] = transform(name, values)
         return rasters
 
-    def _nothing(self, name: str) -> NDArray[Any]:
-        """Return what stands for nothing in a column (1,)."""
-        column = self._beside(name)
+    def _empty(self, name: str) -> NDArray[Any]:
+        """Return the fill value of a column (1,)."""
+        column = self._column(name)
         dtype = self.cells.dtype[name] if column is None else column.dtype
         return np.array([np.nan if dtype.kind == "f" else 0], dtype)
 
-    def _beside(self, name: str) -> NDArray[Any] | None:
-        """Return a column that is not among the cells."""
+    def _column(self, name: str) -> NDArray[Any] | None:
+        """Return a column that is not a field of `cells`; None for one that is."""
         return getattr(self, name) if name in ("count", "change_m", "quality") else self.terms.get(name)
 
 
 @dataclass(frozen=True)
 class Reference:
-    """The master surface that change is measured from.
+    """The reference surface that change is measured from.
 
-    `elevation_m` holds nodes at the cell centres, NaN where unknown; between them the surface is bilinear.
+    `elevation_m` are nodes at the cell centres, NaN where unknown; between them the surface is bilinear.
     """
 
     grid: Grid
@@ -311,29 +311,31 @@ class Reference:
     elevation_m: Floats  # (ny, nx)
     random_variance_m2: Floats32  # (ny, nx)
     roughness_m2: Floats32  # (ny, nx) variance of the terrain about the surface within each cell
-    shared: Shared | None  # None: given from outside, its shared errors unknown
+    shared: SharedParameters | None  # None: external surface with unknown shared errors
     scan_ids: tuple[str, ...]
-    intensity: Floats32  # (ny, nx) mean brightness, 0-1; NaN where unknown
-    variance_factor: Floats32  # (ny, nx) of the cells' random variance as scans show it, against the modelled
-    stable: Bools  # (ny, nx) found steep and without change
-    habits: Habits  # of the station, as its scans show them
-    seen: Floats32  # (ny, nx) share of its scans that saw the cell; NaN where unknown
+    intensity: Floats32  # (ny, nx) mean, 0-1; NaN where unknown
+    variance_factor: Floats32  # (ny, nx) random variance of the cells, empirical over modelled
+    stable: Bools  # (ny, nx) steep and without change in the scans
+    components: VarianceComponents  # of the station, estimated from its scans
+    visibility: Floats32  # (ny, nx) share of its scans that observed the cell; NaN where unknown
 
     @classmethod
-    def given(cls, grid: Grid, version: str, elevation_m: Floats, stable: Bools | None = None) -> Reference:
-        """Return a surface that comes from outside: exact as far as anybody knows."""
-        exact = np.where(np.isfinite(elevation_m), 0.0, np.nan).astype(np.float32)
+    def from_elevation(
+        cls, grid: Grid, version: str, elevation_m: Floats, stable: Bools | None = None
+    ) -> Reference:
+        """Return a reference from an external surface, taken as free of errors."""
+        zeros = np.where(np.isfinite(elevation_m), 0.0, np.nan).astype(np.float32)
         return cls(
             grid=grid,
             version=version,
             elevation_m=elevation_m,
-            random_variance_m2=exact,
-            roughness_m2=exact,
+            random_variance_m2=zeros,
+            roughness_m2=zeros,
             shared=None,
             scan_ids=(),
             intensity=np.full(grid.shape, np.nan, np.float32),
             variance_factor=np.ones(grid.shape, np.float32),
             stable=np.zeros(grid.shape, bool) if stable is None else stable,
-            habits=Habits(),
-            seen=np.full(grid.shape, np.nan, np.float32),
+            components=VarianceComponents(),
+            visibility=np.full(grid.shape, np.nan, np.float32),
         )

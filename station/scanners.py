@@ -1,11 +1,11 @@
-"""The laser scanners the program knows, by the name `scanner.model` gives them."""
+"""The known laser scanner models, by the value of `scanner.model`."""
 
 from __future__ import annotations
 
 # Published values: Voordendag et al. (2023), section 2.2 (VZ-6000); Hartzell et al. (2015), Table 1
 # (VZ-4000, LMS-Z390i). The papers give no range noise and no aperture for the VZ-6000, and nothing for the
-# VZ-400i: there the maker's data sheets stand in (RIEGL: 10 mm and 3 mm precision; 0.35 mrad, 1.55 µm), and
-# for how far the inclination sensors reach.
+# VZ-400i: these values, and the ranges of the inclination sensors, are from the manufacturer's data sheets
+# (RIEGL: 10 mm and 3 mm precision; 0.35 mrad, 1.55 µm).
 SCANNERS: dict[str, dict[str, float]] = {
     "riegl-vz-6000": {
         "wavelength_um": 1.064,

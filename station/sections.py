@@ -1,6 +1,6 @@
-"""The tables of the site file: every key, what it may be, and what stands for it when it is left out.
+"""The tables of the site file: every key, its valid values and its default.
 
-What each key does is told in the commented files in `config/`.
+The commented files in `config/` explain the keys.
 """
 
 from __future__ import annotations
@@ -22,21 +22,26 @@ Arm = Annotated[float, Field(ge=-2, le=2)]
 Place = Annotated[float, Field(ge=-1e8, le=1e8)]  # metres on a map; no map of the Earth is larger
 
 
-def _in_utc(moment: datetime) -> datetime:
-    return moment.astimezone(UTC)
+def _without_required(schema: dict[str, Any]) -> None:
+    """Remove the required keys from a JSON Schema: those of a known instrument have values."""
+    schema.pop("required", None)
+
+
+def _in_utc(time: datetime) -> datetime:
+    return time.astimezone(UTC)
 
 
 Utc = Annotated[AwareDatetime, AfterValidator(_in_utc)]
 
 
 class Section(BaseModel):
-    """A table of the site file: nothing unknown, nothing changed after reading."""
+    """A table of the site file: no unknown keys, immutable."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
 
 class StationSection(Section):
-    """Who the station is; goes into the metadata of everything it writes."""
+    """Identity of the station; written to the metadata of all its files."""
 
     id: Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_-]{0,31}$")]
     data: Path
@@ -58,7 +63,9 @@ class ScansSection(Section):
 
 
 class ScannerSection(Section):
-    """The instrument: a known model, each value of which may be overridden."""
+    """The instrument: a known model; each of its values can be overridden."""
+
+    model_config = ConfigDict(json_schema_extra=_without_required)
 
     model: str = "riegl-vz-6000"
     wavelength_um: Annotated[float, Field(ge=0.3, le=2.5)]
@@ -73,22 +80,22 @@ class ScannerSection(Section):
 
     @model_validator(mode="before")
     @classmethod
-    def _fill_from_model(cls, given: Any) -> Any:  # noqa: ANN401 - whatever the file holds
-        if not isinstance(given, dict) or not isinstance(given.get("model", ""), str):
-            return given  # pydantic says of what type they must be
-        model = given.get("model", "riegl-vz-6000")
+    def _fill_from_model(cls, values: Any) -> Any:  # noqa: ANN401 - any TOML value
+        if not isinstance(values, dict) or not isinstance(values.get("model", ""), str):
+            return values  # pydantic reports the types
+        model = values.get("model", "riegl-vz-6000")
         known = SCANNERS.get(model, {})
-        missing = set(SCANNERS["riegl-vz-6000"]) - set(given)
+        missing = set(SCANNERS["riegl-vz-6000"]) - set(values)
         if not known and missing:
             raise ValueError(
-                f"unknown scanner {model!r}: take one of {', '.join(SCANNERS)},"
+                f"unknown scanner {model!r}: choose from {', '.join(SCANNERS)},"
                 f" or give {', '.join(sorted(missing))}"
             )
-        return {**known, **given}
+        return {**known, **values}
 
     @property
     def instrument(self) -> Scanner:
-        """The scanner as a quantity, angles in radians."""
+        """The scanner, angles in radians."""
         return Scanner(
             model=self.model,
             wavelength_um=self.wavelength_um,
@@ -104,7 +111,7 @@ class ScannerSection(Section):
 
 
 class SopSection(Section):
-    """A scanner orientation and position, and from when it holds."""
+    """A scanner orientation and position, and the time from which it is valid."""
 
     from_: Annotated[Utc, Field(alias="from")]
     file: Path
@@ -120,7 +127,7 @@ class Origin(Section):
 
 
 class MapSection(Section):
-    """The map the products are in, and how the project frame hangs on it."""
+    """The map of the products, and how the project frame is placed on it."""
 
     crs: str | None = None
     origin: Origin | None = None
@@ -138,7 +145,7 @@ class Bounds(Section):
 
 
 class GridSection(Section):
-    """The fixed raster."""
+    """The grid of the products."""
 
     bounds_m: Bounds
     cell_m: Annotated[float, Field(ge=0.001)] = 1.0
@@ -157,7 +164,7 @@ class GridSection(Section):
                     " make it a whole number"
                 )
         if self.shape[0] * self.shape[1] > 100_000_000:
-            raise ValueError(f"{self.shape} cells are too many: coarsen cell_m or cut bounds_m")
+            raise ValueError(f"{self.shape} cells are too many: increase cell_m or reduce bounds_m")
         return self
 
     @property
@@ -168,7 +175,7 @@ class GridSection(Section):
 
 
 class InclinationSection(Section):
-    """The inclination log beside each scan and what is done with it."""
+    """The inclination log of each scan, and how it is used."""
 
     suffix: str = "-incl.txt"
     required: bool = True
@@ -179,7 +186,7 @@ class InclinationSection(Section):
 
 
 class WeatherColumns(Section):
-    """What the weather log calls its columns."""
+    """Column names of the weather log."""
 
     time: str = "TIMESTAMP"
     temperature_c: str
@@ -207,12 +214,12 @@ class AirValues(Section):
 
     @property
     def air(self) -> Air:
-        """The same as a quantity."""
+        """The air at the scanner."""
         return Air(self.temperature_c, self.pressure_hpa, self.humidity_pct)
 
 
 class AirSection(Section):
-    """What the scanner itself assumed of the air; without this table nothing is corrected for air."""
+    """The air that the scanner assumed; without this table there is no correction for the air."""
 
     scanner_setting: AirValues | Literal["weather"] = AirValues(
         temperature_c=-2.0, pressure_hpa=684.0, humidity_pct=28.0
@@ -221,47 +228,47 @@ class AirSection(Section):
 
 
 class AdjustmentSection(Section):
-    """How the pose of each scan is found, and on which ground: found out, or the polygons of a GeoJSON."""
+    """How the pose of each scan is estimated, and from which stable ground: detected, or from a GeoJSON."""
 
     method: Literal["none", "joint"] = "joint"
     stable: Literal["auto"] | Path = "auto"
 
 
 class UncertaintySection(Section):
-    """Which budget is computed, and whether its terms are stored."""
+    """Which error budget is computed, and whether its terms are stored."""
 
     model: Literal["rigorous", "voordendag2023"] = "rigorous"
-    registration_sigma_m: NotNegative = 0.0  # of the published budget only
+    registration_sigma_m: NotNegative = 0.0  # published budget only
     store_terms: bool = False
 
 
 class ReferenceSection(Section):
-    """The master surface: the mean of the first usable scans, or a GeoTIFF."""
+    """The reference surface: the mean of the first usable scans, or a GeoTIFF."""
 
     scans: Annotated[int, Field(ge=1, le=200)] | Path = 8
 
 
 class AreasSection(Section):
-    """Named polygons, each of which becomes a time series of mean and volume change."""
+    """Named polygons; each has a time series of mean and volume change."""
 
     file: Path
 
 
 class FlagsSection(Section):
-    """A person's list of times whose epochs are not to be used."""
+    """A manual list of time intervals whose epochs must not be used."""
 
     file: Path
 
 
 class RetentionSection(Section):
-    """What becomes of raw scans that are stored and verified."""
+    """What happens to raw scans once they are stored and verified."""
 
     raw: Literal["leave", "move", "delete"] = "leave"
     keep_days: NotNegative = 30.0
     archive: Path | None = None
 
     @model_validator(mode="after")
-    def _says_where(self) -> RetentionSection:
+    def _require_archive(self) -> RetentionSection:
         if self.raw == "move" and self.archive is None:
             raise ValueError('raw = "move" needs archive, the folder to move scans to')
         return self
@@ -275,7 +282,7 @@ def _on_loopback(address: str) -> str:
     except ValueError:
         is_loopback = is_port = False
     if not (is_loopback and is_port):
-        raise ValueError('give an address of this machine alone and a port: "127.0.0.1:9750"')
+        raise ValueError('give a loopback address and a port: "127.0.0.1:9750"')
     return address
 
 
@@ -291,9 +298,9 @@ Target = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_-]{0,63}$")]
 
 
 class ChangeAlarm(Section):
-    """What change of an area is worth an alarm."""
+    """The change of areas that raises an alarm."""
 
-    areas: tuple[str, ...] = ()  # none named: all
+    areas: tuple[str, ...] = ()  # empty: all areas
     within_h: Positive = 6.0
     least_m: NotNegative = 0.0
     scans: Annotated[int, Field(ge=1, le=24)] = 2
@@ -301,7 +308,7 @@ class ChangeAlarm(Section):
 
 
 class AlarmsSection(Section):
-    """What people are told of, and by which targets: names of credentials. 0 switches a rule off."""
+    """The alarm rules, and the targets (names of credentials) that are notified. 0 disables a rule."""
 
     targets: tuple[Target, ...] = ()
     digest: Target | None = None
@@ -316,7 +323,7 @@ class AlarmsSection(Section):
 
 
 class ProductsSection(Section):
-    """What is made of every scan for people and other tools."""
+    """What is produced from every scan for people and other programs."""
 
     page: bool = True
     geotiff: bool = False
@@ -349,11 +356,11 @@ class SiteFile(Section):
     @model_validator(mode="after")
     def _chain_is_complete(self) -> SiteFile:
         if self.scans.frame == "scanner" and not self.sop:
-            raise ValueError('scans.frame = "scanner" needs an [[sop]] to lead the points to the map')
+            raise ValueError('scans.frame = "scanner" needs an [[sop]] to transform the points to the map')
         if self.map.crs is None and (self.map.pop or self.map.origin):
-            raise ValueError("map.pop and map.origin lead to a map: say which with map.crs")
+            raise ValueError("map.pop and map.origin need map.crs, the map they refer to")
         if self.map.pop and self.map.origin and self.scans.frame == "scanner":
-            raise ValueError("map.pop and map.origin are two ways to the same map: keep one")
+            raise ValueError("map.pop and map.origin both place the project frame on the map: keep one")
         if self.alarms and self.alarms.change and not self.areas:
-            raise ValueError("alarms.change needs areas: name their file in [areas]")
+            raise ValueError("alarms.change needs areas: give their file in [areas]")
         return self

@@ -1,4 +1,4 @@
-"""What every test may ask for."""
+"""Fixtures shared by all tests."""
 
 from __future__ import annotations
 
@@ -7,16 +7,17 @@ from pathlib import Path
 
 import pytest
 
-# As in the service's children: on a busy machine matrices take many times as long on several threads.
+# As in the worker processes: on a busy machine, threaded linear algebra is many times slower.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+pytest_plugins = ["support.epochs", "support.site"]
 PROJECT = Path(__file__).resolve().parents[1]
 
 
 @pytest.fixture(scope="session")
 def shared_data() -> Path:
-    """Return the folder of real scans, logs and matrices; the test is skipped where there is none.
+    """Return the folder of real scans, logs and matrices, `STATION_SHARED_DATA`; without it, skip the test.
 
-    They are not part of the project, for their size and licences; `STATION_SHARED_DATA` says where they are.
+    The data are not part of the project because of their size and licences.
     """
     folder = Path(os.environ.get("STATION_SHARED_DATA", PROJECT.parent / "shared" / "data"))
     if not folder.is_dir():

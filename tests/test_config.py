@@ -1,8 +1,13 @@
-"""The site file: every fault at once, in words that say what to do."""
+"""The site file: all faults at once, each with its remedy; its JSON Schema."""
+
+import json
+import tomllib
+from datetime import datetime
+from pathlib import Path
 
 import pytest
 
-from station.config import read_site
+from station.config import SCHEMA_NAME, read_site, site_schema, write_site
 from station.errors import ConfigError
 
 GOOD = """
@@ -32,7 +37,7 @@ def test_paths_are_relative_to_the_file(tmp_path):
     assert site.instrument.beam_divergence_rad == pytest.approx(0.12e-3)
 
 
-def test_all_faults_at_once_with_the_nearest_right_key(tmp_path):
+def test_all_faults_are_listed_with_the_closest_valid_key(tmp_path):
     text = (
         GOOD.replace('id = "x"', 'id = "a b"')
         .replace("frame", "fram")
@@ -40,20 +45,20 @@ def test_all_faults_at_once_with_the_nearest_right_key(tmp_path):
     )
     with pytest.raises(ConfigError) as error:
         read(tmp_path, text + '[uncertainty]\nmodel = "best"\n')
-    told = str(error.value)
-    assert "site.toml: 4 to mend" in told
-    assert "scans.fram: no such key; did you mean 'frame'?" in told
-    assert "station.id" in told
-    assert "make it a whole number" in told
-    assert "uncertainty.model" in told
+    message = str(error.value)
+    assert "site.toml: 4 to fix" in message
+    assert "scans.fram: no such key; did you mean 'frame'?" in message
+    assert "station.id" in message
+    assert "make it a whole number" in message
+    assert "uncertainty.model" in message
 
 
 @pytest.mark.parametrize(
-    ("change", "says"),
+    ("change", "message"),
     [
         (("[station]", "[station"), "not valid TOML"),
         (('frame = "map"', 'frame = "scanner"'), "needs an"),
-        (("[grid]", '[scanner]\nmodel = "vz"\n[grid]'), "take one of riegl-vz-6000"),
+        (("[grid]", '[scanner]\nmodel = "vz"\n[grid]'), "choose from riegl-vz-6000"),
         (("[grid]", "[scanner]\nmodel = []\n[grid]"), "scanner.model: .* string"),
         (("[station]", "scanner = 5\n[station]"), "scanner: .* dictionary"),
         (("[grid]", '[reference]\nscans = "there.tif"\n[grid]'), "no such file"),
@@ -63,7 +68,7 @@ def test_all_faults_at_once_with_the_nearest_right_key(tmp_path):
         (("[grid]", "[products]\nquicklook_width_px = 100\n[grid]"), "products.quicklook_width_px"),
         (("[grid]", "[products]\nchange_limit_m = 0\n[grid]"), "products.change_limit_m"),
         (("[grid]", "[areas]\n[grid]"), "areas.file: missing"),
-        (("[grid]", '[map]\npop = "pop.dat"\n[grid]'), "say which with map.crs"),
+        (("[grid]", '[map]\npop = "pop.dat"\n[grid]'), "need map.crs"),
         (("east = 10.0", "east = -10.0"), "at least one cell_m beyond"),
         (("cell_m = 0.5", "cell_m = 0.001"), "too many"),
         (("cell_m = 0.5", "cell_m = 1e-320"), "grid.cell_m"),
@@ -71,60 +76,109 @@ def test_all_faults_at_once_with_the_nearest_right_key(tmp_path):
         (("cell_m = 0.5", "cell_m = nan"), "grid.cell_m"),
     ],
 )
-def test_faults_say_what_to_do(tmp_path, change, says):
-    with pytest.raises(ConfigError, match=says):
+def test_each_fault_is_explained(tmp_path, change, message):
+    with pytest.raises(ConfigError, match=message):
         read(tmp_path, GOOD.replace(*change))
 
 
-def test_a_missing_file_and_a_folder(tmp_path):
+def test_missing_file_and_folder(tmp_path):
     with pytest.raises(ConfigError, match="cannot be read"):
         read_site(tmp_path / "none.toml")
     with pytest.raises(ConfigError, match="is a folder"):
         read_site(tmp_path)
 
 
-def test_only_what_changes_numbers_changes_the_hash(tmp_path):
-    one = read(tmp_path, GOOD).science_hash
-    assert read(tmp_path, GOOD.replace('inbox = "inbox"', 'inbox = "other"')).science_hash == one
-    assert read(tmp_path, GOOD.replace("cell_m = 0.5", "cell_m = 1.0")).science_hash != one
+def test_science_hash_depends_on_settings_that_change_results(tmp_path):
+    original = read(tmp_path, GOOD).science_hash
+    assert read(tmp_path, GOOD.replace('inbox = "inbox"', 'inbox = "other"')).science_hash == original
+    assert read(tmp_path, GOOD.replace("cell_m = 0.5", "cell_m = 1.0")).science_hash != original
 
 
-def test_stable_ground_counts_by_what_the_file_says(tmp_path):
+def test_science_hash_depends_on_the_content_of_the_stable_ground(tmp_path):
     (tmp_path / "one.geojson").write_text("{}")
     (tmp_path / "same.geojson").write_text("{}")
     (tmp_path / "other.geojson").write_text("[]")
     auto = read(tmp_path, GOOD)
     assert (auto.adjustment.method, auto.adjustment.stable) == ("joint", "auto")
-    wording = GOOD + '[adjustment]\nstable = "{}.geojson"\n'
-    one, same, other = (read(tmp_path, wording.replace("{}", name)) for name in ("one", "same", "other"))
-    assert one.adjustment.stable == tmp_path / "one.geojson"
-    assert one.science_hash == same.science_hash
-    assert len({auto.science_hash, one.science_hash, other.science_hash}) == 3
+    template = GOOD + '[adjustment]\nstable = "{}.geojson"\n'
+    first, same, other = (read(tmp_path, template.replace("{}", name)) for name in ("one", "same", "other"))
+    assert first.adjustment.stable == tmp_path / "one.geojson"
+    assert first.science_hash == same.science_hash
+    assert len({auto.science_hash, first.science_hash, other.science_hash}) == 3
 
 
-def test_areas_change_no_epoch(tmp_path):
+def test_science_hash_does_not_depend_on_areas(tmp_path):
     (tmp_path / "areas.geojson").write_text("{}")
     site = read(tmp_path, f'{GOOD}[areas]\nfile = "areas.geojson"\n')
     assert site.areas.file == tmp_path / "areas.geojson"
     assert site.science_hash == read(tmp_path, GOOD).science_hash
 
 
-def test_only_what_changes_numbers_of_every_epoch_changes_the_hash(tmp_path):
-    """Whatever an epoch names itself, and whatever keeps house, leaves it alone."""
+def test_science_hash_excludes_what_each_epoch_records_and_housekeeping(tmp_path):
     columns = 'columns = {{ temperature_c = "{}", humidity_pct = "H", pressure_hpa = "P" }}'
     weather = f'[weather]\nfile = "w.dat"\n{columns}\n'
     (tmp_path / "flags.csv").write_text("from,to,reason\n")
-    one = read(tmp_path, GOOD + weather.format("T")).science_hash
-    for more in (
-        weather.format("T2"),  # other air: the epochs it changes tell by their own
+    original = read(tmp_path, GOOD + weather.format("T")).science_hash
+    for section in (
+        weather.format("T2"),  # other air: each epoch records its own
         weather.format("T") + '[flags]\nfile = "flags.csv"\n',
         weather.format("T") + '[retention]\nraw = "delete"\n',
         weather.format("T") + "[service]\nmemory_gb = 3\n",
     ):
-        assert read(tmp_path, GOOD + more).science_hash == one
-    for more in (
+        assert read(tmp_path, GOOD + section).science_hash == original
+    for section in (
         weather.format("T") + "max_age_s = 60\n",
         weather.format("T") + "[reference]\nscans = 3\n",
         weather.format("T") + "[inclination]\ncutoff_hz = 0.1\n",
     ):
-        assert read(tmp_path, GOOD + more).science_hash != one
+        assert read(tmp_path, GOOD + section).science_hash != original
+
+
+def as_json(value):
+    """A TOML document with its times as text, as editors pass it to a validator."""
+    if isinstance(value, dict):
+        return {key: as_json(item) for key, item in value.items()}
+    if isinstance(value, list):
+        return [as_json(item) for item in value]
+    return value.isoformat() if isinstance(value, datetime) else value
+
+
+@pytest.mark.parametrize("name", ["hintereisferner", "mammoth"])
+def test_shipped_site_files_satisfy_the_schema(name):
+    from jsonschema import Draft7Validator
+
+    schema = json.loads(site_schema())
+    Draft7Validator.check_schema(schema)
+    text = (Path(__file__).parents[1] / "config" / f"{name}.toml").read_text(encoding="utf-8")
+    document = as_json(tomllib.loads(text))
+    assert not list(Draft7Validator(schema).iter_errors(document))
+    document["scanner"] = {"model": "riegl-vz-400i"}  # its values are known
+    assert not list(Draft7Validator(schema).iter_errors(document))
+
+
+@pytest.mark.parametrize(
+    ("section", "key", "value"),
+    [
+        ("scans", "fram", "map"),
+        ("scans", "frame", "maps"),
+        ("grid", "cell_m", "1 m"),
+        ("grid", "cell_m", 0),
+        ("scanner", "beam_origin_m", [0, 0, 3]),
+        ("scanner", "beam_origin_m", [0, 0]),
+        ("sop", "from", "2024-10-01T00:00:00Z"),
+        ("reference", "scans", 0),
+    ],
+)
+def test_schema_rejects_invalid_keys_and_values(section, key, value):
+    from jsonschema import Draft7Validator
+
+    document = {**as_json(tomllib.loads(GOOD)), "reference": {}, "scanner": {}, "sop": {}}
+    document[section] = {**document[section], key: value}
+    assert list(Draft7Validator(json.loads(site_schema())).iter_errors(document))
+
+
+def test_init_writes_the_schema_next_to_the_site_file(tmp_path):
+    path = write_site(tmp_path / "station", "hef")
+    directive, *_ = path.read_text(encoding="utf-8").splitlines()
+    assert directive == f"#:schema ./{SCHEMA_NAME}"
+    assert (path.parent / SCHEMA_NAME).read_text(encoding="utf-8") == site_schema()

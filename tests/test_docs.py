@@ -1,5 +1,6 @@
-"""Whatever a user meets stands in the README or in the commented site files."""
+"""The documentation agrees with the code: README, generated reference, commented site files."""
 
+import importlib.util
 import re
 import subprocess
 import sys
@@ -8,41 +9,29 @@ from pathlib import Path
 import pytest
 from pydantic import BaseModel
 
-from station import config, errors
-from station.archive.areas import AREA_VARIABLES
-from station.archive.variables import VARIABLES
+from station import config
 from station.config import read_site, write_site
 from station.scanners import SCANNERS
 from station.sections import SiteFile
 
 ROOT = Path(__file__).parents[1]
+DOCS = ROOT / "docs"
 README = (ROOT / "README.md").read_text(encoding="utf-8")
 SITES = "\n".join(path.read_text(encoding="utf-8") for path in (ROOT / "config").glob("*.toml"))
 
 
 def commands():
-    told = subprocess.run(
-        [sys.executable, "-m", "station.cli", "--help"], capture_output=True, text=True, check=True
+    text = subprocess.run(
+        [sys.executable, "-m", "station", "--help"], capture_output=True, text=True, check=True
     ).stdout
-    return re.findall(r"^  ([a-z]+)  ", told[told.index("Commands:") :], re.MULTILINE)
+    return re.findall(r"^  ([a-z]+)  ", text[text.index("Commands:") :], re.MULTILINE)
 
 
-def test_every_command():
-    found = commands()
-    assert {"init", "check", "process", "run", "status", "simulate", "demo"} <= set(found)
-    for command in found:
+def test_every_command_is_in_the_readme():
+    names = commands()
+    assert {"init", "check", "process", "run", "status", "simulate", "demo"} <= set(names)
+    for command in names:
         assert f"`station {command}" in README
-
-
-def test_every_variable_of_the_store():
-    for row in (*VARIABLES, *AREA_VARIABLES):
-        assert f"`{row.name}`" in README, row.name
-
-
-def test_every_error():
-    for error in vars(errors).values():
-        if isinstance(error, type) and error is not errors.StationError:
-            assert f"`{error.__name__}`" in README
 
 
 def keys(model):
@@ -53,7 +42,7 @@ def keys(model):
             yield from keys(section)
 
 
-def test_every_key_of_the_site_file():
+def test_every_key_of_the_site_file_is_in_the_examples():
     optional = {"exit_diameter_m", "registration_sigma_m", "time"}  # overrides for other instruments and logs
     missing = [key for key in set(keys(SiteFile)) - optional if not re.search(rf"\b{key}\b", SITES)]
     assert not missing
@@ -61,19 +50,18 @@ def test_every_key_of_the_site_file():
 
 @pytest.mark.parametrize("like", ["hef", "mammoth"])
 def test_site_files_are_complete(tmp_path, like):
-    """Apart from the SOP, which is a station's own."""
+    """They can be read as they are, but for the files with the SOP of a station."""
     site = write_site(tmp_path, like)
     text = site.read_text(encoding="utf-8")
     for name in re.findall(r'(?:file|pop) = "([^"]+\.dat)"', text):
         (tmp_path / name).write_text("1 0 0 0\n0 1 0 0\n0 0 1 0\n0 0 0 1\n")
-    told = read_site(site)
-    assert told.station.id == like
+    assert read_site(site).station.id == like
     with pytest.raises(config.ConfigError, match="nothing is overwritten"):
         write_site(tmp_path, like)
 
 
-def test_papers_instrument_values():
-    """V section 2.2, H Table 1."""
+def test_instrument_values_equal_those_of_the_papers():
+    """Voordendag et al. (2023), section 2.2; Hartzell et al. (2015), Table 1."""
     vz6000 = SCANNERS["riegl-vz-6000"]
     assert (vz6000["wavelength_um"], vz6000["beam_divergence_mrad"]) == (1.064, 0.12)
     assert vz6000["inclination_sigma_deg"] == 0.008
@@ -83,3 +71,26 @@ def test_papers_instrument_values():
     )  # fmt: skip
     z390 = SCANNERS["riegl-lms-z390i"]
     assert (z390["beam_divergence_mrad"], z390["range_sigma_m"]) == (0.30, 0.004)
+
+
+@pytest.fixture(scope="module")
+def generator():
+    spec = importlib.util.spec_from_file_location("generate_reference", DOCS / "generate_reference.py")
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def test_the_committed_pages_are_those_of_the_code(generator):
+    for name, expected in generator.generated_pages().items():
+        actual = (DOCS / "reference" / name).read_text(encoding="utf-8")
+        assert actual == expected, f"{name}: run python docs/generate_reference.py"
+
+
+def test_every_log_key_is_described(generator):
+    assert not generator.log_keys() - set(generator.LOG_KEYS)
+
+
+def test_the_readme_stays_short():
+    assert len(README.splitlines()) <= 150
+    assert len(README.split()) <= 1200

@@ -1,1 +1,1 @@
-"""Arrays to bytes: what others read."""
+"""File formats of the store: arrays to bytes."""

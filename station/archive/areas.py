@@ -1,11 +1,11 @@
-"""`areas.nc`: mean and volume change of named areas over time, made from the epochs."""
+"""`areas.nc`: mean and volume change of named areas over time, computed from the epochs."""
 
 from __future__ import annotations
 
 import hashlib
 import json
 from collections.abc import Callable
-from dataclasses import astuple
+from dataclasses import astuple, dataclass
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -13,56 +13,70 @@ import h5py
 import netCDF4
 import numpy as np
 
-from station.archive.aggregate import AreaChange
-from station.archive.layout import (
-    TIMES_TOGETHER,
+from station.archive.atomic_files import atomic_write
+from station.archive.epochs import EpochRef
+from station.archive.netcdf_layout import (
+    TIMES_PER_CHUNK,
     Series,
-    define,
-    introduce,
-    strings,
-    time_axis,
-    written_whole,
+    create_time_axis,
+    create_variable,
+    decode_text,
+    write_global_attrs,
 )
-from station.archive.sources import ORDINARY, read_source, runs, take_over
-from station.archive.store import Named, Row
-from station.archive.variables import BY_NAME, FILL, TEXT, TEXT_LENGTH, Variable
+from station.archive.schema import BY_NAME, FILL, TEXT, TEXT_LENGTH, Variable
+from station.archive.series.epoch_reader import LIBVER_COMPAT, contiguous_runs, copy_unchanged, read_source
+from station.archive.series.index import SeriesIndex
 from station.quantities import Bools
-from station.science.change import SIGNIFICANT_SIGMAS
+from station.science.gridding.significance import SIGNIFICANT_SIGMAS
 
-Columns = dict[str, np.ndarray[Any, Any]]  # all that lies over time, as it stands in the file
+Columns = dict[str, np.ndarray[Any, Any]]  # variables over time, as stored
 
-MASKS = "area_masks_sha256"
-LACKING = -1
+MASKS_ATTRIBUTE = "area_masks_sha256"
+MISSING = -1
 _OVER_TIME = ("time", "area")
-_ONE_SIGMA = "one standard deviation, with what all cells of a scan share and what was interpolated"
+_ONE_SIGMA = "one standard deviation, including errors shared by all cells of a scan and interpolation"
 
 
-def _of(quantity: str, told: str, units: str, comment: str) -> tuple[Variable, ...]:
-    """Return the variables of a quantity: its value, one sigma, and between what it lies at 95 %."""
+@dataclass(frozen=True)
+class AreaChange:
+    """Change of an area: mean with voids interpolated, median of the observed cells, one sigma each [m].
+
+    NaN if no cell was observed.
+    """
+
+    mean_m: float
+    mean_sigma_m: float
+    median_m: float
+    median_sigma_m: float
+    coverage: float  # share of the cells that have a change
+
+
+def _with_uncertainty(quantity: str, description: str, units: str, comment: str) -> tuple[Variable, ...]:
+    """Return the variables of a quantity: value, one sigma, and the bounds of the 95 % interval."""
     return (
-        Variable(quantity, _OVER_TIME, "f8", f"{told} of the area", units, comment=comment),
+        Variable(quantity, _OVER_TIME, "f8", f"{description} of the area", units, comment=comment),
         Variable(
             f"{quantity}_uncertainty",
             _OVER_TIME,
             "f8",
-            f"uncertainty of the {told}",
+            f"uncertainty of the {description}",
             units,
             comment=_ONE_SIGMA,
         ),
-        Variable(f"{quantity}_low", _OVER_TIME, "f8", f"lower end of the {told} at 95 %", units),
-        Variable(f"{quantity}_high", _OVER_TIME, "f8", f"upper end of the {told} at 95 %", units),
+        Variable(f"{quantity}_low", _OVER_TIME, "f8", f"lower bound of the {description} at 95 %", units),
+        Variable(f"{quantity}_high", _OVER_TIME, "f8", f"upper bound of the {description} at 95 %", units),
     )
 
 
 AREA_VARIABLES: tuple[Variable, ...] = (
     Variable("area_name", ("area", "area_text"), "S1", "name of the area"),
     Variable("area_size", ("area",), "f8", "horizontal size of the area's cells on the grid", "m2"),
-    *_of(
+    *_with_uncertainty(
         "mean_change", "mean elevation change", "m",
-        "against the reference surface; cells without a change are interpolated from those around them",
+        "relative to the reference surface; cells without a change are interpolated from their neighbours",
     ),
-    *_of("median_change", "median elevation change", "m", "of the cells that have a change"),
-    *_of("volume_change", "volume change", "m3", "mean_change times area_size"),
+    *_with_uncertainty("median_change", "median elevation change", "m", "of the cells that have a change"),
+    *_with_uncertainty("volume_change", "volume change", "m3", "mean_change times area_size"),
     Variable("coverage", _OVER_TIME, "f8", "share of the area's cells that have a change", "1"),
     BY_NAME["epoch_file"],
     BY_NAME["reference_version"],
@@ -70,153 +84,164 @@ AREA_VARIABLES: tuple[Variable, ...] = (
 
 
 class Aggregator(Protocol):
-    """What knows how an area changed and how sure that is."""
+    """Computes the change of an area and its uncertainty."""
 
-    def area(self, cells: Bools, row: Row) -> AreaChange:
-        """How the cells (ny, nx) changed in an epoch; NaN where none has a change."""
+    def area(self, cells: Bools, epoch: EpochRef) -> AreaChange:
+        """Return the change of the cells (ny, nx) in an epoch; NaN if no cell has a change."""
 
 
 def update_areas(
     series: Series, areas: dict[str, Bools], aggregator: Aggregator, progress: Callable[[], None]
 ) -> Path | None:
-    """Make `areas.nc` agree with `series.nc`; `areas` are cells (ny, nx) by name.
+    """Bring `areas.nc` up to date with `series.nc` and return its path; `areas` are masks (ny, nx) by name.
 
-    Epochs it already holds are not computed again unless an area has changed. Returns None, and writes
-    nothing, where there is no area or no epoch. `progress` is called after each epoch computed. Raises
-    StoreError where an epoch is damaged or it cannot write; then the old file stays.
+    Epochs already in the file are not computed again unless an area has changed. Returns None and writes
+    nothing if there is no area or no epoch. `progress` is called after each epoch computed. Raises
+    StoreError if an epoch is damaged or the file cannot be written; the old file then remains.
     """
-    found = Named(series) if areas else ()
-    if not found:
+    epochs = SeriesIndex(series) if areas else ()
+    if not epochs:
         return None
     path = series.folder / "areas.nc"
     masks = fingerprint(series, areas)
-    whole, known = _read(path, masks, len(areas), found)
-    place = {key: index for index, key in enumerate(_keys(known["time"], _names(known["epoch_file"])))}
-    at = [place.get(key, LACKING) for key in _keys(found.time_s[whole:], found.epoch_file[whole:])]
-    if at == list(range(len(place))):
+    unchanged, known = _read_known(path, masks, len(areas), epochs)
+    known_row = {
+        key: index
+        for index, key in enumerate(_epoch_keys(known["time"], _join_characters(known["epoch_file"])))
+    }
+    known_rows = [
+        known_row.get(key, MISSING)
+        for key in _epoch_keys(epochs.time_s[unchanged:], epochs.epoch_file[unchanged:])
+    ]
+    if known_rows == list(range(len(known_row))):
         return path
     size_m2 = np.array([np.count_nonzero(cells) for cells in areas.values()]) * series.grid.cell_m**2
-    lacking = [found[whole + index] for index, place in enumerate(at) if place == LACKING]
-    measured = _measure(lacking, areas, size_m2, aggregator, progress)
-    is_known = np.array(at) != LACKING
-    columns = _blank(len(at), len(areas))
+    missing = [
+        epochs[unchanged + index] for index, known_row in enumerate(known_rows) if known_row == MISSING
+    ]
+    computed = _compute(missing, areas, size_m2, aggregator, progress)
+    is_known = np.array(known_rows) != MISSING
+    columns = _blank(len(known_rows), len(areas))
     for name, column in columns.items():
-        column[is_known] = known[name][[index for index in at if index != LACKING]]
-        column[~is_known] = measured[name]
-    with written_whole(path) as beside:
-        with netCDF4.Dataset(beside, "w", clobber=False) as file:
-            _write(file, series, tuple(areas), size_m2, columns, whole)
-            file.setncattr(MASKS, masks)
-        if whole:
-            with h5py.File(path, "r") as old, h5py.File(beside, "r+", libver=ORDINARY) as file:
-                take_over(old, file, tuple(columns), whole)
+        column[is_known] = known[name][[index for index in known_rows if index != MISSING]]
+        column[~is_known] = computed[name]
+    with atomic_write(path) as tmp_path:
+        with netCDF4.Dataset(tmp_path, "w", clobber=False) as file:
+            _write(file, series, tuple(areas), size_m2, columns, unchanged)
+            file.setncattr(MASKS_ATTRIBUTE, masks)
+        if unchanged:
+            with h5py.File(path, "r") as old_file, h5py.File(tmp_path, "r+", libver=LIBVER_COMPAT) as file:
+                copy_unchanged(old_file, file, tuple(columns), unchanged)
     return path
 
 
 def fingerprint(series: Series, areas: dict[str, Bools]) -> str:
-    """Identify areas by their names, their order and their cells, and the grid these are of."""
-    told = hashlib.sha256(json.dumps([astuple(series.grid), list(areas)]).encode())
+    """Return a hash of the areas: names, order, cells and grid."""
+    digest = hashlib.sha256(json.dumps([astuple(series.grid), list(areas)]).encode())
     for cells in areas.values():
-        told.update(np.packbits(cells).tobytes())
-    return told.hexdigest()
+        digest.update(np.packbits(cells).tobytes())
+    return digest.hexdigest()
 
 
-def is_of(path: Path, series: Series, areas: dict[str, Bools]) -> bool:
-    """Tell whether a file holds the series of just these areas."""
+def matches(path: Path, series: Series, areas: dict[str, Bools]) -> bool:
+    """Return True if a file contains the series of exactly these areas."""
     try:
         with h5py.File(path, "r") as file:
-            return bool(file.attrs[MASKS] == np.bytes_(fingerprint(series, areas)))
+            return bool(file.attrs[MASKS_ATTRIBUTE] == np.bytes_(fingerprint(series, areas)))
     except (OSError, RuntimeError, KeyError):
         return False
 
 
 def _blank(times: int, areas: int) -> Columns:
-    """Return columns without any value."""
+    """Return empty columns."""
     return {
         "time": np.zeros(times),
         "time_bnds": np.zeros((times, 2)),
-        **{row.name: np.full((times, areas), FILL) for row in AREA_VARIABLES if row.dims == _OVER_TIME},
+        **{spec.name: np.full((times, areas), FILL) for spec in AREA_VARIABLES if spec.dims == _OVER_TIME},
         **{
-            row.name: np.zeros((times, TEXT_LENGTH["text"]), "S1")
-            for row in AREA_VARIABLES
-            if row.dims == TEXT
+            spec.name: np.zeros((times, TEXT_LENGTH["text"]), "S1")
+            for spec in AREA_VARIABLES
+            if spec.dims == TEXT
         },
     }
 
 
-def _keys(time_s: np.ndarray[Any, Any], epoch_file: np.ndarray[Any, Any]) -> list[tuple[float, bytes]]:
-    """Return what tells one epoch from another: its time and file."""
+def _epoch_keys(time_s: np.ndarray[Any, Any], epoch_file: np.ndarray[Any, Any]) -> list[tuple[float, bytes]]:
+    """Return the keys that identify epochs: time and file name."""
     return list(zip(time_s.tolist(), epoch_file.tolist(), strict=True))
 
 
-def _names(letters: np.ndarray[Any, Any]) -> np.ndarray[Any, Any]:
-    """Return characters (n, length) as names (n,)."""
-    return np.ascontiguousarray(letters).view(f"S{letters.shape[-1]}")[:, 0]
+def _join_characters(characters: np.ndarray[Any, Any]) -> np.ndarray[Any, Any]:
+    """Return characters (n, length) as byte strings (n,)."""
+    return np.ascontiguousarray(characters).view(f"S{characters.shape[-1]}")[:, 0]
 
 
-def _read(path: Path, masks: str, areas: int, named: Named) -> tuple[int, Columns]:
-    """Read what the file holds of these areas: how many epochs stand as they are, and what comes after them.
+def _read_known(path: Path, masks: str, areas: int, index: SeriesIndex) -> tuple[int, Columns]:
+    """Return the number of leading epochs that can be copied unchanged, and the columns of those after them.
 
-    Those that stand fill whole chunks. Nothing where the file is not there, damaged or of other areas.
+    The unchanged epochs fill whole chunks. Zero and empty columns if the file is missing, damaged or of
+    other areas.
     """
     blank = _blank(0, areas)
     try:
         with h5py.File(path, "r") as file:
-            if file.attrs[MASKS] != np.bytes_(masks):
+            if file.attrs[MASKS_ATTRIBUTE] != np.bytes_(masks):
                 return 0, blank
             times = len(file["time"])
             if any(file[name].shape != (times, *column.shape[1:]) for name, column in blank.items()):
                 return 0, blank
-            stands = np.array_equal(file["time"][:], named.time_s[:times])
-            stands = stands and np.array_equal(_names(file["epoch_file"][:]), named.epoch_file[:times])
-            stands = stands and all(file[name].chunks[0] == TIMES_TOGETHER for name in blank)
-            whole = times // TIMES_TOGETHER * TIMES_TOGETHER if stands else 0
-            return whole, {
-                name: np.asarray(file[name][whole:], dtype=column.dtype) for name, column in blank.items()
+            is_unchanged = np.array_equal(file["time"][:], index.time_s[:times])
+            is_unchanged = is_unchanged and np.array_equal(
+                _join_characters(file["epoch_file"][:]), index.epoch_file[:times]
+            )
+            is_unchanged = is_unchanged and all(file[name].chunks[0] == TIMES_PER_CHUNK for name in blank)
+            unchanged = times // TIMES_PER_CHUNK * TIMES_PER_CHUNK if is_unchanged else 0
+            return unchanged, {
+                name: np.asarray(file[name][unchanged:], dtype=column.dtype) for name, column in blank.items()
             }
     except (OSError, RuntimeError, KeyError, TypeError, ValueError):
         return 0, blank
 
 
-def _measure(
-    lacking: list[Row],
+def _compute(
+    missing: list[EpochRef],
     areas: dict[str, Bools],
     size_m2: np.ndarray[Any, Any],
     aggregator: Aggregator,
     progress: Callable[[], None],
 ) -> Columns:
-    """Compute the columns of some epochs; where there was no reference yet, nothing is known."""
-    columns = _blank(len(lacking), len(areas))
-    for path, first, at, count in runs(lacking):
-        words = read_source(path, first, at, count).words
+    """Compute the columns of the missing epochs; fill values for epochs without a reference."""
+    columns = _blank(len(missing), len(areas))
+    for path, first, start, count in contiguous_runs(missing):
+        scalars = read_source(path, first, start, count).scalars
         for name in ("time", "time_bnds", "epoch_file", "reference_version"):
-            columns[name][at : at + count] = words[name]
-    for index, version in enumerate(strings(columns["reference_version"])):
+            columns[name][start : start + count] = scalars[name]
+    for index, version in enumerate(decode_text(columns["reference_version"])):
         for area, cells in enumerate(areas.values()):
             if version and size_m2[area] > 0:
-                told = figures(aggregator.area(cells, lacking[index]), float(size_m2[area]))
-                for name, value in told.items():
+                statistics = area_statistics(aggregator.area(cells, missing[index]), float(size_m2[area]))
+                for name, value in statistics.items():
                     columns[name][index, area] = value if np.isfinite(value) else FILL
         progress()
     return columns
 
 
-def figures(found: AreaChange, size_m2: float) -> dict[str, float]:
-    """Return what is told of the change of an area of that size, by the names of the variables."""
-    told: dict[str, float] = {}
+def area_statistics(change: AreaChange, size_m2: float) -> dict[str, float]:
+    """Return mean, median and volume change of an area of `size_m2` with 95 % bounds, by variable name."""
+    statistics: dict[str, float] = {}
     for name, value, sigma in (
-        ("mean_change", found.mean_m, found.mean_sigma_m),
-        ("median_change", found.median_m, found.median_sigma_m),
-        ("volume_change", found.mean_m * size_m2, found.mean_sigma_m * size_m2),
+        ("mean_change", change.mean_m, change.mean_sigma_m),
+        ("median_change", change.median_m, change.median_sigma_m),
+        ("volume_change", change.mean_m * size_m2, change.mean_sigma_m * size_m2),
     ):
-        half = SIGNIFICANT_SIGMAS * sigma
-        told |= {
+        half_width = SIGNIFICANT_SIGMAS * sigma
+        statistics |= {
             name: value,
             f"{name}_uncertainty": sigma,
-            f"{name}_low": value - half,
-            f"{name}_high": value + half,
+            f"{name}_low": value - half_width,
+            f"{name}_high": value + half_width,
         }
-    return told | {"coverage": found.coverage}
+    return statistics | {"coverage": change.coverage}
 
 
 def _write(
@@ -227,27 +252,27 @@ def _write(
     columns: Columns,
     first: int,
 ) -> None:
-    """Write the areas, and their columns from the `first` epoch on."""
+    """Write the areas, and their columns starting at epoch `first`."""
     times = first + len(columns["time"])
-    spelt = np.array([name.encode() for name in names])
-    introduce(file, series, f"Elevation change of areas at {series.name or series.station_id}")
+    encoded_names = np.array([name.encode() for name in names])
+    write_global_attrs(file, series, f"Elevation change of areas at {series.name or series.station_id}")
     for dim, length in {
         "time": None,
         "bnds": 2,
         "area": len(names),
-        "area_text": spelt.dtype.itemsize,
+        "area_text": encoded_names.dtype.itemsize,
         "text": TEXT_LENGTH["text"],
     }.items():
         file.createDimension(dim, length)
-    time_axis(file, times)
-    for row in AREA_VARIABLES:
-        variable = define(file, row, series, times)
-        if row.dims == _OVER_TIME:
-            variable.coordinates = "area_name"  # a label: CDO and NCO carry it on, xarray selects by it
+    create_time_axis(file, times)
+    for spec in AREA_VARIABLES:
+        variable = create_variable(file, spec, series, times)
+        if spec.dims == _OVER_TIME:
+            variable.coordinates = "area_name"  # a label that CDO and NCO preserve and xarray selects by
     file.set_auto_mask(False)
     file.set_auto_chartostring(False)
     file["area_name"].setncattr("_Encoding", "utf-8")
-    letters = spelt.view("S1").reshape(len(names), -1)
-    file["area_name"][:], file["area_size"][:] = letters, size_m2
+    characters = encoded_names.view("S1").reshape(len(names), -1)
+    file["area_name"][:], file["area_size"][:] = characters, size_m2
     for name, column in columns.items():
         file[name][first:times] = column

@@ -1,1 +1,1 @@
-"""The numbers of the four papers, computed: what is reproduced, what is an error, what is built where."""
+"""The numbers of the four papers, computed; their errata; the functions for their equations."""

@@ -1,4 +1,4 @@
-"""What the papers have wrong or leave open, and what is built instead."""
+"""Errors and open points of the papers, and what is implemented instead."""
 
 from __future__ import annotations
 
@@ -9,10 +9,10 @@ from station.papers.figures import HARTZELL, LESLAR, OZENDI, VOORDENDAG
 
 @dataclass(frozen=True)
 class Paper:
-    """A paper as one cites it."""
+    """A paper as it is cited."""
 
     key: str
-    authors: str  # as the docstrings name them
+    authors: str  # as cited in the docstrings
     title: str
     subject: str
 
@@ -47,68 +47,69 @@ PAPERS = (
     ),
     Paper(
         LESLAR, "Leslar et al. (2014)",
-        "Geomatica 68(3), 10.5623/cig2014-303: variances and Sobol indices of a lidar on a vehicle",
-        "which input matters",
+        "Geomatica 68(3), 10.5623/cig2014-303: variances and Sobol indices of a mobile lidar",
+        "sensitivity analysis",
     ),
 )  # fmt: skip
 
 ERRATA = (
-    Erratum(HARTZELL, "Eq. 1", "a beam that begins in the centre of the scanner's frame; it begins beside it",
+    Erratum(HARTZELL, "Eq. 1", "a beam from the origin of the scanner's frame; its true origin is offset",
             "vertex = origin + range times direction (Voordendag et al., Eq. 4): `beam.vertex`, `beam.cartesian`"),
-    Erratum(HARTZELL, "Eq. 3", "the order of the three rotations is not unambiguous in print",
+    Erratum(HARTZELL, "Eq. 3", "the order of the three rotations is ambiguous in print",
             "Rz(κ) Ry(φ) Rx(ω), as in the author's code: `pose.rotation`"),
-    Erratum(HARTZELL, "Eq. 5", "the SOP already holds the lean of its own scan: absolute roll and pitch apply it twice",
-            "the difference to that scan: `inclination.relative_lean`"),
-    Erratum(HARTZELL, "Eq. 7-8", "the beam's width is added as an angle and as a range; on a plane both are one effect",
-            "the angle alone: `uncertainty.sigma_angle`"),
-    Erratum(HARTZELL, "section 2.2", "the scatter of raw inclination samples is taken as each point's own error",
-            "what the filter leaves, common to all points of its time: `shared`"),
-    Erratum(HARTZELL, "Eq. 14, 21", "leaving out correlation is called conservative; common errors add up coherently,"
-            " so that published volumes are 150 to 280 times too sure",
-            "Σ a² σ_r² + gᵀ C g: `volume.variance`, `shared.aggregate_variance`"),
+    Erratum(HARTZELL, "Eq. 5", "the SOP already contains the tilt of its scan: absolute roll and pitch apply it twice",
+            "the tilt relative to that scan: `inclination.relative_tilt`"),
+    Erratum(HARTZELL, "Eq. 7-8", "the beam's width is added as an angle and as a range; on a plane both are the same effect",
+            "the angle alone: `shot_noise.sigma_angle`"),
+    Erratum(HARTZELL, "section 2.2", "the scatter of raw inclination samples is taken as a random error of each point",
+            "the residual after the filter, common to all points of the same time: `parameters`"),
+    Erratum(HARTZELL, "Eq. 14, 21", "neglecting correlation is called conservative; common errors add up coherently:"
+            " registration alone gives a σ of the net volume of above 1 %, not of 0.004 %",
+            "Σ a² σ_r² + gᵀ C g: `volume.variance`, `propagation.aggregate_variance`"),
     Erratum(HARTZELL, "Table 2", "Mammoth, mesh, gross: 0.00153 % and 0.00065 % should be 0.00059 % and 0.00052 %",
-            "sigmas in m³: `volume.mesh`, `volume.independent_variance`"),
-    Erratum(HARTZELL, "section 2.2", "the reference variance takes residuals for independent",
-            "as published: `registration.reference_variance`; the station's own adjustment holds what is shared"),
-    Erratum(VOORDENDAG, "Eq. 2, 5", "a tilt that 23,000 shots share is divided by √n",
-            'tilt as a shared parameter; the printed form with `model = "voordendag2023"`'),
+            "sigmas in m³: `volume.mesh_volume`, `volume.independent_variance`"),
+    Erratum(HARTZELL, "section 2.2", "the reference variance treats residuals as independent",
+            "as published: `registration.reference_variance`; the station's adjustment models shared errors"),
+    Erratum(VOORDENDAG, "Eq. 2, 5", "a tilt error common to 23,000 shots is divided by √n",
+            'tilt as a shared parameter; as printed with `model = "voordendag2023"`'),
     Erratum(VOORDENDAG, "Eq. 3", "a linear sum of a standard deviation and a bound",
-            'quadrature; the printed form with `model = "voordendag2023"`'),
-    Erratum(VOORDENDAG, "Eq. 10", "air of one density along the path; its growth below the scanner is left as noise,"
+            'sum in quadrature; as printed with `model = "voordendag2023"`'),
+    Erratum(VOORDENDAG, "Eq. 10", "air of constant density along the path; its increase below the scanner is treated as noise,"
             " and changes of pressure are called insignificant",
-            "a hydrostatic path from the station's own temperature and pressure: `air.air_correction`"),
-    Erratum(VOORDENDAG, "Eq. 11", "refraction is neglected since the spot stays within the footprint",
-            "corrected, and what is left of it estimated in each scan: `air.refraction_rise`, `adjustment`"),
-    Erratum(VOORDENDAG, "Eq. 12", "range error seen vertically, but then a constant 0.01 m is taken",
-            "Eq. 12 as it stands: `uncertainty.sigma_atmosphere`, `uncertainty.range_variance`"),
+            "a hydrostatic path from the station's temperature and pressure: `air.air_correction`"),
+    Erratum(VOORDENDAG, "Eq. 11", "refraction is neglected because the spot stays within the footprint",
+            "corrected, and its residual estimated in each scan: `air.refraction_height_error`, `joint`"),
+    Erratum(VOORDENDAG, "Eq. 12", "range error projected to the vertical, but then a constant 0.01 m is used",
+            "Eq. 12 as printed: `shot_noise.sigma_atmosphere`, `shot_noise.range_variance`"),
     Erratum(VOORDENDAG, "Eq. 13", "negative with the beam pointing down and the normal up",
             "its magnitude: `beam.cos_incidence`"),
-    Erratum(VOORDENDAG, "Eq. 17", "π M m with full axes is four times the area; Table 2 gives the major axis as area",
+    Erratum(VOORDENDAG, "Eq. 17", "π M m with full axes is four times the area; Table 2 lists the major axis as area",
             "π/4 M m: `beam.footprint_area`"),
-    Erratum(VOORDENDAG, "Eq. 18", "a third of the vertical extent, nought on ice seen level, where the error is not",
-            "R β/4 sin θ / cos γ: `uncertainty.angle_variance`"),
+    Erratum(VOORDENDAG, "Eq. 18", "a third of the vertical extent, zero on a level surface, where the error is not",
+            "R β/4 sin θ / cos γ: `shot_noise.angle_variance`"),
     Erratum(OZENDI, "Eq. 2-4", "the arctangent loses the quadrant", "atan2: `beam.polar`"),
-    Erratum(OZENDI, "Eq. 7", "angles are named in one order and used in another, which would swap their sigmas",
+    Erratum(OZENDI, "Eq. 7", "angles are defined in one order and used in another, which would swap their sigmas",
             "range, elevation, azimuth throughout: `beam.polar_jacobian`"),
-    Erratum(OZENDI, "section 4", "residuals across a plane are taken for those of the range",
+    Erratum(OZENDI, "section 4", "residuals across a plane are taken as range residuals",
             "divided by cos α: `precision.sigma_range`"),
     Erratum(OZENDI, "section 4", "no formula for the noise of the range is published",
-            "a I^b + c with the angles' part told apart: `precision.fit_range_model`"),
-    Erratum(OZENDI, "Table 1", "the scatter between repeats grows with the step: other spots are compared",
-            "sampling and precision apart: `precision.angle_precision`"),
-    Erratum(LESLAR, "Eq. 7", "U Q⁻¹ Uᵀ has the unit 1/m²", "U Q Uᵀ: `sensitivity.propagated`"),
-    Erratum(LESLAR, "Eq. 11", "only first-order terms are taken off an index of third or higher order",
-            "all lower terms taken off: `sensitivity.interactions`; first and total indices need none: `sensitivity.sobol`"),
-    Erratum(LESLAR, "section 5", "propagation and Sobol indices are said to name different inputs; with the same inputs"
-            " of an almost linear model they cannot", "both are computed and compared: `station sensitivity`"),
+            "a I^b + c, with the angle noise estimated separately: `precision.fit_range_model`"),
+    Erratum(OZENDI, "Table 1", "the scatter between repeats grows with the step, because different spots are compared",
+            "sampling and precision separated: `precision.angle_precision`"),
+    Erratum(LESLAR, "Eq. 7", "U Q⁻¹ Uᵀ has the unit 1/m²", "U Q Uᵀ: `sensitivity.first_order_variance`"),
+    Erratum(LESLAR, "Eq. 11", "only first-order terms are subtracted from an index of third or higher order",
+            "all lower terms subtracted: `sensitivity.interactions`; first and total indices need none: `sensitivity.sobol`"),
+    Erratum(LESLAR, "section 5", "propagation and Sobol indices are said to rank inputs differently; for the same inputs"
+            " of a nearly linear model they cannot", "both are computed and compared: `station sensitivity`"),
     Erratum(LESLAR, "Table 1", "the inertial system's sigmas are not given; both analyses imply different ones",
-            "0.007 m, which the shares beside it imply: `mobile.EXPECTED`"),
+            "0.007 m, implied by the shares of the other inputs: `mobile_lidar.EXPECTED`"),
 )  # fmt: skip
 
 NOT_REPRODUCIBLE = {
-    HARTZELL: "volumes and Fig. 5-6, 8-11: the points are not published",
+    HARTZELL: "volumes, gross sigmas of the meshes and Fig. 5-6, 8-11: the points are not published",
     VOORDENDAG: "range errors along LES temperatures, maps of σ per cell, ±0.10 and ±0.50 m (by simulation:"
     " `python -m benchmarks.accuracy`)",
-    OZENDI: "the range noise of 2-12 mm: no formula, no data",
-    LESLAR: "figures that rest on the inertial system's own sigmas",
+    OZENDI: "the range noise of 2-12 mm: no formula, no data; the means of Table 1 (36.6cc, 17.8cc): the angles of the"
+    " single repeats are not available here",
+    LESLAR: "figures that depend on the sigmas of the inertial system or on an unpublished geometry",
 }

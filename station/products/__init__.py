@@ -1,1 +1,1 @@
-"""Pictures and files for people: maps, GeoTIFF, the station's page."""
+"""Products for people and other programs: maps, tables, GeoTIFF, the station's page."""

@@ -1,8 +1,8 @@
-"""Colours that a number is shown in: perceptually even, readable for the colour-blind, fixed in their limits.
+"""Colour scales: perceptually uniform, readable for the colour-blind, with fixed limits.
 
-Vik, lajolla and davos are scientific colour maps of Crameri (2018), doi:10.5281/zenodo.1243862, thinned to
-so many that straight lines between them stay within 2 of 255.
-Copyright (c) 2020 Fabio Crameri; MIT licence, whose text stands in assets/colours.LICENSE.
+Vik, lajolla and davos are scientific colour maps of Crameri (2018), doi:10.5281/zenodo.1243862, reduced to as
+few colours as keep linear interpolation between them within 2 of 255.
+Copyright (c) 2020 Fabio Crameri; MIT licence, text in assets/colours.LICENSE.
 """
 
 from __future__ import annotations
@@ -32,8 +32,8 @@ _DAVOS = (
 
 
 @dataclass(frozen=True)
-class Scale:
-    """How a quantity becomes a colour: beyond its ends it stays what it is there."""
+class ColourScale:
+    """The colour scale of a quantity; values beyond a limit have the colour of the limit."""
 
     title: str
     low: float
@@ -42,8 +42,8 @@ class Scale:
     colours: Pixels  # (k, 3), from low to high
     logarithmic: bool = False
 
-    def place(self, values: Floats | Floats32) -> Any:  # noqa: ANN401 - an array of the shape and type given
-        """Return where values lie between the ends, 0 to 1."""
+    def position(self, values: Floats | Floats32) -> Any:  # noqa: ANN401 - an array of the shape and type given
+        """Return the position of values between the limits, 0 to 1."""
         if self.logarithmic:
             with np.errstate(divide="ignore", invalid="ignore"):
                 share = np.log(values / self.low) / np.log(self.high / self.low)
@@ -53,51 +53,62 @@ class Scale:
 
     def paint(self, values: Floats | Floats32) -> Pixels:
         """Return the colour of each value (…, 3)."""
-        step = (self.place(values) * 255 + 0.5).astype(np.uint8)
-        return np.asarray(self.table()[step])
+        step = (self.position(values) * 255 + 0.5).astype(np.uint8)
+        return np.asarray(self.colour_table()[step])
 
-    def table(self) -> Pixels:
-        """Return 256 colours from low to high."""
-        at = np.linspace(0, 255, len(self.colours))
-        bands = [np.interp(np.arange(256), at, self.colours[:, band]) for band in range(3)]
+    def colour_table(self) -> Pixels:
+        """Return 256 colours from low to high (256, 3)."""
+        positions = np.linspace(0, 255, len(self.colours))
+        bands = [np.interp(np.arange(256), positions, self.colours[:, band]) for band in range(3)]
         return np.stack(bands, axis=-1).round().astype(np.uint8)
 
 
-def change_scale(limit_m: float, since: str) -> Scale:
-    """Red where the surface sank, blue where it rose, by up to `limit_m`."""
+def change_scale(limit_m: float, since: str) -> ColourScale:
+    """Return the scale of change up to `limit_m` [m]: red where the surface sank, blue where it rose."""
     ticks = tuple(limit_m * share for share in (-1.0, -0.5, 0.0, 0.5, 1.0))
-    return Scale(f"elevation change since {since}, m", -limit_m, limit_m, ticks, _colours(_VIK)[::-1])
+    return ColourScale(f"elevation change since {since}, m", -limit_m, limit_m, ticks, _from_hex(_VIK)[::-1])
 
 
-def sigma_scale(limit_m: float) -> Scale:
-    """Dark where little is known; two decades up to the limit of the change."""
-    return _decades("1 σ of the change, m", limit_m / 100, limit_m, _colours(_LAJOLLA)[::-1])
+def sigma_scale(limit_m: float) -> ColourScale:
+    """Return the scale of sigma [m]: dark where it is large, two decades up to the limit of the change."""
+    return _log_scale("1 σ of the change, m", limit_m / 100, limit_m, _from_hex(_LAJOLLA)[::-1])
 
 
-def points_scale() -> Scale:
-    """Dark where many points fall."""
-    return _decades("laser points per cell", 1.0, 100.0, _colours(_DAVOS)[-5::-1])  # not from white on
+def points_scale() -> ColourScale:
+    """Return the scale of points per cell: dark where there are many."""
+    return _log_scale("laser points per cell", 1.0, 100.0, _from_hex(_DAVOS)[-5::-1])  # without the white end
 
 
-def _decades(title: str, low: float, high: float, colours: Pixels) -> Scale:
+def _log_scale(title: str, low: float, high: float, colours: Pixels) -> ColourScale:
     count = round(np.log10(high / low)) + 1
     ticks = tuple(float(tick) for tick in low * 10.0 ** np.arange(count))
-    return Scale(title, low, high, ticks, colours, logarithmic=True)
+    return ColourScale(title, low, high, ticks, colours, logarithmic=True)
 
 
-def _colours(hexed: str) -> Pixels:
-    return np.frombuffer(bytes.fromhex(hexed), np.uint8).reshape(-1, 3)
+def _from_hex(hex_text: str) -> Pixels:
+    return np.frombuffer(bytes.fromhex(hex_text), np.uint8).reshape(-1, 3)
 
 
-def palette() -> Pixels:
-    """Return up to 256 colours (k, 3) that all maps can do with: greys that stay grey, scales in light."""
+def shared_palette() -> Pixels:
+    """Return up to 256 colours (k, 3) shared by all maps: neutral greys, and the scales lit and shaded."""
     greys = np.repeat(np.linspace(96, 252, 40).round()[:, None], 3, axis=1)
-    lit = [np.minimum(_colours(_VIK) * light, 255) for light in (0.86, 0.93, 1.0, 1.05)]
-    words = [(250, 250, 248), (30, 33, 38), (70, 72, 76), (105, 110, 118), (158, 60, 0), (203, 155, 125)]
-    return np.vstack([greys, *lit, _colours(_LAJOLLA), _colours(_DAVOS), words]).round().astype(np.uint8)
+    shaded = [np.minimum(_from_hex(_VIK) * brightness, 255) for brightness in (0.86, 0.93, 1.0, 1.05)]
+    text_colours = [
+        (250, 250, 248),
+        (30, 33, 38),
+        (70, 72, 76),
+        (105, 110, 118),
+        (158, 60, 0),
+        (203, 155, 125),
+    ]
+    return (
+        np.vstack([greys, *shaded, _from_hex(_LAJOLLA), _from_hex(_DAVOS), text_colours])
+        .round()
+        .astype(np.uint8)
+    )
 
 
 def round_up(value: float) -> float:
-    """Return the next of 0.1, 0.2, 0.5, 1, 2, 5 and so on."""
+    """Return the value rounded up to the next of 0.1, 0.2, 0.5, 1, 2, 5 and so on."""
     decade = 10.0 ** np.floor(np.log10(value))
     return float(next(decade * step for step in (1, 2, 5, 10) if decade * step >= value * (1 - 1e-9)))

@@ -12,78 +12,79 @@ from typing import Any
 import numpy as np
 from pyproj import Transformer
 
-from station.archive.layout import Series
-from station.archive.store import Row, rows, series_in
+from station.archive.epochs import EpochRef
+from station.archive.netcdf_layout import Series
+from station.archive.series.index import list_epochs, series_in
 from station.config import Site
 from station.errors import StationError
-from station.products.areas import REFERENCE, Span, area_lines, as_csv
-from station.products.gallery import default_limit, put
+from station.products.area_tables import REFERENCE, Span, area_records, as_csv
+from station.products.epoch_table import EpochTable, read_epoch_table
+from station.products.gallery import default_limit, replace_if_changed
 from station.products.geotiff import KINDS, export_geotiff
-from station.products.record import Record, read_record
-from station.science.pose import horizontal_crs
+from station.science.geometry.pose import horizontal_crs
 
 TOPO4D = "https://stac-extensions.github.io/topo4d/v1.0.0/schema.json"
-COG = "image/tiff; application=geotiff; profile=cloud-optimized"
-Each = Callable[[list[Row]], Iterable[Row]]
+COG_MEDIA_TYPE = "image/tiff; application=geotiff; profile=cloud-optimized"
+Track = Callable[[list[EpochRef]], Iterable[EpochRef]]
 
 
-def export(site: Site, kind: str, span: Span | None, folder: Path, each: Each = iter) -> list[Path]:
-    """Write the epochs of a span, the newest where none is given, as `kind` into a folder.
+def export(site: Site, kind: str, span: Span | None, folder: Path, track: Track = iter) -> list[Path]:
+    """Write the epochs of a span, by default the newest, as `kind` into a folder; return the files written.
 
-    `kind` is geotiff, csv (scans and areas; all of them where no span is given) or stac. Returns what was
-    written. Raises StationError where there is nothing to write or a library is missing.
+    `kind` is geotiff, csv (scans and areas; by default of all epochs) or stac. Raises StationError if there
+    is nothing to write or a library is missing.
     """
     series = series_in(site.station.data)
-    record = read_record(series)
+    table = read_epoch_table(series)
     if kind == "csv":
-        return _csv(site, record, span or Span.of(None, None), folder)
-    versions = dict(zip(record.words["epoch_file"], record.words["reference_version"], strict=True))
-    measured = [row for row in rows(series) if versions.get(row.epoch_file)]
-    chosen = measured[-1:] if span is None else [row for row in measured if row.start in span]
+        return _write_csv(site, table, span or Span.parse(None, None), folder)
+    versions = dict(zip(table.texts["epoch_file"], table.texts["reference_version"], strict=True))
+    measured = [epoch for epoch in list_epochs(series) if versions.get(epoch.epoch_file)]
+    chosen = measured[-1:] if span is None else [epoch for epoch in measured if epoch.start in span]
     if not chosen:
-        raise StationError("no epoch with a change there")
+        raise StationError("no epoch with a change in this span")
     limit_m = site.products.change_limit_m
     limit_m = limit_m or default_limit(series, measured[0], versions[measured[0].epoch_file])
     if kind == "stac":
-        return _stac(site, series, record, list(each(chosen)), folder, limit_m)
-    return [path for row in each(chosen) for path in export_geotiff(series, row, folder, limit_m)]
+        return _write_stac(site, series, table, list(track(chosen)), folder, limit_m)
+    return [path for epoch in track(chosen) for path in export_geotiff(series, epoch, folder, limit_m)]
 
 
-def _csv(site: Site, record: Record, span: Span, folder: Path) -> list[Path]:
-    told = io.StringIO()
-    writer = csv.writer(told, lineterminator="\n")
-    writer.writerow(["start_utc", "scan", "verdict", "reason", *record.numbers])
-    for index, start_s in enumerate(record.start_s):
+def _write_csv(site: Site, table: EpochTable, span: Span, folder: Path) -> list[Path]:
+    stream = io.StringIO()
+    writer = csv.writer(stream, lineterminator="\n")
+    writer.writerow(["start_utc", "scan", "verdict", "reason", *table.scalars])
+    for index, start_s in enumerate(table.start_s):
         start = datetime.fromtimestamp(float(start_s), UTC)
         if start in span:
-            numbers = [float(column[index]) for column in record.numbers.values()]
+            numbers = [float(column[index]) for column in table.scalars.values()]
             writer.writerow(
                 [
                     f"{start:%Y-%m-%dT%H:%M:%SZ}",
-                    record.words["scan_id"][index],
-                    record.verdict[index],
-                    record.words["verdict_reason"][index],
+                    table.texts["scan_id"][index],
+                    table.verdict[index],
+                    table.texts["verdict_reason"][index],
                     *(f"{number:.9g}" if np.isfinite(number) else "" for number in numbers),
                 ]
             )
-    made = {"scans.csv": told.getvalue()}
+    files = {"scans.csv": stream.getvalue()}
     if site.areas is not None:
-        made["areas.csv"] = as_csv(area_lines(site, None, span, REFERENCE))
-    for name, text in made.items():
-        put(folder / name, text.encode())
-    return [folder / name for name in made]
+        files["areas.csv"] = as_csv(area_records(site, None, span, REFERENCE))
+    for name, text in files.items():
+        replace_if_changed(folder / name, text.encode())
+    return [folder / name for name in files]
 
 
-def _stac(
-    site: Site, series: Series, record: Record, chosen: list[Row], folder: Path, limit_m: float
+def _write_stac(
+    site: Site, series: Series, table: EpochTable, chosen: list[EpochRef], folder: Path, limit_m: float
 ) -> list[Path]:
-    """Write a collection of one item an epoch, GeoTIFFs beside each, which works wherever it is put."""
+    """Write a relocatable STAC collection of one item per epoch, with its GeoTIFFs."""
     try:
         import pystac  # noqa: PLC0415 - an extra
     except ImportError as error:
         raise StationError("STAC needs pystac: pip install 'tls-station[export]'") from error
-    geometry, bbox = _outline(series)
-    starts = [row.start for row in chosen]
+    geometry, bbox = _footprint(series)
+    starts = [epoch.start for epoch in chosen]
     collection = pystac.Collection(
         id=series.station_id,
         description=f"Elevation change at {site.station.name or series.station_id}, measured by a permanently"
@@ -97,19 +98,20 @@ def _stac(
         stac_extensions=[TOPO4D],
         summaries=pystac.Summaries({"num_items": {"values": [len(chosen)]}}),
     )
-    for row in chosen:
+    for epoch in chosen:
         item = pystac.Item(
-            id=Path(row.epoch_file).stem,
+            id=Path(epoch.epoch_file).stem,
             geometry=geometry,
             bbox=bbox,
-            datetime=row.start,
-            properties=_properties(site, series, record, row),
+            datetime=epoch.start,
+            properties=_item_properties(site, series, table, epoch),
             stac_extensions=[TOPO4D],
         )
-        beside = folder / item.id
-        for kind, path in zip(KINDS, export_geotiff(series, row, beside, limit_m), strict=True):
+        item_folder = folder / item.id
+        for kind, path in zip(KINDS, export_geotiff(series, epoch, item_folder, limit_m), strict=True):
             item.add_asset(
-                kind, pystac.Asset(f"./{path.name}", KINDS[kind][1], media_type=COG, roles=["data"])
+                kind,
+                pystac.Asset(f"./{path.name}", KINDS[kind][1], media_type=COG_MEDIA_TYPE, roles=["data"]),
             )
         collection.add_item(item)
     collection.normalize_hrefs(str(folder))
@@ -117,14 +119,14 @@ def _stac(
     return [folder / "collection.json"]
 
 
-def _properties(site: Site, series: Series, record: Record, row: Row) -> dict[str, Any]:
-    """Return what the extension for topographic time series tells of an epoch, and its verdict."""
-    at = record.words["epoch_file"].index(row.epoch_file)
+def _item_properties(site: Site, series: Series, table: EpochTable, epoch: EpochRef) -> dict[str, Any]:
+    """Return the STAC properties of an epoch: those of the topo4d extension, and its verdict."""
+    index = table.texts["epoch_file"].index(epoch.epoch_file)
     crs = horizontal_crs(series.crs) if series.crs else None
     code = crs.to_authority() if crs is not None else None
-    version = record.words["reference_version"][at]
-    told: dict[str, Any] = {
-        "title": f"{site.station.name or series.station_id}, {row.start:%Y-%m-%d %H:%M} UTC",
+    version = table.texts["reference_version"][index]
+    properties: dict[str, Any] = {
+        "title": f"{site.station.name or series.station_id}, {epoch.start:%Y-%m-%d %H:%M} UTC",
         "instruments": [site.scanner.model],
         "topo4d:data_type": "raster",
         "topo4d:native_crs": ":".join(code) if code else "local",
@@ -137,16 +139,16 @@ def _properties(site: Site, series: Series, record: Record, row: Row) -> dict[st
             "param": {"reference_version": version},
             "product_level": "L3",
         },
-        "station:verdict": record.verdict[at],
-        "station:scan_id": record.words["scan_id"][at],
+        "station:verdict": table.verdict[index],
+        "station:scan_id": table.texts["scan_id"][index],
     }
-    if np.isfinite(points := record.numbers["point_total"][at]):
-        told["topo4d:point_count"] = int(points)
-    return told
+    if np.isfinite(points := table.scalars["point_total"][index]):
+        properties["topo4d:point_count"] = int(points)
+    return properties
 
 
-def _outline(series: Series) -> tuple[dict[str, Any] | None, list[float] | None]:
-    """Return the edge of the grid in degrees as GeoJSON, and its box; None where the map is nowhere."""
+def _footprint(series: Series) -> tuple[dict[str, Any] | None, list[float] | None]:
+    """Return the outline of the grid in degrees as GeoJSON, and its bounding box; None without a CRS."""
     if series.crs is None:
         return None, None
     grid = series.grid

@@ -1,4 +1,4 @@
-"""Maps of the recent epochs as files: which are kept, and those that lack are drawn."""
+"""Map images of the recent epochs: which are kept, and drawing of the missing ones."""
 
 from __future__ import annotations
 
@@ -16,51 +16,52 @@ from typing import NamedTuple
 import numpy as np
 from PIL import Image
 
-from station import __version__
-from station.archive.layout import Series, written_whole
-from station.archive.store import Row
+from station._version import __version__
+from station.archive.atomic_files import atomic_write
+from station.archive.epochs import EpochRef
+from station.archive.netcdf_layout import Series
 from station.products.colours import round_up
-from station.products.look import Base, Look, base_of, look_at
-from station.products.maps import Caption, change_map, encoded, points_map, sigma_map
+from station.products.maps import Caption, change_map, encode_webp, points_map, sigma_map
+from station.products.overview import BaseMap, Overview, base_map, read_overview
 from station.quantities import Floats, Grid
 
-ALL_FOR = timedelta(days=2)  # before the newest epoch; then the last map of each day …
-DAILY_FOR = timedelta(days=60)  # … and before that the last of each month
+KEEP_ALL_FOR = timedelta(days=2)  # before the newest epoch; then the last map of each day …
+KEEP_DAILY_FOR = timedelta(days=60)  # … and before that the last of each month
 DAY_S = 86_400.0
-MOST_DRAWN = 8  # at a time: an archive that was there before the page is shown bit by bit
-TOGETHER = 2  # pictures; to encode them takes most of the time
-GRACE_S = 3600.0  # a page that is open somewhere may still name a map that is kept no longer
-SIGMAS_TO_THE_END = 10.0
+MAX_DRAWN = 8  # per call: an archive older than the page is drawn over several calls
+ENCODER_THREADS = 2  # encoding takes most of the time
+DELETE_GRACE_S = 3600.0  # an open page may still refer to a map that is no longer kept
+LIMIT_SIGMAS = 10.0
 
 
-class Measured(NamedTuple):
-    """An epoch that has a reference; thousands are made for a page."""
+class MeasuredEpoch(NamedTuple):
+    """An epoch that has a reference; a page creates thousands of them."""
 
-    rows: Sequence[Row]
-    at: int  # its place among these
+    epochs: Sequence[EpochRef]
+    position: int  # its index in `epochs`
     start: datetime
     version: str  # of the reference
-    verdict: str  # what the caption says of it
-    look: Look | None = None  # where it need not be read
+    verdict: str  # text in the caption
+    overview: Overview | None = None  # if it is in memory already
 
     @property
-    def row(self) -> Row:
-        """Return where it lies."""
-        return self.rows[self.at]
+    def epoch(self) -> EpochRef:
+        """Return the epoch and its location in the archive."""
+        return self.epochs[self.position]
 
 
 @dataclass(frozen=True)
 class Style:
-    """How maps are drawn; maps of another style are drawn anew."""
+    """How maps are drawn; maps of another style are drawn again."""
 
     station: str
     width_px: int
-    limit_m: float | None  # None: fixed once, by the first epoch that is drawn
+    limit_m: float | None  # None: fixed once, from the first epoch
 
 
 @dataclass(frozen=True)
-class Hung:
-    """A map that is there, relative to the gallery's folder."""
+class MapImage:
+    """A map image on disk, relative to the gallery's folder."""
 
     start: datetime
     file: str
@@ -68,155 +69,173 @@ class Hung:
 
 @dataclass(frozen=True)
 class Gallery:
-    """What there is to show: change by time, and for the newest epoch what goes with it."""
+    """The map images of the page: change over time; sigma and points of the newest epoch."""
 
-    change: list[Hung]
+    change: list[MapImage]
     sigma: str | None
     points: str | None
     limit_m: float | None
     size: tuple[int, int]  # of a map [pixels]
 
 
-def hang(
+def update_gallery(
     series: Series,
     folder: Path,
-    found: list[Measured],
+    measured: list[MeasuredEpoch],
     style: Style,
     progress: Callable[[], None],
 ) -> Gallery:
-    """Draw the maps that lack, newest first, and take down those that are kept no longer.
+    """Draw the missing maps, newest first, delete those no longer kept, and return the gallery.
 
-    `found` are the epochs that have a reference, in the order of time. Raises StoreError where something
-    cannot be read or written.
+    `measured` are the epochs that have a reference, in time order. Raises StoreError if something cannot be
+    read or written.
     """
-    if not found:
+    if not measured:
         return Gallery([], None, None, style.limit_m, (0, 0))
-    limit_m = style.limit_m or _limit(series, folder, found[0])
-    told = json.dumps([style.station, style.width_px, limit_m, __version__])
-    tag = hashlib.sha256(told.encode()).hexdigest()[:8]
-    place = folder / "maps"
-    kept = [found[index] for index in thinned(np.array([one.start.timestamp() for one in found]))]
-    drawn, hung = 0, []
-    for one in reversed(kept):
-        row = one.row
-        name = f"{Path(row.epoch_file).stem}_{tag}.webp"
-        last = one is found[-1]
-        if not all((place / file).is_file() for file in _names(name, last=last)):
-            if drawn == MOST_DRAWN:
+    limit_m = style.limit_m or _fixed_limit(series, folder, measured[0])
+    style_json = json.dumps([style.station, style.width_px, limit_m, __version__])
+    tag = hashlib.sha256(style_json.encode()).hexdigest()[:8]
+    maps_folder = folder / "maps"
+    retained = [
+        measured[index]
+        for index in retention_indices(np.array([item.start.timestamp() for item in measured]))
+    ]
+    drawn_count, images = 0, []
+    for item in reversed(retained):
+        epoch = item.epoch
+        name = f"{Path(epoch.epoch_file).stem}_{tag}.webp"
+        is_last = item is measured[-1]
+        if not all((maps_folder / file).is_file() for file in _file_names(name, is_last=is_last)):
+            if drawn_count == MAX_DRAWN:
                 continue
-            caption = Caption(style.station, f"{row.start:%Y-%m-%d %H:%M} UTC", one.verdict)
-            look = one.look or look_at(
-                row, kept_base(series, folder, one.version, style.width_px), points=last
+            caption = Caption(style.station, f"{epoch.start:%Y-%m-%d %H:%M} UTC", item.verdict)
+            overview = item.overview or read_overview(
+                epoch, cached_base_map(series, folder, item.version, style.width_px), points=is_last
             )
-            _draw(look, place, caption, style.width_px, limit_m, name, last=last)
-            drawn += 1
+            _draw(overview, maps_folder, caption, style.width_px, limit_m, name, is_last=is_last)
+            drawn_count += 1
             progress()
-        hung.append(Hung(row.start, f"maps/{name}"))
-    hung.reverse()
-    _, sigma, points = _names(Path(hung[-1].file).name, last=True)
-    _take_down(place, {Path(one.file).name for one in hung} | {sigma, points})
-    with Image.open(folder / hung[-1].file) as picture:
-        return Gallery(hung, f"maps/{sigma}", f"maps/{points}", limit_m, picture.size)
+        images.append(MapImage(epoch.start, f"maps/{name}"))
+    images.reverse()
+    _, sigma, points = _file_names(Path(images[-1].file).name, is_last=True)
+    _delete_old(maps_folder, {Path(item.file).name for item in images} | {sigma, points})
+    with Image.open(folder / images[-1].file) as picture:
+        return Gallery(images, f"maps/{sigma}", f"maps/{points}", limit_m, picture.size)
 
 
-def _names(name: str, *, last: bool) -> tuple[str, ...]:
-    """Return the files of an epoch: its change, and for the newest its sigma and points."""
+def _file_names(name: str, *, is_last: bool) -> tuple[str, ...]:
+    """Return the file names of an epoch: its change and, for the newest, its sigma and points."""
     stem = name.removesuffix(".webp")
-    return (name, f"{stem}_sigma.webp", f"{stem}_points.webp") if last else (name,)
+    return (name, f"{stem}_sigma.webp", f"{stem}_points.webp") if is_last else (name,)
 
 
-def thinned(start_s: Floats) -> list[int]:
-    """Return which of some moments (n,) [s], in their order, are kept: fewer the older they are.
+def retention_indices(start_s: Floats) -> list[int]:
+    """Return the indices of those of the times (n,) [s], ascending, that are kept: fewer the older they are.
 
-    Whole days grow too old for a map each: what is kept of a month was drawn as that of its day.
+    Ages are compared by whole days, so that the map kept of a month was already drawn as that of its day.
     """
     day = start_s // DAY_S
     month = start_s.astype("datetime64[s]").astype("datetime64[M]").astype(np.int64)
-    young = start_s[-1] - start_s <= ALL_FOR.total_seconds()
-    daily = ~young & (day[-1] - day <= DAILY_FOR.days)
-    kept = [np.flatnonzero(young)]
-    for some, of in ((daily, day), (~young & ~daily, month)):
-        index = np.flatnonzero(some)
-        kept.append(index[np.diff(of[index], append=np.inf) != 0])
-    return [int(index) for index in np.sort(np.concatenate(kept))]
+    recent = start_s[-1] - start_s <= KEEP_ALL_FOR.total_seconds()
+    daily = ~recent & (day[-1] - day <= KEEP_DAILY_FOR.days)
+    groups = [np.flatnonzero(recent)]
+    for selected, period in ((daily, day), (~recent & ~daily, month)):
+        index = np.flatnonzero(selected)
+        groups.append(index[np.diff(period[index], append=np.inf) != 0])
+    return [int(index) for index in np.sort(np.concatenate(groups))]
 
 
 def _draw(
-    look: Look, place: Path, caption: Caption, width_px: int, limit_m: float, name: str, *, last: bool
+    overview: Overview,
+    maps_folder: Path,
+    caption: Caption,
+    width_px: int,
+    limit_m: float,
+    name: str,
+    *,
+    is_last: bool,
 ) -> None:
-    names = _names(name, last=last)
+    file_names = _file_names(name, is_last=is_last)
     drawings: list[Callable[[], Image.Image]] = [
-        lambda: change_map(look, caption, limit_m, width_px, "the reference"),
-        lambda: sigma_map(look, caption, limit_m, width_px),
-        lambda: points_map(look, caption, width_px),
+        lambda: change_map(overview, caption, limit_m, width_px, "the reference"),
+        lambda: sigma_map(overview, caption, limit_m, width_px),
+        lambda: points_map(overview, caption, width_px),
     ]
-    with ThreadPoolExecutor(TOGETHER) as pool:
-        pictures = pool.map(lambda draw: encoded(draw()), drawings[: len(names)])
-        for file, picture in zip(names, pictures, strict=True):
-            put(place / file, picture)
+    with ThreadPoolExecutor(ENCODER_THREADS) as pool:
+        pictures = pool.map(lambda draw: encode_webp(draw()), drawings[: len(file_names)])
+        for file, picture in zip(file_names, pictures, strict=True):
+            replace_if_changed(maps_folder / file, picture)
 
 
-def put(path: Path, content: bytes) -> None:
-    """Replace a file as a whole; one that is the same already is left as it is."""
+def replace_if_changed(path: Path, content: bytes) -> None:
+    """Replace a file atomically; leave it untouched if the content is the same."""
     try:
         if path.read_bytes() == content:
             return
     except OSError:
         pass
-    with written_whole(path) as beside:
-        beside.write_bytes(content)
+    with atomic_write(path) as tmp_path:
+        tmp_path.write_bytes(content)
 
 
-def kept_base(series: Series, folder: Path, version: str, pixels: int) -> Base:
-    """Return the base of a reference's version; kept beside the maps it takes half a second off each."""
+def cached_base_map(series: Series, folder: Path, version: str, pixels: int) -> BaseMap:
+    """Return the base map of a reference version; caching it with the maps saves half a second each."""
     path = folder / f".terrain_{version}_{pixels}.npz"
     grid = series.grid
     try:
         with path.open("rb") as raw, np.load(raw, allow_pickle=False) as file:
             if np.array_equal(file["grid"], [grid.west_m, grid.north_m, grid.cell_m, grid.nx, grid.ny]):
-                top, bottom, left, right, factor = (int(n) for n in file["part"])
-                west_m, north_m, cell_m = (float(n) for n in file["place"])
-                shade = np.where(file["shade"] == 0, np.float32(np.nan), (file["shade"] - 1.0) / 254.0)
+                row_start, row_stop, column_start, column_stop, factor = (
+                    int(number) for number in file["extent"]
+                )
+                west_m, north_m, cell_m = (float(number) for number in file["origin"])
+                shade = np.where(
+                    file["hillshade"] == 0, np.float32(np.nan), (file["hillshade"] - 1.0) / 254.0
+                )
                 ny, nx = shade.shape
                 part = Grid(west_m, north_m, cell_m, nx, ny)
-                rows, columns = slice(top, bottom), slice(left, right)
-                return Base(version, factor, rows, columns, shade.astype(np.float32), part)
+                rows, columns = slice(row_start, row_stop), slice(column_start, column_stop)
+                return BaseMap(version, factor, rows, columns, shade.astype(np.float32), part)
     except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile):
-        pass  # not there yet, or damaged: made anew
-    base = base_of(series, version, pixels)
-    shade = np.where(np.isfinite(base.shade), 1 + 254 * np.nan_to_num(base.shade), 0).round().astype(np.uint8)
-    with written_whole(path) as beside, beside.open("wb") as file:
+        pass  # missing or damaged: computed again
+    base = base_map(series, version, pixels)
+    shade = (
+        np.where(np.isfinite(base.hillshade), 1 + 254 * np.nan_to_num(base.hillshade), 0)
+        .round()
+        .astype(np.uint8)
+    )
+    with atomic_write(path) as tmp_path, tmp_path.open("wb") as file:
         np.savez_compressed(
             file,
             grid=[grid.west_m, grid.north_m, grid.cell_m, grid.nx, grid.ny],
-            part=[base.rows.start, base.rows.stop, base.columns.start, base.columns.stop, base.factor],
-            place=[base.grid.west_m, base.grid.north_m, base.grid.cell_m],
-            shade=shade,
+            extent=[base.rows.start, base.rows.stop, base.columns.start, base.columns.stop, base.factor],
+            origin=[base.grid.west_m, base.grid.north_m, base.grid.cell_m],
+            hillshade=shade,
         )
     return base
 
 
-def _limit(series: Series, folder: Path, first: Measured) -> float:
-    """Return where the colours of change end [m]: fixed once, by the first epoch there is then."""
+def _fixed_limit(series: Series, folder: Path, first: MeasuredEpoch) -> float:
+    """Return the limit of the change colours [m], fixed once from the first epoch."""
     path = folder / "limit.json"
     try:
         return float(json.loads(path.read_text(encoding="ascii"))["change_limit_m"])
     except (OSError, ValueError, KeyError, TypeError):
         pass
-    limit_m = default_limit(series, first.row, first.version)
-    put(path, json.dumps({"change_limit_m": limit_m}).encode("ascii"))
+    limit_m = default_limit(series, first.epoch, first.version)
+    replace_if_changed(path, json.dumps({"change_limit_m": limit_m}).encode("ascii"))
     return limit_m
 
 
-def default_limit(series: Series, row: Row, version: str) -> float:
+def default_limit(series: Series, epoch: EpochRef, version: str) -> float:
     """Return ten times the median sigma of an epoch's cells [m], rounded up."""
-    look = look_at(row, base_of(series, version, max(series.grid.shape)))
-    if not look.seen.any():
+    overview = read_overview(epoch, base_map(series, version, max(series.grid.shape)))
+    if not overview.observed.any():
         return 1.0
-    return round_up(SIGMAS_TO_THE_END * float(np.median(look.sigma_m[look.seen])))
+    return round_up(LIMIT_SIGMAS * float(np.median(overview.sigma_m[overview.observed])))
 
 
-def _take_down(place: Path, kept: set[str]) -> None:
-    for path in place.glob("*.webp"):
-        if path.name not in kept and time.time() - path.stat().st_mtime > GRACE_S:
+def _delete_old(maps_folder: Path, keep: set[str]) -> None:
+    for path in maps_folder.glob("*.webp"):
+        if path.name not in keep and time.time() - path.stat().st_mtime > DELETE_GRACE_S:
             path.unlink(missing_ok=True)

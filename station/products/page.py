@@ -1,4 +1,4 @@
-"""The station's page: static files, each replaced as a whole, that work from a folder and from any server."""
+"""The station's page: static files, each replaced atomically, that work from a folder and any server."""
 
 from __future__ import annotations
 
@@ -13,220 +13,235 @@ from typing import Any
 import jinja2
 import numpy as np
 
-from station import __version__
-from station.archive.layout import Series
-from station.archive.store import Named
-from station.products.gallery import Gallery, Measured, Style, hang, put, thinned
-from station.products.look import Look
+from station._version import __version__
+from station.archive.netcdf_layout import Series
+from station.archive.series.index import SeriesIndex
+from station.products.epoch_table import AreaSeries, EpochTable, read_area_series, read_epoch_table
+from station.products.gallery import (
+    Gallery,
+    MeasuredEpoch,
+    Style,
+    replace_if_changed,
+    retention_indices,
+    update_gallery,
+)
 from station.products.maps import ASSETS
-from station.products.record import AreaRecord, Record, read_areas, read_record
+from station.products.overview import Overview
 from station.quantities import Floats
-from station.science.change import SIGNIFICANT_SIGMAS
+from station.science.gridding.significance import SIGNIFICANT_SIGMAS
 
-STATIC = {  # what each is made of; one style sheet is one round trip
+STATIC = {  # the parts of each file; a single style sheet is a single round trip
     "page.css": ("uplot.css", "page.css"),
     "page.js": ("page.js",),
     "uplot.js": ("uplot.js",),
     "icon.svg": ("icon.svg",),
 }
-POINTS = 250  # of a curve; of a longer series every nth, up to the newest
-MOST_AREAS = 8  # with a curve, so that the page stays light
+MAX_CURVE_POINTS = 250  # of a curve; of a longer series every nth, the newest included
+MAX_AREAS = 8  # with a curve, so that the page stays small
 TABLE_ROWS = 24
-LISTED = 20  # of what waits or is set aside
-HONEST = (0.8, 1.25)  # of the spread of change over sigma on ground that does not move
-RECENT = 24  # scans by which that is judged
+MAX_LISTED = 20  # scans that wait or were set aside
+CALIBRATED_Z_STD = (0.8, 1.25)  # limits of the standard deviation of change / sigma on stable ground
+RECENT_SCANS = 24  # scans used for it
 
 
 @dataclass(frozen=True)
-class Told:
-    """What the service says, which is not in the archive."""
+class PageContext:
+    """The state of the service, which is not in the archive."""
 
     name: str
     institution: str
     written_s: float  # now
     expected_every_s: float
-    waiting: list[dict[str, Any]]  # scan, for
-    set_aside: list[dict[str, Any]]  # scan, reason, since
+    waiting: list[dict[str, Any]]  # keys scan, for
+    set_aside: list[dict[str, Any]]  # keys scan, reason, since
     faults: list[str]
-    seconds: dict[str, float]  # that a scan took, by its id
-    looks: dict[str, Look] = field(default_factory=dict)  # that need not be read, by the file of the epoch
+    durations_s: dict[str, float]  # processing time by scan id
+    overviews: dict[str, Overview] = field(default_factory=dict)  # those in memory already, by epoch file
 
 
 def write_page(
     series: Series,
     folder: Path,
-    told: Told,
+    context: PageContext,
     width_px: int,
     limit_m: float | None,
     progress: Callable[[], None],
 ) -> None:
-    """Bring the page in `folder` up to what is stored; raise StoreError where that cannot be.
+    """Update the page in `folder` to the stored epochs; raise StoreError if that fails.
 
-    Maps come first, then the data, then the page that names them.
+    The maps are written first, then the data, then the page that refers to them.
     """
-    record = read_record(series) if series.path.is_file() else None
-    all_areas = read_areas(series)
-    areas = all_areas[:MOST_AREAS]
-    if record is not None:
-        areas = [_without_unusable(area, record) for area in areas]
+    table = read_epoch_table(series) if series.path.is_file() else None
+    all_areas = read_area_series(series)
+    areas = all_areas[:MAX_AREAS]
+    if table is not None:
+        areas = [_mask_unusable(area, table) for area in areas]
     gallery = Gallery([], None, None, None, (0, 0))
-    if record is not None:
-        style = Style(told.name or series.station_id, width_px, limit_m)
-        gallery = hang(series, folder, _measured(series, record, told.looks), style, progress)
-    for name, parts in STATIC.items():
-        put(folder / name, b"".join((ASSETS / part).read_bytes() for part in parts))
-    data = {
-        "written_s": told.written_s,
-        "expected_every_s": told.expected_every_s,
-        "station": series.station_id,
-        "maps": [{"time_s": one.start.timestamp(), "file": one.file} for one in gallery.change],
-        "area_time_s": _numbers(areas[0].start_s[_picked(len(areas[0].start_s))], 0) if areas else [],
-        "areas": [_area(area) for area in areas],
-        "health": _health(record, told) if record is not None else None,
-    }
-    _script(folder / "data.js", "STATION", data)
-    _script(folder / "written.js", "STATION_WRITTEN_S", told.written_s)
-    put(folder / "index.html", _rendered(series, told, record, areas, gallery, len(all_areas)).encode())
-
-
-def _script(path: Path, name: str, value: object) -> None:
-    """Write data as a script: a page opened from a folder may load no other kind."""
-    body = json.dumps(value, allow_nan=False, separators=(",", ":"), ensure_ascii=True)
-    put(path, f"window.{name}={body};\n".encode("ascii"))
-
-
-def _measured(series: Series, record: Record, looks: dict[str, Look]) -> list[Measured]:
-    """Return the epochs that have a reference: the first, and those of which there is a map."""
-    rows = Named(series)
-    versions, reasons = record.words["reference_version"], record.words["verdict_reason"]
-    told = [at for at, version in enumerate(versions) if version]
-    if not told:
-        return []
-    kept = {0, *thinned(record.start_s[told])}
-    return [
-        Measured(
-            rows,
-            at,
-            datetime.fromtimestamp(float(record.start_s[at]), UTC),
-            versions[at],
-            "" if record.verdict[at] == "good" else f"{record.verdict[at]}: {reasons[at]}",
-            looks.get(record.words["epoch_file"][at]),
+    if table is not None:
+        style = Style(context.name or series.station_id, width_px, limit_m)
+        gallery = update_gallery(
+            series, folder, _measured_epochs(series, table, context.overviews), style, progress
         )
-        for at in (told[index] for index in sorted(kept))
+    for name, parts in STATIC.items():
+        replace_if_changed(folder / name, b"".join((ASSETS / part).read_bytes() for part in parts))
+    data = {
+        "written_s": context.written_s,
+        "expected_every_s": context.expected_every_s,
+        "station": series.station_id,
+        "maps": [{"time_s": image.start.timestamp(), "file": image.file} for image in gallery.change],
+        "area_time_s": _json_numbers(areas[0].start_s[_decimate(len(areas[0].start_s))], 0) if areas else [],
+        "areas": [_area_curve(area) for area in areas],
+        "health": _health_curves(table, context) if table is not None else None,
+    }
+    _write_script(folder / "data.js", "STATION", data)
+    _write_script(folder / "written.js", "STATION_WRITTEN_S", context.written_s)
+    replace_if_changed(
+        folder / "index.html", _render(series, context, table, areas, gallery, len(all_areas)).encode()
+    )
+
+
+def _write_script(path: Path, name: str, value: object) -> None:
+    """Write data as a script, the only kind that a page opened from a folder may load."""
+    body = json.dumps(value, allow_nan=False, separators=(",", ":"), ensure_ascii=True)
+    replace_if_changed(path, f"window.{name}={body};\n".encode("ascii"))
+
+
+def _measured_epochs(
+    series: Series, table: EpochTable, overviews: dict[str, Overview]
+) -> list[MeasuredEpoch]:
+    """Return the epochs that have a reference: the first, and those whose map is kept."""
+    epochs = SeriesIndex(series)
+    versions, reasons = table.texts["reference_version"], table.texts["verdict_reason"]
+    with_reference = [position for position, version in enumerate(versions) if version]
+    if not with_reference:
+        return []
+    retained = {0, *retention_indices(table.start_s[with_reference])}
+    return [
+        MeasuredEpoch(
+            epochs,
+            position,
+            datetime.fromtimestamp(float(table.start_s[position]), UTC),
+            versions[position],
+            "" if table.verdict[position] == "good" else f"{table.verdict[position]}: {reasons[position]}",
+            overviews.get(table.texts["epoch_file"][position]),
+        )
+        for position in (with_reference[index] for index in sorted(retained))
     ]
 
 
-def _picked(count: int) -> slice:
-    """Return every nth of so many, the newest among them, so that no more than POINTS are left."""
-    step = max(1, math.ceil(count / POINTS))
+def _decimate(count: int) -> slice:
+    """Return a slice of every nth of `count` values, the newest included; at most MAX_CURVE_POINTS."""
+    step = max(1, math.ceil(count / MAX_CURVE_POINTS))
     return slice((count - 1) % step if count else 0, None, step)
 
 
-def _numbers(values: Floats, digits: int) -> list[float | None]:
-    told = (round(float(one), digits) if np.isfinite(one) else None for one in values)
-    return [int(one) if one is not None and not digits else one for one in told]
+def _json_numbers(values: Floats, digits: int) -> list[float | None]:
+    rounded = (round(float(value), digits) if np.isfinite(value) else None for value in values)
+    return [int(value) if value is not None and not digits else value for value in rounded]
 
 
-def _without_unusable(area: AreaRecord, record: Record) -> AreaRecord:
-    """Return an area's series with gaps where neither change nor sigma can be relied on."""
-    bad = record.start_s[[verdict == "unusable" for verdict in record.verdict]]
-    gaps = np.isin(area.start_s, bad)
-    return replace(area, columns={name: np.where(gaps, np.nan, one) for name, one in area.columns.items()})
+def _mask_unusable(area: AreaSeries, table: EpochTable) -> AreaSeries:
+    """Return the series of an area with gaps at epochs whose change and sigma are unusable."""
+    unusable_s = table.start_s[[verdict == "unusable" for verdict in table.verdict]]
+    gaps = np.isin(area.start_s, unusable_s)
+    return replace(
+        area, columns={name: np.where(gaps, np.nan, values) for name, values in area.columns.items()}
+    )
 
 
-def _area(area: AreaRecord) -> dict[str, Any]:
-    few = _picked(len(area.start_s))
+def _area_curve(area: AreaSeries) -> dict[str, Any]:
+    kept = _decimate(len(area.start_s))
     return {
         "name": area.name,
-        "mean_m": _numbers(area.columns["mean_change"][few], 4),
-        "sigma_m": _numbers(area.columns["mean_change_uncertainty"][few], 5),
+        "mean_m": _json_numbers(area.columns["mean_change"][kept], 4),
+        "sigma_m": _json_numbers(area.columns["mean_change_uncertainty"][kept], 5),
     }
 
 
-def _health(record: Record, told: Told) -> dict[str, Any]:
-    few = _picked(len(record))
+def _health_curves(table: EpochTable, context: PageContext) -> dict[str, Any]:
+    kept = _decimate(len(table))
     digits = {"platform_roll": 4, "platform_pitch": 4, "air_temperature": 1, "air_pressure": 1}
     digits |= {"stable_median": 4, "stable_nmad": 4, "stable_z_std": 2}
-    shown = record.words["scan_id"][few]
-    seconds = np.array([told.seconds.get(one, np.nan) for one in shown], dtype=np.float64)
+    scan_ids = table.texts["scan_id"][kept]
+    seconds = np.array([context.durations_s.get(scan_id, np.nan) for scan_id in scan_ids], dtype=np.float64)
     return {
-        "time_s": _numbers(record.start_s[few], 0),
-        **{name: _numbers(record.numbers[name][few], places) for name, places in digits.items()},
-        "seconds": _numbers(seconds, 1),
+        "time_s": _json_numbers(table.start_s[kept], 0),
+        **{name: _json_numbers(table.scalars[name][kept], places) for name, places in digits.items()},
+        "seconds": _json_numbers(seconds, 1),
     }
 
 
-def _rendered(
+def _render(
     series: Series,
-    told: Told,
-    record: Record | None,
-    areas: list[AreaRecord],
+    context: PageContext,
+    table: EpochTable | None,
+    areas: list[AreaSeries],
     gallery: Gallery,
     area_count: int,
 ) -> str:
-    recent = range(max(0, len(record) - TABLE_ROWS), len(record))[::-1] if record is not None else []
+    recent = range(max(0, len(table) - TABLE_ROWS), len(table))[::-1] if table is not None else []
     return PAGE.render(
         id=series.station_id,
-        told=told,
+        context=context,
         version=__version__,
         gallery=gallery,
-        scans=[_scan(record, told, index) for index in recent] if record is not None else [],
-        areas=[_latest(area) for area in areas],
-        honesty=_honesty(record),
-        waiting=told.waiting[:LISTED],
-        set_aside=told.set_aside[-LISTED:][::-1],
-        listed=LISTED,
+        scans=[_scan_row(table, context, index) for index in recent] if table is not None else [],
+        areas=[_area_row(area) for area in areas],
+        calibration=_sigma_calibration(table),
+        waiting=context.waiting[:MAX_LISTED],
+        set_aside=context.set_aside[-MAX_LISTED:][::-1],
+        max_listed=MAX_LISTED,
         areas_left_out=area_count - len(areas),
     )
 
 
-def _scan(record: Record, told: Told, index: int) -> dict[str, Any]:
-    """One row of the table of scans."""
-    scan_id = record.words["scan_id"][index]
+def _scan_row(table: EpochTable, context: PageContext, index: int) -> dict[str, Any]:
+    """Return a row of the table of scans."""
+    scan_id = table.texts["scan_id"][index]
     return {
         "id": scan_id,
-        "time_s": float(record.start_s[index]),
-        "verdict": record.verdict[index],
-        "reason": record.words["verdict_reason"][index],
-        "seconds": told.seconds.get(scan_id, math.nan),
-        **{name: float(column[index]) for name, column in record.numbers.items()},
+        "time_s": float(table.start_s[index]),
+        "verdict": table.verdict[index],
+        "reason": table.texts["verdict_reason"][index],
+        "seconds": context.durations_s.get(scan_id, math.nan),
+        **{name: float(column[index]) for name, column in table.scalars.items()},
     }
 
 
-def _latest(area: AreaRecord) -> dict[str, Any] | None:
-    """One row of the table of areas: its newest values."""
+def _area_row(area: AreaSeries) -> dict[str, Any] | None:
+    """Return a row of the table of areas: the newest values of an area."""
     mean_m, sigma_m = (area.columns[key] for key in ("mean_change", "mean_change_uncertainty"))
     known = np.flatnonzero(np.isfinite(mean_m))
-    told: dict[str, Any] = {"name": area.name, "size_m2": area.size_m2, "time_s": None}
+    row: dict[str, Any] = {"name": area.name, "size_m2": area.size_m2, "time_s": None}
     if len(known):
-        at = known[-1]
-        told |= {key: float(column[at]) for key, column in area.columns.items()}
-        told |= {"time_s": float(area.start_s[at]), "half95": SIGNIFICANT_SIGMAS * float(sigma_m[at])}
-    return told
+        newest = known[-1]
+        row |= {key: float(column[newest]) for key, column in area.columns.items()}
+        row |= {"time_s": float(area.start_s[newest]), "half95": SIGNIFICANT_SIGMAS * float(sigma_m[newest])}
+    return row
 
 
-def _honesty(record: Record | None) -> dict[str, Any] | None:
-    """Judge the stated sigma by ground that does not move and no fit has seen; None where there is none."""
-    if record is None:
+def _sigma_calibration(table: EpochTable | None) -> dict[str, Any] | None:
+    """Return how sigma compares with the change of hold-out stable ground; None if there is none."""
+    if table is None:
         return None
-    z = record.numbers["stable_z_std"]
-    z = z[np.isfinite(z)][-RECENT:]
+    z = table.scalars["stable_z_std"]
+    z = z[np.isfinite(z)][-RECENT_SCANS:]
     if not len(z):
         return None
-    middle = float(np.median(z))
-    low, high = HONEST
-    word = "honest" if low <= middle <= high else "too wide" if middle < low else "too narrow"
-    return {"z": middle, "word": word, "scans": len(z), "low": low, "high": high}
+    median = float(np.median(z))
+    low, high = CALIBRATED_Z_STD
+    status = "calibrated" if low <= median <= high else "too large" if median < low else "too small"
+    return {"z": median, "status": status, "scans": len(z), "low": low, "high": high}
 
 
-def _number(value: float | None, digits: int, sign: bool = False) -> str:  # noqa: FBT001, FBT002 - a filter
+def _format_number(value: float | None, digits: int, sign: bool = False) -> str:  # noqa: FBT001, FBT002 - a filter
     if value is None or not math.isfinite(value):
         return "–"
     return f"{value:{'+' if sign else ''},.{digits}f}".replace("-", "−").replace(",", "\u202f")
 
 
-def _utc(moment_s: float) -> str:
-    return f"{datetime.fromtimestamp(moment_s, UTC):%Y-%m-%d %H:%M}"
+def _format_utc(time_s: float) -> str:
+    return f"{datetime.fromtimestamp(time_s, UTC):%Y-%m-%d %H:%M}"
 
 
 def _template() -> jinja2.Template:
@@ -234,8 +249,8 @@ def _template() -> jinja2.Template:
         loader=jinja2.FileSystemLoader(ASSETS), autoescape=True, undefined=jinja2.StrictUndefined,
         trim_blocks=True, lstrip_blocks=True,
     )  # fmt: skip
-    environment.filters |= {"number": _number, "utc": _utc}
+    environment.filters |= {"number": _format_number, "utc": _format_utc}
     return environment.get_template("page.html")
 
 
-PAGE = _template()  # once, before children are forked: compiling it takes as long as drawing a map
+PAGE = _template()  # compiled once, before worker processes are forked: it takes as long as drawing a map

@@ -1,4 +1,4 @@
-"""The station's page on this machine: read-only, over loopback."""
+"""Web server of the station's page: read-only, over loopback."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ HEADERS = {
     "x-content-type-options": "nosniff",
     "referrer-policy": "no-referrer",
     "cross-origin-resource-policy": "same-origin",
-    "cache-control": "no-cache",  # ask whether it has changed: the page is a new one after each scan
+    "cache-control": "no-cache",  # revalidate: the page changes with each scan
 }
 
 
-class _Headed:
-    """Adds the headers to every answer."""
+class _SecurityHeaders:
+    """Adds the security headers to every response."""
 
     def __init__(self, app: ASGIApp) -> None:
         self._app = app
@@ -38,9 +38,9 @@ class _Headed:
 
 
 def app_for(folder: Path) -> Starlette:
-    """Return a web application of the files in a folder: for readers on this machine, and nothing hidden.
+    """Return a web application that serves the files of a folder, except hidden ones, to this machine.
 
-    Raises StationError where starlette is not installed.
+    Raises StationError if starlette is not installed.
     """
     try:
         from starlette.applications import Starlette  # noqa: PLC0415 - an extra
@@ -54,18 +54,18 @@ def app_for(folder: Path) -> Starlette:
         raise StationError("serving needs two libraries: pip install 'tls-station[serve]'") from error
 
     class Shown(StaticFiles):
-        """Files whose names do not begin with a dot; links are not followed out of the folder."""
+        """Files whose names do not begin with a dot; links that leave the folder are not followed."""
 
         def lookup_path(self, path: str) -> tuple[str, object]:  # type: ignore[override]
             if any(part.startswith(".") for part in Path(path).parts):
                 raise HTTPException(404)
             return super().lookup_path(path)
 
-    # Another site's name that leads here (DNS rebinding) is refused.
+    # A foreign host name that resolves to this machine (DNS rebinding) is rejected.
     return Starlette(
         routes=[Mount("/", Shown(directory=folder, html=True, check_dir=False))],
         middleware=[
-            Middleware(_Headed),
+            Middleware(_SecurityHeaders),
             Middleware(TrustedHostMiddleware, allowed_hosts=[LOOPBACK, "localhost"]),
             Middleware(GZipMiddleware),
         ],
@@ -73,9 +73,9 @@ def app_for(folder: Path) -> Starlette:
 
 
 def serve(folder: Path, port: int) -> None:
-    """Serve until interrupted. Raises StationError where there is no page yet."""
+    """Serve until interrupted; raise StationError if there is no page yet."""
     if not (folder / "index.html").is_file():
-        raise StationError(f"{folder}: no page yet; it is made with the first scan (products.page = true)")
+        raise StationError(f"{folder}: no page yet; it is written with the first scan (products.page = true)")
     app = app_for(folder)
     import uvicorn  # noqa: PLC0415 - an extra
 

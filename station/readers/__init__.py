@@ -1,1 +1,1 @@
-"""Bytes to arrays: knows formats, knows no equation."""
+"""File formats to arrays: the readers know formats and no equations."""

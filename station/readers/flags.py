@@ -1,4 +1,4 @@
-"""Bad intervals noted by a person: a CSV file that may grow while the service runs."""
+"""Time intervals flagged by a person as unusable: a CSV file that may grow while the service runs."""
 
 from __future__ import annotations
 
@@ -8,13 +8,13 @@ from pathlib import Path
 from typing import NamedTuple
 
 from station.errors import ConfigError
-from station.readers.scan import foreign_code
+from station.readers.scan import decoder_errors
 
 COLUMNS = ["from", "to", "reason"]
 
 
 class Flag(NamedTuple):
-    """An interval whose epochs are not to be used, and why."""
+    """A time interval whose epochs must not be used, and the reason."""
 
     from_utc_s: float
     to_utc_s: float
@@ -22,45 +22,47 @@ class Flag(NamedTuple):
 
 
 def read_flags(path: Path) -> list[Flag]:
-    """Read rows `from,to,reason` in the order of the file: ISO times, UTC where no zone is written.
+    """Read rows `from,to,reason` in file order: ISO times, UTC unless a zone is given.
 
-    Raises ConfigError for a row that is none, naming its line, but for a last one still being written;
-    NotReadyError where the disk or its rights fail.
+    Raises ConfigError, with the line number, for an invalid row, unless it is the last one and still being
+    written; NotReadyError if the disk fails or access is denied.
     """
-    with foreign_code(f"{path.name} cannot be read"):
+    with decoder_errors(f"{path.name} cannot be read"):
         text = path.read_text(encoding="utf-8-sig")
     lines = text.splitlines()
     if lines and [name.strip() for name in lines[0].split(",")] != COLUMNS:
         raise ConfigError(f"{path}: must begin with the line {','.join(COLUMNS)}")
     flags = []
-    for number, row in enumerate(csv.reader(lines[1:]), start=2):
+    for line_number, row in enumerate(csv.reader(lines[1:]), start=2):
         if not any(field.strip() for field in row) or row[0].lstrip().startswith("#"):
             continue
         try:
-            flags.append(_flag(path, number, row))
+            flags.append(_parse_flag(path, line_number, row))
         except ConfigError:
-            if number < len(lines) or text.endswith("\n"):
+            if line_number < len(lines) or text.endswith("\n"):
                 raise
     return flags
 
 
-def flag_on(flags: list[Flag], start_utc_s: float, end_utc_s: float) -> str:
-    """Return the reasons of the flags that a scan overlaps, '' where none does."""
-    found = [flag.reason for flag in flags if flag.from_utc_s <= end_utc_s and start_utc_s <= flag.to_utc_s]
-    return "; ".join(dict.fromkeys(found))
+def reasons_for(flags: list[Flag], start_utc_s: float, end_utc_s: float) -> str:
+    """Return the reasons of the flags that overlap a scan, joined by semicolons; '' if there are none."""
+    reasons = [flag.reason for flag in flags if flag.from_utc_s <= end_utc_s and start_utc_s <= flag.to_utc_s]
+    return "; ".join(dict.fromkeys(reasons))
 
 
-def _flag(path: Path, number: int, row: list[str]) -> Flag:
+def _parse_flag(path: Path, line_number: int, row: list[str]) -> Flag:
     try:
         start, end, reason = (field.strip() for field in row)
         flag = Flag(_utc_s(start), _utc_s(end), reason)
     except (ValueError, OverflowError) as error:
-        raise ConfigError(f"{path}: line {number}: not a row {','.join(COLUMNS)}: {error}") from error
+        raise ConfigError(f"{path}: line {line_number}: not a row {','.join(COLUMNS)}: {error}") from error
     if flag.to_utc_s < flag.from_utc_s or not reason:
-        raise ConfigError(f"{path}: line {number}: " + ("ends before it begins" if reason else "no reason"))
+        raise ConfigError(
+            f"{path}: line {line_number}: " + ("ends before it begins" if reason else "no reason")
+        )
     return flag
 
 
 def _utc_s(text: str) -> float:
-    moment = datetime.fromisoformat(text)
-    return (moment if moment.tzinfo else moment.replace(tzinfo=UTC)).timestamp()
+    time = datetime.fromisoformat(text)
+    return (time if time.tzinfo else time.replace(tzinfo=UTC)).timestamp()

@@ -1,4 +1,4 @@
-"""The inclination log a scanner writes beside each scan."""
+"""The inclination log that a scanner writes for each scan."""
 
 from __future__ import annotations
 
@@ -9,67 +9,67 @@ import numpy as np
 
 from station.errors import ScanError
 from station.quantities import Floats, InclinationLog
-from station.readers.scan import WEEK_S, foreign_code
+from station.readers.scan import WEEK_S, decoder_errors
 
 COLUMNS = ("time", "roll", "pitch")
-MOST_BYTES = 1 << 26  # 1 Hz for a month
-FARTHEST_S = 86_400.0  # from the middle of the log: no scan lasts longer
+MAX_BYTES = 1 << 26  # 1 Hz for a month
+MAX_TIME_DIFFERENCE_S = 86_400.0  # from the median time of the log; no scan lasts longer
 
 
 def read_inclination(path: Path) -> InclinationLog:
-    """Read `Time,Roll,Pitch` in degrees, as written, in radians; a row that cannot be read is all NaN.
+    """Read `Time,Roll,Pitch` [degrees] and return it uncleaned [rad]; an unreadable row is all NaN.
 
-    Such rows stay, so that who cleans the log can count them. A last line without its end is one of them:
-    half a number is a wrong number; and so is a time more than a day from the others. GPS seconds of the week
-    run on past the week's end, as the scan's do.
-    Raises ScanError where no row can be read, NotReadyError where the disk or its rights fail.
+    Unreadable rows are kept so that the cleaning can count them. A last line without a newline is unreadable,
+    because half a number is a wrong number, and so is a time more than a day from the others. GPS seconds of
+    the week continue past the end of the week, as those of the scan do.
+    Raises ScanError if no row can be read, NotReadyError if the disk fails or access is denied.
     """
-    with foreign_code(f"{path.name} cannot be read"), path.open("rb") as file:
-        raw = file.read(MOST_BYTES + 1)
-    if len(raw) > MOST_BYTES:
+    with decoder_errors(f"{path.name} cannot be read"), path.open("rb") as file:
+        raw = file.read(MAX_BYTES + 1)
+    if len(raw) > MAX_BYTES:
         raise ScanError(f"{path.name}: too large for an inclination log")
-    whole, _, cut = raw.decode("utf-8-sig", "replace").rpartition("\n")
-    lines = [line for line in whole.split("\n") if line.strip()]
+    complete, _, partial_line = raw.decode("utf-8-sig", "replace").rpartition("\n")
+    lines = [line for line in complete.split("\n") if line.strip()]
     if not lines:
-        raise ScanError(f"{path.name}: holds no row")
+        raise ScanError(f"{path.name}: contains no rows")
     names = [name.strip(' "\r').lower() for name in lines[0].split(",")]
     if not set(COLUMNS) <= set(names):
         raise ScanError(f"{path.name}: its first line is not Time,Roll,Pitch but {lines[0][:60]!r}")
-    places = [names.index(name) for name in COLUMNS]
-    rows = np.array([_numbers(line, places) for line in lines[1:]]).reshape(-1, 3)
-    if cut.strip():
+    indices = [names.index(name) for name in COLUMNS]
+    rows = np.array([_parse_row(line, indices) for line in lines[1:]]).reshape(-1, 3)
+    if partial_line.strip():
         rows = np.vstack([rows, [np.nan] * 3])
     readable = np.isfinite(rows).all(axis=-1)
     if not readable.any():
-        raise ScanError(f"{path.name}: no row of {len(rows)} can be read")
-    time_s = _past_week(rows[:, 0], rows[readable][0, 0])
-    readable &= np.abs(time_s - np.median(time_s[readable])) <= FARTHEST_S
+        raise ScanError(f"{path.name}: none of {len(rows)} rows can be read")
+    time_s = _unwrap_week(rows[:, 0], rows[readable][0, 0])
+    readable &= np.abs(time_s - np.median(time_s[readable])) <= MAX_TIME_DIFFERENCE_S
     time_s[~readable] = rows[~readable] = np.nan
     return InclinationLog(time_s, np.radians(rows[:, 1]), np.radians(rows[:, 2]))
 
 
-def in_week_of(log: InclinationLog, time_s: float) -> InclinationLog:
-    """Return a clean log in the GPS week that a scan counts its seconds in, of which `time_s` is one.
+def align_gps_week(log: InclinationLog, time_s: float) -> InclinationLog:
+    """Return a cleaned log with its times in the GPS week of the scan; `time_s` is a time of the scan [s].
 
-    Where the week ends between the starts of scan and log, only one of the two is seen to run on.
+    If the week ends between the starts of scan and log, only one of the two shows the rollover.
     """
-    apart_s = time_s - float(np.median(log.time_s))
-    weeks = round(apart_s / WEEK_S)
-    if abs(weeks) != 1 or abs(apart_s - weeks * WEEK_S) > FARTHEST_S:
+    difference_s = time_s - float(np.median(log.time_s))
+    weeks = round(difference_s / WEEK_S)
+    if abs(weeks) != 1 or abs(difference_s - weeks * WEEK_S) > MAX_TIME_DIFFERENCE_S:
         return log
     return replace(log, time_s=log.time_s + weeks * WEEK_S)
 
 
-def _numbers(line: str, places: list[int]) -> tuple[float, ...]:
-    """Return the numbers in these places of a line, NaN for each where one is lacking."""
+def _parse_row(line: str, indices: list[int]) -> tuple[float, ...]:
+    """Return the values of some columns of a line; all NaN if one is missing."""
     fields = line.split(",")
     try:
-        return tuple(float(fields[place]) for place in places)
+        return tuple(float(fields[index]) for index in indices)
     except (ValueError, IndexError):
-        return (np.nan,) * len(places)
+        return (np.nan,) * len(indices)
 
 
-def _past_week(time_s: Floats, first_s: float) -> Floats:
-    """Let week seconds that fall back to zero run on."""
-    fallen = (time_s >= 0) & (time_s < first_s - WEEK_S / 2) & (first_s < WEEK_S)
-    return np.where(fallen, time_s + WEEK_S, time_s)
+def _unwrap_week(time_s: Floats, first_s: float) -> Floats:
+    """Return seconds of the GPS week that continue past its end instead of falling back to zero [s]."""
+    wrapped = (time_s >= 0) & (time_s < first_s - WEEK_S / 2) & (first_s < WEEK_S)
+    return np.where(wrapped, time_s + WEEK_S, time_s)

@@ -1,7 +1,7 @@
-"""LAS and LAZ scans: 1.0 to 1.4, all point formats.
+"""LAS and LAZ scans: versions 1.0 to 1.4, all point formats.
 
-lazrs decodes, laspy tells the coordinate system. Points are not read through laspy, for it refuses a scan
-over any odd letter in a record that nobody needs.
+laspy parses the header and the coordinate system. Its decoder, lazrs, is called directly, because laspy's
+reader cannot decode into shared memory (see `station.readers.prefetch`).
 """
 
 from __future__ import annotations
@@ -12,27 +12,28 @@ from contextlib import contextmanager
 from functools import cached_property, partial
 from io import BufferedReader
 from pathlib import Path
-from typing import BinaryIO, ClassVar, Self
+from typing import ClassVar, Self
 
 import lazrs
 import numpy as np
 from laspy import DecompressionSelection, LasHeader
+from laspy.header import GpsTimeType
 from numpy.typing import NDArray
 
 from station.errors import NotReadyError, ScanError
-from station.quantities import Floats, HeadTrack, Shots
-from station.readers.ahead import Room, filled
-from station.readers.las_layout import Layout, read_layout
-from station.readers.scan import WEEK_S, ScanHeader, foreign_code
+from station.quantities import AzimuthTrack, Floats, Shots
+from station.readers.las_header import LasFileHeader, read_header
+from station.readers.prefetch import Buffer, prefetch
+from station.readers.scan import WEEK_S, ScanHeader, decoder_errors
 
-NEEDED = DecompressionSelection.base().decompress_z().decompress_gps_time()  # heeded in formats 6 and up
-BRIGHT = NEEDED.decompress_intensity()
-BLOCKS_AT_ONCE = 8  # decoded together, some chunks a core; conversion still goes block by block, in the cache
-LONGEST_SCAN_S = 86_400.0
-PLACES = 200  # where a scan is looked at that has no chunks, or few
-SKIP = 50_000  # points decoded at a time only to pass them
-BRIGHTEST = 1 / 65535  # intensity is of 16 bits: LAS 1.4 R15, table 7
-FEW_CHUNKS = 20  # with fewer, chunk starts are too far apart to follow the head
+REQUIRED_FIELDS = DecompressionSelection.base().decompress_z().decompress_gps_time()  # of formats 6 and up
+WITH_INTENSITY = REQUIRED_FIELDS.decompress_intensity()
+BLOCKS_PER_BUFFER = 8  # decoded together, several chunks per core; converted one by one, in the cache
+MAX_SCAN_S = 86_400.0
+SAMPLE_COUNT = 200  # points sampled from a scan with no or few chunks
+SKIP_POINTS = 50_000  # points decoded at a time to skip them
+INTENSITY_SCALE = 1 / 65535  # intensity has 16 bits: LAS 1.4 R15, table 7
+MIN_CHUNKS = 20  # with fewer, chunk starts are too far apart to follow the azimuth
 
 Records = NDArray[np.void]
 
@@ -40,7 +41,7 @@ Records = NDArray[np.void]
 class LasScan:
     """A LAS/LAZ file whose headers agree with each other and with its size (see `ScanReader`).
 
-    Holds no open file between calls; a file that is replaced meanwhile gives NotReadyError.
+    No file stays open between calls; if it is replaced in between, NotReadyError is raised.
     """
 
     suffixes: ClassVar[tuple[str, ...]] = (".las", ".laz")
@@ -48,23 +49,22 @@ class LasScan:
     def __init__(self, path: Path, *, range_max_m: float | None = None) -> None:
         self.path = path
         self._range_max_m = range_max_m
-        with foreign_code("cannot be opened"), path.open("rb") as file:
+        with decoder_errors("cannot be opened"), path.open("rb") as file:
             status = os.fstat(file.fileno())
-            self._identity = _identity(status)
-            self._layout = read_layout(file, status.st_size)
-            file.seek(0)
-            crs_wkt = _crs_wkt(file)
-        low_m, high_m = self._layout.low_m, self._layout.high_m
+            self._file_identity = _file_identity(status)
+            self._las_header = read_header(file, status.st_size)
+        las = self._las_header.las
+        x_low_m, y_low_m, z_low_m = las.mins.tolist()
+        x_high_m, y_high_m, z_high_m = las.maxs.tolist()
         self.header = ScanHeader(
-            point_count=self._layout.count,
-            low_m=(float(low_m[0]), float(low_m[1]), float(low_m[2])),
-            high_m=(float(high_m[0]), float(high_m[1]), float(high_m[2])),
-            has_time=self._layout.has_time,
-            standard_time=self._layout.standard_time,
-            crs_wkt=crs_wkt,
-            software=self._layout.software,
+            point_count=las.point_count,
+            low_m=(x_low_m, y_low_m, z_low_m),
+            high_m=(x_high_m, y_high_m, z_high_m),
+            has_time=self._las_header.has_time,
+            standard_time=las.global_encoding.gps_time_type is GpsTimeType.STANDARD,
+            crs_wkt=_crs_wkt(las),
         )
-        nearest_m = float(np.linalg.norm(np.clip(0.0, low_m, high_m)))
+        nearest_m = float(np.linalg.norm(np.clip(0.0, las.mins, las.maxs)))
         if range_max_m is not None and nearest_m > range_max_m:
             raise ScanError(
                 f"the nearest point is {nearest_m:,.0f} m from the origin, beyond scanner.range_max_m ="
@@ -78,178 +78,195 @@ class LasScan:
         self.close()
 
     def close(self) -> None:
-        """Nothing is open between calls."""
+        """Do nothing: no file is open between calls."""
 
-    def blocks(self, size: int = 50_000, *, brightness: bool = True) -> Iterator[Shots]:
-        """Give all echoes in the order of the file, `size` at a time; memory does not grow with the file.
+    def blocks(self, size: int = 50_000, *, with_intensity: bool = True) -> Iterator[Shots]:
+        """Yield all echoes in file order, `size` at a time; memory does not grow with the file.
 
-        They are decoded from the call on, if that can be done beside. Without `brightness` an eighth of the
-        decoding is saved. Raises ScanError where fewer points are there than the header counts, or one lies
-        outside the header's box, farther than `range_max_m`, or has no finite time.
+        Decoding runs ahead in a child process if possible, from this call on. Without `with_intensity` an
+        eighth of the decoding is saved. Raises ScanError if the file contains fewer points than its header
+        counts, or if a point is outside the header's box, beyond `range_max_m`, or without a finite time.
         """
-        timed = self.time_range_s() is not None
-        together, width, count = BLOCKS_AT_ONCE * size, self._layout.record_bytes, self._layout.count
-        lengths = [min(together, count - first) * width for first in range(0, count, together)]
-        rooms = filled(partial(self._filling, BRIGHT if brightness else NEEDED), lengths)
-        return self._shots(rooms, size, timed=timed, brightness=brightness)
+        has_time = self.time_range_s() is not None
+        buffer_points, point_count = BLOCKS_PER_BUFFER * size, self.header.point_count
+        record_bytes = self._las_header.record_dtype.itemsize
+        lengths = [
+            min(buffer_points, point_count - first) * record_bytes
+            for first in range(0, point_count, buffer_points)
+        ]
+        layers = WITH_INTENSITY if with_intensity else REQUIRED_FIELDS
+        buffers = prefetch(partial(self._open_decoder, layers), lengths)
+        return self._iter_shots(buffers, size, has_time=has_time, with_intensity=with_intensity)
 
-    def _shots(self, rooms: Iterator[Room], size: int, *, timed: bool, brightness: bool) -> Iterator[Shots]:
-        check = _Check(self._layout, self._range_max_m)
-        for room in rooms:
-            records = room.view(self._layout.record)
+    def _iter_shots(
+        self, buffers: Iterator[Buffer], size: int, *, has_time: bool, with_intensity: bool
+    ) -> Iterator[Shots]:
+        decoder = _ShotDecoder(self._las_header.las, self._range_max_m)
+        for buffer in buffers:
+            records = buffer.view(self._las_header.record_dtype)
             for start in range(0, len(records), size):
-                yield check.shots(records[start : start + size], timed=timed, brightness=brightness)
+                yield decoder.decode(
+                    records[start : start + size], has_time=has_time, with_intensity=with_intensity
+                )
 
     @contextmanager
-    def _filling(self, layers: DecompressionSelection) -> Iterator[Callable[[Room], None]]:
-        """Open the points; give what decodes as many of the next as a room holds."""
-        with self._points(layers, all_cores=True) as points:
+    def _open_decoder(self, layers: DecompressionSelection) -> Iterator[Callable[[Buffer], None]]:
+        """Open the points; yield a function that decodes the next ones into a buffer until it is full."""
+        with self._open_points(layers, all_cores=True) as points:
             yield points.fill
 
     def time_range_s(self) -> tuple[float, float] | None:
-        """Give the earliest and latest time stamp [s] of echoes here and there.
+        """Return the earliest and latest time stamp [s] of sampled echoes.
 
-        None where the format has no time or all stamps are zero.
+        None if the format has no time or all stamps are zero.
         """
-        if not self._layout.has_time:
+        if not self._las_header.has_time:
             return None
-        time_s, *_ = self._glance
+        time_s, *_ = self._sample
         range_s = float(time_s.min()), float(time_s.max())
         return range_s if any(range_s) else None
 
-    def head_track(self) -> HeadTrack | None:
-        """Give where the head looked when, from echoes here and there.
+    def azimuth_track(self) -> AzimuthTrack | None:
+        """Return the azimuth of the scanner head over time [rad], from sampled echoes.
 
-        Decodes no more than the end where there are chunks enough. None for a scan without time or not in the
-        scanner's frame.
+        Decodes only the end of the file if there are enough chunks. None for a scan without time or not in
+        the scanner's frame.
         """
         if self._range_max_m is None or self.time_range_s() is None:
             return None
-        time_s, x_m, y_m = self._glance
-        if 0 < self._layout.chunks < FEW_CHUNKS:
-            blocks = self.blocks(max(self._layout.count // PLACES, 1), brightness=False)
-            firsts = [(one.time_s[0], *one.xyz_m[:2, 0]) for one in blocks if one.time_s is not None]
-            time_s, x_m, y_m = np.array(firsts).T
-        time_s, first = np.unique(time_s, return_index=True)
+        time_s, x_m, y_m = self._sample
+        if self._las_header.laszip is not None and len(time_s) <= MIN_CHUNKS:  # its chunks and the last point
+            blocks = self.blocks(max(self.header.point_count // SAMPLE_COUNT, 1), with_intensity=False)
+            first_shots = [
+                (shots.time_s[0], *shots.xyz_m[:2, 0]) for shots in blocks if shots.time_s is not None
+            ]
+            time_s, x_m, y_m = np.array(first_shots).T
+        time_s, first_index = np.unique(time_s, return_index=True)
         if len(time_s) < 2:
             return None
-        return HeadTrack(time_s, np.unwrap(np.arctan2(y_m[first], x_m[first])))
+        return AzimuthTrack(time_s, np.unwrap(np.arctan2(y_m[first_index], x_m[first_index])))
 
     @cached_property
-    def _glance(self) -> tuple[Floats, Floats, Floats]:
-        """Time [s], x and y [m] of echoes (n,): the first of each chunk, or some on the way, and the last."""
-        layout = self._layout
-        places = [] if layout.laszip else np.linspace(0, layout.count - 1, PLACES).astype(np.int64).tolist()
-        seen = [layout.chunk_firsts]
-        with self._points(NEEDED, all_cores=False) as points:
-            for number in [*places, layout.count - 1]:
-                points.seek(number)
-                seen.append(points.read(1).tobytes())
-        records = np.frombuffer(b"".join(seen), layout.record)
-        shots = _Check(layout, self._range_max_m).shots(records, timed=True)
-        assert shots.time_s is not None  # noqa: S101 - asked for
+    def _sample(self) -> tuple[Floats, Floats, Floats]:
+        """Time [s], x and y [m] (n,): the first echo of each chunk, or evenly spaced ones, and the last."""
+        header, last = self._las_header, self.header.point_count - 1
+        indices = (
+            [last] if header.laszip else [*np.linspace(0, last, SAMPLE_COUNT).astype(int).tolist(), last]
+        )
+        raw = header.first_points
+        with self._open_points(REQUIRED_FIELDS, all_cores=False) as points:
+            for index in indices:
+                points.seek(index)
+                raw += points.read(1).tobytes()
+        records = np.frombuffer(raw, header.record_dtype)
+        shots = _ShotDecoder(header.las, self._range_max_m).decode(records, has_time=True)
+        assert shots.time_s is not None  # noqa: S101 - requested
         return shots.time_s, shots.xyz_m[0], shots.xyz_m[1]
 
     @contextmanager
-    def _points(self, layers: DecompressionSelection, *, all_cores: bool) -> Iterator[_Points]:
-        """Open the points, at the first; passes see the file that was checked or NotReadyError."""
-        with foreign_code("cannot be opened again"):
+    def _open_points(self, layers: DecompressionSelection, *, all_cores: bool) -> Iterator[_PointStream]:
+        """Open the file at its first point; raise NotReadyError if it changed since it was checked."""
+        with decoder_errors("cannot be opened again"):
             file = self.path.open("rb")
         with file:
-            if _identity(os.fstat(file.fileno())) != self._identity:
+            if _file_identity(os.fstat(file.fileno())) != self._file_identity:
                 raise NotReadyError("has changed since it was opened")
-            yield _Points(file, self._layout, layers, all_cores=all_cores)
+            yield _PointStream(file, self._las_header, layers, all_cores=all_cores)
 
 
-class _Points:
-    """The records of an open file, one after the other from wherever one seeks; onwards only."""
+class _PointStream:
+    """The point records of an open file, read in order; seeking goes forward only."""
 
     def __init__(
-        self, file: BufferedReader, layout: Layout, layers: DecompressionSelection, *, all_cores: bool
+        self, file: BufferedReader, header: LasFileHeader, layers: DecompressionSelection, *, all_cores: bool
     ) -> None:
         self._file = file
-        self._layout = layout
-        self.at = 0
+        self._header = header
+        self._dtype = header.record_dtype
+        self.position = 0
         self._decompressor = None
-        file.seek(layout.points_at)
-        if layout.laszip is not None:
-            with foreign_code("cannot be decompressed"):
+        file.seek(header.las.offset_to_point_data)
+        if header.laszip is not None:
+            with decoder_errors("cannot be decompressed"):
                 decompressor = lazrs.ParLasZipDecompressor if all_cores else lazrs.LasZipDecompressor
-                self._decompressor = decompressor(file, layout.laszip, layers.to_lazrs())
+                self._decompressor = decompressor(file, header.laszip, layers.to_lazrs())
 
-    def seek(self, number: int) -> None:
-        """Go on to a point."""
-        if self._decompressor is not None and not self._layout.even_chunks:
-            while self.at < number:  # lazrs 0.8 seeks to wrong points where chunks differ in length
-                self.read(min(SKIP, number - self.at))
+    def seek(self, index: int) -> None:
+        """Skip forward to a point."""
+        if self._decompressor is not None and not self._header.equal_chunks:
+            while self.position < index:  # lazrs 0.8 seeks to wrong points if chunks differ in length
+                self.read(min(SKIP_POINTS, index - self.position))
             return
-        self.at = number
-        with foreign_code(f"corrupt near point {number:,}"):
+        self.position = index
+        with decoder_errors(f"corrupt near point {index:,}"):
             if self._decompressor is None:
-                self._file.seek(self._layout.points_at + number * self._layout.record_bytes)
+                self._file.seek(self._header.las.offset_to_point_data + index * self._dtype.itemsize)
             else:
-                self._decompressor.seek(number)
+                self._decompressor.seek(index)
 
     def read(self, count: int) -> Records:
-        """Decode the next `count` records; they must be there."""
-        room = np.empty(count * self._layout.record_bytes, np.uint8)
-        self.fill(room)
-        return room.view(self._layout.record)
+        """Return the next `count` records, decoded; the file must contain them."""
+        buffer = np.empty(count * self._dtype.itemsize, np.uint8)
+        self.fill(buffer)
+        return buffer.view(self._dtype)
 
-    def fill(self, room: Room) -> None:
-        """Decode the next records into a room; as many as it holds must be there."""
-        count = len(room) // self._layout.record_bytes
-        with foreign_code(f"corrupt after point {self.at:,}"):
+    def fill(self, buffer: Buffer) -> None:
+        """Decode the next records into a buffer until it is full; the file must contain them."""
+        count = len(buffer) // self._dtype.itemsize
+        with decoder_errors(f"corrupt after point {self.position:,}"):
             if self._decompressor is not None:
-                self._decompressor.decompress_many(room)
-            elif self._file.readinto(room.data) != len(room):
-                raise ScanError(f"cut off: ends before point {self.at + count:,} of {self._layout.count:,}")
-        self.at += count
+                self._decompressor.decompress_many(buffer)
+            elif self._file.readinto(buffer.data) != len(buffer):
+                raise ScanError(
+                    f"cut off: ends before point {self.position + count:,}"
+                    f" of {self._header.las.point_count:,}"
+                )
+        self.position += count
 
 
-class _Check:
-    """Turns records into shots and holds them against what the header says."""
+class _ShotDecoder:
+    """Decodes point records into shots and checks them against the header."""
 
-    def __init__(self, layout: Layout, range_max_m: float | None) -> None:
-        self._layout = layout
-        slack_m = layout.scale  # writers round the box before or after the points
-        self._low_m, self._high_m = layout.low_m - slack_m, layout.high_m + slack_m
+    def __init__(self, las: LasHeader, range_max_m: float | None) -> None:
+        self._las = las
+        tolerance_m = las.scales  # writers round the box before or after the points
+        self._low_m, self._high_m = las.mins - tolerance_m, las.maxs + tolerance_m
         self._scanner_frame = range_max_m is not None
-        # the box is enough where its farthest corner is in range
-        corner_m = np.linalg.norm(np.maximum(np.abs(layout.low_m), np.abs(layout.high_m)))
+        # points need no check of their range if the farthest corner of the box is in range
+        corner_m = np.linalg.norm(np.maximum(np.abs(las.mins), np.abs(las.maxs)))
         self._range_max_m = range_max_m if range_max_m is not None and corner_m > range_max_m else None
         self._first_s: float | None = None
         self._earliest_s = np.inf
         self._latest_s = -np.inf
 
-    def shots(self, records: Records, *, timed: bool, brightness: bool = False) -> Shots:
-        """Give the echoes of some records, contiguous (n,), with their times if `timed`."""
+    def decode(self, records: Records, *, has_time: bool, with_intensity: bool = False) -> Shots:
+        """Return the echoes of records, contiguous (n,), with their times if `has_time`."""
         xyz_m = np.empty((3, len(records)))
         for axis, axis_m in enumerate(xyz_m):
-            self._lay(records, axis, axis_m)
+            self._scale_axis(records, axis, axis_m)
         if self._range_max_m is not None:
             farthest_m = float(np.sqrt((xyz_m**2).sum(axis=0).max()))
             if farthest_m > self._range_max_m:
                 raise ScanError(
                     f"an echo {farthest_m:,.0f} m away, beyond scanner.range_max_m = {self._range_max_m:g}:"
-                    " corrupt, or another unit, frame or scanner than the site file says"
+                    " corrupt, or not of the unit, frame or scanner that the site file states"
                 )
-        bright = records["intensity"] * BRIGHTEST if brightness else None
-        return Shots(xyz_m, self._times(records) if timed else None, bright)
+        intensity = records["intensity"] * INTENSITY_SCALE if with_intensity else None
+        return Shots(xyz_m, self._decode_times(records) if has_time else None, intensity)
 
-    def _lay(self, records: Records, axis: int, values: Floats) -> None:
-        """Lay the coordinates (n,) along an axis into `values` [m]."""
+    def _scale_axis(self, records: Records, axis: int, values: Floats) -> None:
+        """Write the coordinates (n,) along an axis into `values` [m]."""
         values[:] = records["XYZ"[axis]]
-        values *= self._layout.scale[axis]
-        values += self._layout.offset[axis]
+        values *= self._las.scales[axis]
+        values += self._las.offsets[axis]
         if values.min() < self._low_m[axis] or values.max() > self._high_m[axis]:
             raise ScanError(
                 f"corrupt, or written by a faulty program: {'xyz'[axis]} = {values.min():.3f} to"
-                f" {values.max():.3f} m leaves the header's {self._layout.low_m[axis]:.3f} to"
-                f" {self._layout.high_m[axis]:.3f} m"
+                f" {values.max():.3f} m leaves the header's {self._las.mins[axis]:.3f} to"
+                f" {self._las.maxs[axis]:.3f} m"
             )
 
-    def _times(self, records: Records) -> Floats:
+    def _decode_times(self, records: Records) -> Floats:
         time_s = np.ascontiguousarray(records["gps_time"], dtype=np.float64)
         low_s, high_s = float(time_s.min()), float(time_s.max())
         if not (np.isfinite(low_s) and np.isfinite(high_s)):
@@ -260,7 +277,7 @@ class _Check:
             time_s = np.where(time_s < self._first_s - WEEK_S / 2, time_s + WEEK_S, time_s)
             low_s, high_s = float(time_s.min()), float(time_s.max())
         self._earliest_s, self._latest_s = min(self._earliest_s, low_s), max(self._latest_s, high_s)
-        if self._scanner_frame and self._latest_s - self._earliest_s > LONGEST_SCAN_S:
+        if self._scanner_frame and self._latest_s - self._earliest_s > MAX_SCAN_S:
             raise ScanError(
                 f"time stamps from {self._earliest_s:.3f} to {self._latest_s:.3f} s, more than a day apart:"
                 " corrupt, or several scans in one file"
@@ -268,15 +285,15 @@ class _Check:
         return time_s
 
 
-def _crs_wkt(file: BinaryIO) -> str | None:
-    """Give the coordinate system a file names, None where it names none that can be understood."""
+def _crs_wkt(las: LasHeader) -> str | None:
+    """Return the coordinate system that a file declares; None if it declares none that can be parsed."""
     try:
-        with foreign_code("coordinate system"):
-            crs = LasHeader.read_from(file).parse_crs()
+        with decoder_errors("coordinate system"):
+            crs = las.parse_crs()
             return None if crs is None else crs.to_wkt()
     except ScanError:
         return None
 
 
-def _identity(status: os.stat_result) -> tuple[int, int, int, int]:
+def _file_identity(status: os.stat_result) -> tuple[int, int, int, int]:
     return status.st_dev, status.st_ino, status.st_size, status.st_mtime_ns

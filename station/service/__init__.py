@@ -1,1 +1,1 @@
-"""The shell around the science: clocks, threads, signals, disks; knows no equation."""
+"""The service: its loop, schedule, worker, publishing and retention. It contains no equations."""

@@ -1,6 +1,7 @@
-"""The service: one loop that looks at the inbox and takes scans one by one; it waits out what may pass.
+"""The service: one loop that polls the inbox, processes scan after scan and waits out transient faults.
 
-Events, clockwork and signals only put a word into its queue; everything is done here, between two scans.
+File events, scheduler and signals only put an event into its queue. All work is done in the loop, between
+two scans.
 """
 
 from __future__ import annotations
@@ -17,16 +18,17 @@ from typing import TYPE_CHECKING, Protocol
 
 from station.config import Site, read_site
 from station.errors import ConfigError, StationError
+from station.inbox.inbox import Inbox, ScanFile
+from station.inbox.journal import Journal, State
+from station.inbox.lock import exclusive_lock
+from station.logs import log_to_stderr, logfmt
+from station.monitoring.metrics import Metrics
+from station.monitoring.preconditions import EARLIEST_S, clock_problem, require_disk_space
+from station.processing import isolation
 from station.readers.scan import suffixes
-from station.service import child
-from station.service.health import EARLIEST_S, Heart, clock_fault, need_room
-from station.service.inbox import Arrival, Inbox
-from station.service.jobs import Clockwork, Wake
-from station.service.journal import Journal, State
-from station.service.lock import only_writer
-from station.service.logs import log_to_stderr, logfmt
-from station.service.metrics import Metrics
-from station.service.watch import Ear
+from station.service.inbox_watcher import InboxWatcher
+from station.service.scheduler import JobScheduler, LoopEvent
+from station.service.systemd import SystemdNotifier
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -35,307 +37,321 @@ if TYPE_CHECKING:
 log = logging.getLogger("station")
 
 
-class Takes(Protocol):
-    """What the loop asks of a worker; see `worker.Worker`."""
+class ScanProcessor(Protocol):
+    """What the loop needs of a worker; see `worker.Worker`."""
 
     def recover(self) -> None: ...  # noqa: D102
-    def take(self, arrival: Arrival) -> bool: ...  # noqa: D102
-    def glance(self, arrival: Arrival) -> None: ...  # noqa: D102
-    def begin_joining(self) -> None: ...  # noqa: D102
-    def note_joined(self) -> None: ...  # noqa: D102
+    def process(self, scan: ScanFile) -> bool: ...  # noqa: D102
+    def precheck(self, scan: ScanFile) -> None: ...  # noqa: D102
+    def start_compaction(self) -> None: ...  # noqa: D102
+    def publish_compacted(self) -> None: ...  # noqa: D102
     def close(self) -> None: ...  # noqa: D102
-    def sweep(self) -> None: ...  # noqa: D102
+    def run_maintenance(self) -> None: ...  # noqa: D102
 
 
 @dataclass(frozen=True)
-class Pace:
-    """How long the loop waits for what [s]."""
+class LoopTiming:
+    """Waiting times of the loop [s]."""
 
-    period_s: float = 60.0  # between two looks at the inbox without any event
-    calm_s: float = 1.0  # at least, between two looks, however many events there are
-    grace_s: float = 60.0  # for the running scan, when the service is to stop
-    first_pause_s: float = 5.0  # after a fault of the store; doubled up to period_s
-    clock_s: float = (
-        3600.0  # for a clock that may be wrong; one that cannot be right is waited for without end
-    )
+    period_s: float = 60.0  # between two polls of the inbox without an event
+    debounce_s: float = 1.0  # minimum between two polls, however many events arrive
+    grace_s: float = 60.0  # for the running scan when the service is to stop
+    first_pause_s: float = 5.0  # after a store error; doubled up to period_s
+    clock_wait_s: float = 3600.0  # for a doubtful clock; an impossible one is waited for without limit
 
 
-def run(site_path: Path, *, make_worker: Callable[..., Takes] | None = None, pace: Pace | None = None) -> int:
-    """Be the service until told to stop; return the exit status.
+def run(
+    site_path: Path,
+    *,
+    make_worker: Callable[..., ScanProcessor] | None = None,
+    timing: LoopTiming | None = None,
+) -> int:
+    """Run the service until a signal stops it; return the exit status.
 
-    Raises ConfigError where the site file cannot be used, NotReadyError where another process has the data
-    folder, StoreError where that folder cannot be made.
+    Raises ConfigError if the site file cannot be used, NotReadyError if another process has locked the data
+    folder, StoreError if that folder cannot be created.
     """
     log_to_stderr()
     if make_worker is None:
-        child.prepare()  # the server of children loads beside this, what this loads
-        from station.service.worker import Worker  # noqa: PLC0415 - a second of imports, which tests do without
+        isolation.start_forkserver()  # the fork server imports modules while this process does
+        from station.service.worker import Worker  # noqa: PLC0415 - a second of imports that tests avoid
 
         make_worker = Worker
-    faulthandler.enable()  # a watchdog's SIGABRT then tells where the loop hung
-    daemon = Daemon(site_path, make_worker, pace or Pace())
+    faulthandler.enable()  # the watchdog's SIGABRT then prints where the loop hung
+    daemon = Daemon(site_path, make_worker, timing or LoopTiming())
     signal.signal(signal.SIGTERM, lambda *_: daemon.stop())
     signal.signal(signal.SIGINT, lambda *_: daemon.stop())
-    signal.signal(signal.SIGHUP, lambda *_: daemon.wake(Wake.RELOAD))
+    signal.signal(signal.SIGHUP, lambda *_: daemon.post(LoopEvent.RELOAD))
     daemon.serve()
     return 0
 
 
 class Daemon:
-    """The loop and what it holds between two passes."""
+    """The loop of the service and its state between two iterations."""
 
-    def __init__(self, site_path: Path, make_worker: Callable[..., Takes], pace: Pace) -> None:
+    def __init__(
+        self, site_path: Path, make_worker: Callable[..., ScanProcessor], timing: LoopTiming
+    ) -> None:
         self._site_path = site_path
         self._site = read_site(site_path)
         self._make_worker = make_worker
-        self._pace = pace
-        self._heart = Heart()
-        # SimpleQueue, because its put() may be called from a signal handler while get() waits.
-        self._wakes: SimpleQueue[Wake] = SimpleQueue()
-        # Housekeeping too: a station that is never up at night has it done at start.
-        self._due = {Wake.EXPECTED, Wake.JOIN, Wake.SWEEP}
-        self._stop_s = math.inf  # when a running scan is given up
-        self._pauses = 0  # faults in a row
-        self._looked_s = -math.inf
-        self._last_new_s = time.monotonic()
+        self._timing = timing
+        self._systemd = SystemdNotifier()
+        # SimpleQueue: its put() may be called from a signal handler while get() waits.
+        self._events: SimpleQueue[LoopEvent] = SimpleQueue()
+        # Housekeeping is due at start: some stations never run at night.
+        self._due = {LoopEvent.OVERDUE_CHECK, LoopEvent.COMPACT, LoopEvent.MAINTENANCE}
+        self._stop_deadline_s = math.inf  # monotonic time at which the running scan is abandoned
+        self._consecutive_faults = 0
+        self._last_poll_s = -math.inf
+        self._last_arrival_s = time.monotonic()
         self._is_overdue = False
-        self._refused_site = ""  # why the last reload was refused
-        self._closing = ExitStack()
+        self._site_file_fault = ""  # why the last reload was rejected
+        self._exit_stack = ExitStack()
         self._journal: Journal | None = None
-        self._parts: tuple[Takes, Inbox, Ear, Clockwork] | None = None
-        self._is_recovered = False
+        self._open_components: tuple[ScanProcessor, Inbox, InboxWatcher, JobScheduler] | None = None
+        self._is_reconciled = False
         self._metrics = Metrics(lambda: self._site)
 
-    def wake(self, wake: Wake) -> None:
-        """Have the loop do something as soon as the running scan is done; from any thread or signal."""
-        self._wakes.put(wake)
+    def post(self, event: LoopEvent) -> None:
+        """Queue an event for after the running scan; safe from any thread or signal handler."""
+        self._events.put(event)
 
     def stop(self) -> None:
-        """Have the loop end: the running scan is finished within the grace; when told twice, at once."""
+        """End the loop after the running scan, or after `grace_s`; a second call ends it at once."""
         now_s = time.monotonic()
-        self._stop_s = now_s if self._is_stopping() else now_s + self._pace.grace_s
-        self._heart.stopping()
-        self._wakes.put(Wake.STOP)
+        self._stop_deadline_s = now_s if self._is_stopping() else now_s + self._timing.grace_s
+        self._systemd.stopping()
+        self._events.put(LoopEvent.STOP)
 
     def serve(self) -> None:
-        """Be the loop."""
-        self._await_clock()
-        with only_writer(self._site.station.data), self._metrics.serving(), self._closing:
-            self._closing.callback(self._let_go)
+        """Run the loop until `stop` is called."""
+        self._wait_for_clock()
+        with exclusive_lock(self._site.station.data), self._metrics.serving(), self._exit_stack:
+            self._exit_stack.callback(self._close_components)
             while not self._is_stopping():
                 try:
-                    wait_s = self._pass()
-                    self._go_on()
+                    wait_s = self._iterate()
+                    self._resume()
                 except StationError as error:
                     wait_s = self._pause(error)
-                    self._heart.ready()  # up, though paused: nothing is gained by starting it anew
+                    self._systemd.ready()  # up although paused: a restart would gain nothing
                 self._wait(wait_s)
             log.info(logfmt(service="stopped"))
 
-    # ---- one pass
+    # ---- one iteration
 
-    def _pass(self) -> float:
-        """Do what is due and take one scan; return how long nothing will be due [s]."""
-        self._heart.ping()
-        if Wake.RELOAD in self._due:
-            self._due.discard(Wake.RELOAD)
+    def _iterate(self) -> float:
+        """Do what is due and process one scan; return the time until the next work is due [s]."""
+        self._systemd.watchdog()
+        if LoopEvent.RELOAD in self._due:
+            self._due.discard(LoopEvent.RELOAD)
             self._reload()
-        need_room(self._site)
-        worker, inbox, ear, clockwork = self._opened()
-        ear.listen()
-        if step_s := clockwork.follow_clock():
+        require_disk_space(self._site)
+        worker, inbox, watcher, scheduler = self._components()
+        watcher.ensure_watching()
+        if step_s := scheduler.resync_clock():
             log.warning(logfmt(clock="set", step_s=round(step_s)))
-        if Wake.EXPECTED in self._due:
-            self._due.discard(Wake.EXPECTED)
-            self._note_silence()
+        if LoopEvent.OVERDUE_CHECK in self._due:
+            self._due.discard(LoopEvent.OVERDUE_CHECK)
+            self._warn_if_overdue()
             self._metrics.write()
-        if Wake.JOINED in self._due:
-            self._due.discard(Wake.JOINED)
-            self._spared(Wake.JOINED, worker.note_joined)
-        self._looked_s = time.monotonic()
-        listing = inbox.look()
-        self._note_new(listing.new)
-        if listing.first is None and listing.unread is not None:
-            worker.glance(listing.unread)
+        if LoopEvent.COMPACTED in self._due:
+            self._due.discard(LoopEvent.COMPACTED)
+            self._guarded(LoopEvent.COMPACTED, worker.publish_compacted)
+        self._last_poll_s = time.monotonic()
+        state = inbox.poll()
+        self._record_arrivals(state.new)
+        if state.first is None and state.to_precheck is not None:
+            worker.precheck(state.to_precheck)
             return 0.0
-        if listing.first is None:
-            self._tidy(worker)
-            self._say_idle()
-            return min(self._pace.period_s, listing.next_s)
-        self._heart.status(f"measuring {listing.first.name}, {listing.queued - 1} more wait")
-        self._take(worker, listing.first)
+        if state.first is None:
+            self._housekeeping(worker)
+            self._report_idle()
+            return min(self._timing.period_s, state.next_s)
+        self._systemd.status(f"measuring {state.first.name}, {state.queued - 1} more waiting")
+        self._process(worker, state.first)
         return 0.0
 
-    def _take(self, worker: Takes, arrival: Arrival) -> None:
+    def _process(self, worker: ScanProcessor, scan: ScanFile) -> None:
         try:
-            worker.take(arrival)
+            worker.process(scan)
         except StationError:
-            self._is_recovered = False  # it may have been broken off between file and journal
+            self._is_reconciled = False  # it may have stopped between writing the file and the journal
             raise
-        except Exception as bug:  # one that a scan wakes must not keep the others out
-            log.exception(logfmt(scan=arrival.name, verdict="later", reason="a bug: please report it"))
-            self._opened_journal().later(arrival.name, f"a bug: {type(bug).__name__}: {bug}"[:500])
+        except Exception as bug:  # a bug triggered by one scan must not block the others
+            log.exception(logfmt(scan=scan.name, verdict="later", reason="a bug: please report it"))
+            self._open_journal().defer(scan.name, f"a bug: {type(bug).__name__}: {bug}"[:500])
 
-    def _tidy(self, worker: Takes) -> None:
-        """Do what the clockwork asked for, when no scan waits for it; what fails comes again at its time."""
-        for wake, tidy in ((Wake.JOIN, worker.begin_joining), (Wake.SWEEP, worker.sweep)):
-            if wake in self._due and not self._is_stopping():
-                self._due.discard(wake)
-                self._spared(wake, tidy)
+    def _housekeeping(self, worker: ScanProcessor) -> None:
+        """Run scheduled tasks while no scan is waiting; a failed task runs again at its next time."""
+        for event, task in (
+            (LoopEvent.COMPACT, worker.start_compaction),
+            (LoopEvent.MAINTENANCE, worker.run_maintenance),
+        ):
+            if event in self._due and not self._is_stopping():
+                self._due.discard(event)
+                self._guarded(event, task)
 
     @staticmethod
-    def _spared(what: Wake, tidy: Callable[[], None]) -> None:
-        """Do what no scan waits for: a bug there must not keep the scans out."""
+    def _guarded(event: LoopEvent, task: Callable[[], None]) -> None:
+        """Run a task and log any bug in it: housekeeping must not block the scans."""
         try:
-            tidy()
+            task()
         except StationError:
             raise
         except Exception:
-            log.exception(logfmt(failed=what.name.lower(), reason="a bug: please report it"))
+            log.exception(logfmt(failed=event.name.lower(), reason="a bug: please report it"))
 
     # ---- opening, reloading
 
-    def _opened(self) -> tuple[Takes, Inbox, Ear, Clockwork]:
-        """Return what the loop works with; at first it is made, and journal and store are reconciled."""
-        if self._parts is None:
-            self._parts = self._make(self._site)
-        if not self._is_recovered:
-            self._heart.status("reconciling journal and store")
-            self._parts[0].recover()
-            self._is_recovered = True
-            self._heart.ready()
+    def _components(self) -> tuple[ScanProcessor, Inbox, InboxWatcher, JobScheduler]:
+        """Return the components; create them on first use and reconcile journal and store."""
+        if self._open_components is None:
+            self._open_components = self._create_components(self._site)
+        if not self._is_reconciled:
+            self._systemd.status("reconciling journal and store")
+            self._open_components[0].recover()
+            self._is_reconciled = True
+            self._systemd.ready()
             log.info(logfmt(service="running", station=self._site.station.id, inbox=self._site.scans.inbox))
-        return self._parts
+        return self._open_components
 
-    def _make(self, site: Site) -> tuple[Takes, Inbox, Ear, Clockwork]:
-        journal = self._opened_journal()
+    def _create_components(self, site: Site) -> tuple[ScanProcessor, Inbox, InboxWatcher, JobScheduler]:
+        journal = self._open_journal()
         worker = self._make_worker(
             site,
             journal,
-            on_progress=self._heart.ping,
-            should_stop=lambda: time.monotonic() > self._stop_s,
-            on_joined=lambda: self.wake(Wake.JOINED),
-            patient=True,
+            on_progress=self._systemd.watchdog,
+            should_stop=lambda: time.monotonic() > self._stop_deadline_s,
+            on_compacted=lambda: self.post(LoopEvent.COMPACTED),
+            in_service=True,
         )
         inbox = Inbox(site, journal, suffixes())
-        ear = Ear(site.scans.inbox, lambda: self.wake(Wake.LOOK), polling=site.scans.polling)
-        return worker, inbox, ear, Clockwork(self.wake, expected_every_s=site.scans.expected_every_s)
+        watcher = InboxWatcher(
+            site.scans.inbox, lambda: self.post(LoopEvent.INBOX_CHANGED), polling=site.scans.polling
+        )
+        return worker, inbox, watcher, JobScheduler(self.post, expected_every_s=site.scans.expected_every_s)
 
-    def _opened_journal(self) -> Journal:
+    def _open_journal(self) -> Journal:
         if self._journal is None:
-            self._journal = self._closing.enter_context(Journal(self._site.station.data / "journal.sqlite"))
+            self._journal = self._exit_stack.enter_context(
+                Journal(self._site.station.data / "journal.sqlite")
+            )
         return self._journal
 
     def _reload(self) -> None:
-        """Take the site file as it is now; keep the old one, and say so, where it cannot be used."""
-        self._heart.reloading()
+        """Read the site file again; if it cannot be used, log why and keep the old one."""
+        self._systemd.reloading()
         try:
             site = read_site(self._site_path)
             if site.station.data != self._site.station.data:
-                raise ConfigError("station.data has changed: that takes a restart")
-            parts = self._make(site)
+                raise ConfigError("station.data has changed: restart the service")
+            components = self._create_components(site)
         except StationError as error:
-            self._refused_site = str(error)
-            log.error(logfmt(reload="refused", kept="the old site file", reason=error))  # noqa: TRY400 - its text says it all
+            self._site_file_fault = str(error)
+            log.error(  # noqa: TRY400 - the message suffices
+                logfmt(reload="rejected", kept="the old site file", reason=error)
+            )
         else:
-            self._let_go()
-            self._site, self._parts, self._refused_site = site, parts, ""
-            self._due.add(Wake.SWEEP)  # which tells how many epochs another setting made
+            self._close_components()
+            self._site, self._open_components, self._site_file_fault = site, components, ""
+            self._due.add(LoopEvent.MAINTENANCE)  # reports how many epochs have outdated settings
             log.info(logfmt(reload="done", station=site.station.id))
-        self._heart.ready()
+        self._systemd.ready()
 
-    def _let_go(self) -> None:
-        if self._parts is not None:
-            self._parts[0].close()
-            self._parts[2].close()
-            self._parts[3].stop()
-            self._parts = None
+    def _close_components(self) -> None:
+        if self._open_components is not None:
+            self._open_components[0].close()
+            self._open_components[2].close()
+            self._open_components[3].stop()
+            self._open_components = None
 
-    # ---- faults, waiting, ends
+    # ---- faults, waiting, stopping
 
     def _pause(self, error: StationError) -> float:
-        """Say what is wrong, once; return how long to wait before the next try [s]."""
-        pause_s = min(self._pace.first_pause_s * 2.0**self._pauses, self._pace.period_s)
-        self._heart.status(f"paused: {error}")
-        if self._pauses == 0 and not self._is_stopping():
+        """Log the first of consecutive faults; return the pause before the next attempt [s]."""
+        pause_s = min(self._timing.first_pause_s * 2.0**self._consecutive_faults, self._timing.period_s)
+        self._systemd.status(f"paused: {error}")
+        if self._consecutive_faults == 0 and not self._is_stopping():
             log.error(logfmt(service="paused", reason=error))
-        self._pauses = min(self._pauses + 1, 20)
+        self._consecutive_faults = min(self._consecutive_faults + 1, 20)
         return pause_s
 
-    def _go_on(self) -> None:
-        if self._pauses:
-            self._pauses = 0
-            log.info(logfmt(service="goes on"))
+    def _resume(self) -> None:
+        if self._consecutive_faults:
+            self._consecutive_faults = 0
+            log.info(logfmt(service="resumed"))
 
     def _wait(self, wait_s: float) -> None:
-        """Wait until something is due; events shorten the wait, unless it is for a fault to pass."""
-        until_s = time.monotonic() + wait_s
+        """Wait until something is due; inbox events shorten the wait, except after a fault."""
+        deadline_s = time.monotonic() + wait_s
         while True:
-            left_s = max(0.0, until_s - time.monotonic())
+            remaining_s = max(0.0, deadline_s - time.monotonic())
             try:
-                wake = self._wakes.get(timeout=min(left_s, self._heart.longest_wait_s))
+                event = self._events.get(timeout=min(remaining_s, self._systemd.max_wait_s))
             except Empty:
-                self._heart.ping()
-                if until_s <= time.monotonic():
+                self._systemd.watchdog()
+                if deadline_s <= time.monotonic():
                     return
                 continue
-            if wake is Wake.LOOK:
-                if not self._pauses:
-                    until_s = min(until_s, self._looked_s + self._pace.calm_s)
+            if event is LoopEvent.INBOX_CHANGED:
+                if not self._consecutive_faults:
+                    deadline_s = min(deadline_s, self._last_poll_s + self._timing.debounce_s)
                 continue
-            if wake is not Wake.STOP:
-                self._due.add(wake)
-            until_s = 0.0
+            if event is not LoopEvent.STOP:
+                self._due.add(event)
+            deadline_s = 0.0
 
-    def _await_clock(self) -> None:
-        """Wait for a clock that can be right (SERVICE.md)."""
-        until_s = time.monotonic() + self._pace.clock_s
-        while (fault := clock_fault(self._site.station.data, time.time())) and not self._is_stopping():
-            if time.time() > EARLIEST_S and time.monotonic() > until_s:
-                log.warning(logfmt(clock="doubtful", reason=fault, does="starts all the same"))
+    def _wait_for_clock(self) -> None:
+        """Wait until the clock is plausible (service.md, 4)."""
+        deadline_s = time.monotonic() + self._timing.clock_wait_s
+        while (problem := clock_problem(self._site.station.data, time.time())) and not self._is_stopping():
+            if time.time() > EARLIEST_S and time.monotonic() > deadline_s:
+                log.warning(logfmt(clock="doubtful", reason=problem, does="starting anyway"))
                 return
-            self._heart.status(f"waiting: {fault}")
-            self._pause_for_clock(fault)
+            self._systemd.status(f"waiting: {problem}")
+            self._pause_for_clock(problem)
 
-    def _pause_for_clock(self, fault: str) -> None:
-        if self._pauses == 0:
-            log.error(logfmt(service="waiting", reason=fault))
-        self._pauses = 1
-        self._wait(self._pace.first_pause_s)
+    def _pause_for_clock(self, problem: str) -> None:
+        if self._consecutive_faults == 0:
+            log.error(logfmt(service="waiting", reason=problem))
+        self._consecutive_faults = 1
+        self._wait(self._timing.first_pause_s)
 
     def _is_stopping(self) -> bool:
-        return self._stop_s < math.inf
+        return self._stop_deadline_s < math.inf
 
-    # ---- what it says
+    # ---- reports
 
-    def _note_new(self, count: int) -> None:
+    def _record_arrivals(self, count: int) -> None:
         if count:
-            self._last_new_s = time.monotonic()
+            self._last_arrival_s = time.monotonic()
             if self._is_overdue:
-                log.info(logfmt(scans="arrive again", new=count))
+                log.info(logfmt(scans="arriving again", new=count))
             self._is_overdue = False
 
-    def _note_silence(self) -> None:
-        """Warn, once, when a scan is overdue."""
-        every_s = self._site.scans.expected_every_s
-        silent_s = time.monotonic() - self._last_new_s
-        if silent_s > 1.5 * every_s and not self._is_overdue:
+    def _warn_if_overdue(self) -> None:
+        """Log one warning when a scan is overdue."""
+        interval_s = self._site.scans.expected_every_s
+        silent_s = time.monotonic() - self._last_arrival_s
+        if silent_s > 1.5 * interval_s and not self._is_overdue:
             self._is_overdue = True
             log.warning(
                 logfmt(
                     scans="overdue",
                     silent_s=round(silent_s),
-                    expected_every_s=round(every_s),
-                    reason="nothing new in the inbox: look at the scanner and the transfer",
+                    expected_every_s=round(interval_s),
+                    reason="nothing new in the inbox: check the scanner and the transfer",
                 )
             )
 
-    def _say_idle(self) -> None:
-        counts = self._opened_journal().counts()
-        waits = counts[State.WAITING] + counts[State.LATER]
-        text = f"{counts[State.STORED]} stored, {waits} waiting, {counts[State.SET_ASIDE]} set aside"
+    def _report_idle(self) -> None:
+        counts = self._open_journal().counts()
+        waiting = counts[State.WAITING] + counts[State.LATER]
+        text = f"{counts[State.STORED]} stored, {waiting} waiting, {counts[State.SET_ASIDE]} set aside"
         if self._is_overdue:
             text += "; a scan is overdue"
-        if self._refused_site:
-            text += f"; the site file was refused, the old one is kept: {self._refused_site}"
-        self._heart.status(text)
+        if self._site_file_fault:
+            text += f"; the new site file was rejected, the old one is in use: {self._site_file_fault}"
+        self._systemd.status(text)

@@ -1,4 +1,4 @@
-"""What becomes of raw scans in the inbox: left there, moved to an archive or deleted, once that is safe."""
+"""Retention of raw scans: left in the inbox, moved to an archive, or deleted, once that is safe."""
 
 from __future__ import annotations
 
@@ -9,151 +9,155 @@ from collections.abc import Iterable, Mapping
 from datetime import UTC, datetime
 from pathlib import Path
 
-from station.archive.layout import Series
-from station.archive.store import JOINED, joined, rows_in, stored
+from station.archive.epochs import COMPACTED, compacted_files, epochs_in_file, parse_epoch_filename
+from station.archive.netcdf_layout import Series
 from station.config import Site
 from station.errors import NotReadyError, ScanError
-from station.service.content import fingerprint, sha256_of
-from station.service.inbox import Arrival
-from station.service.journal import Entry
-from station.service.places import archived, arrival_of
-from station.service.tasks import Progress, series_of, sha256_of_log
+from station.inbox.file_hash import file_identity, sha256_file
+from station.inbox.inbox import ScanFile
+from station.inbox.journal import Entry
+from station.inbox.scan_files import archive_path, scan_file
+from station.processing.scan_tasks import Progress, series_for, sha256_log
 
-MOST_AT_ONCE = 50  # scans a sweep lets go; there are four sweeps a day
+MAX_PER_RUN = 50  # scans per maintenance run; there are four runs a day
 
 
-def due_to_go(site: Site, entries: Iterable[Entry], kept: set[str]) -> list[str]:
-    """Return the stored scans that have been kept long enough, oldest first, but for those in `kept`.
+def expired_scans(site: Site, entries: Iterable[Entry], reserved: set[str]) -> list[str]:
+    """Return the names of stored scans older than `keep_days`, oldest first, except those in `reserved`.
 
-    What is moved can still be read: `kept` is for scans that are deleted.
+    Moved scans can still be read, so `reserved` applies only to deletion.
     """
-    given = site.retention
-    if given.raw == "leave":
+    settings = site.retention
+    if settings.raw == "leave":
         return []
-    sops = {sop.scan for sop in site.sop}  # whose log is looked for in the inbox
-    listed = list(entries)
-    newest_s = max((entry.start_utc_s or 0.0 for entry in listed), default=0.0)
-    before_s = min(time.time(), newest_s) - given.keep_days * 86_400  # a clock far ahead lets nothing go
-    found = [
+    sop_scans = {sop.scan for sop in site.sop}  # their logs are searched for in the inbox
+    all_entries = list(entries)
+    newest_s = max((entry.start_utc_s or 0.0 for entry in all_entries), default=0.0)
+    cutoff_s = min(time.time(), newest_s) - settings.keep_days * 86_400  # a clock far ahead expires nothing
+    candidates = [
         (entry.start_utc_s, entry.name)
-        for entry in listed
+        for entry in all_entries
         if entry.start_utc_s is not None
-        and entry.start_utc_s < before_s
+        and entry.start_utc_s < cutoff_s
         and entry.outcome is not None
-        and Path(entry.name).stem not in sops
-        and (given.raw == "move" or entry.name not in kept)
+        and Path(entry.name).stem not in sop_scans
+        and (settings.raw == "move" or entry.name not in reserved)
         and (site.scans.inbox / entry.name).is_file()
     ]
-    return [name for _, name in sorted(found)[:MOST_AT_ONCE]]
+    return [name for _, name in sorted(candidates)[:MAX_PER_RUN]]
 
 
-def retire(
+def apply_retention(
     site: Site, entries: Iterable[Entry], files: Mapping[str, str], progress: Progress
 ) -> list[tuple[str, str, str]]:
-    """Move or delete raw scans and their logs; return of each its name, what was done, and why not.
+    """Move or delete raw scans and their logs; return (name, action, reason) for each.
 
-    `kept` are those whose bytes or epoch are not proved by their checksums, of the store in `files`. At one
-    that `waits`, as the folders cannot be written, it ends. A file that holds many epochs is read once.
+    The action is "kept" if the checksums of scan, log or epoch do not match; `files` has those of the store.
+    It is "waits" if the folders cannot be written; the run then ends. A file of many epochs is read once.
     """
-    told: list[tuple[str, str, str]] = []
-    proved: set[Path] = set()
+    actions: list[tuple[str, str, str]] = []
+    verified: set[Path] = set()
     for entry in entries:
         try:
-            told.append((entry.name, _retire(site, entry, files, proved, progress), ""))
+            actions.append((entry.name, _move_or_delete(site, entry, files, verified, progress), ""))
         except ScanError as error:
-            told.append((entry.name, "kept", str(error)))
-        except NotReadyError as error:  # it would be so for the others too
-            return [*told, (entry.name, "waits", str(error))]
-    return told
+            actions.append((entry.name, "kept", str(error)))
+        except NotReadyError as error:  # the others would fail likewise
+            return [*actions, (entry.name, "waits", str(error))]
+    return actions
 
 
-def _retire(site: Site, entry: Entry, files: Mapping[str, str], proved: set[Path], progress: Progress) -> str:
-    """Move or delete a raw scan and its log; say what was done. `proved` files of the store need no proof.
+def _move_or_delete(
+    site: Site, entry: Entry, files: Mapping[str, str], verified: set[Path], progress: Progress
+) -> str:
+    """Move or delete a raw scan and its log; return "moved" or "deleted".
 
-    Raises ScanError where the scan is not the one that was stored or its epoch is not proved; NotReadyError
-    where the folders cannot be written. Nothing is lost then.
+    Store files in `verified` are not read again. Raises ScanError if the scan is not the stored one or its
+    epoch cannot be verified, NotReadyError if the folders cannot be written. Nothing is lost then.
     """
-    arrival = arrival_of(site, site.scans.inbox / entry.name)
-    before = fingerprint(arrival.path)
-    _require_proved(site, arrival, entry, files, proved, progress)
-    going = [path for path in (arrival.log, arrival.path) if path is not None]  # the scan goes last
+    scan = scan_file(site, site.scans.inbox / entry.name)
+    identity = file_identity(scan.path)
+    _require_verified(site, scan, entry, files, verified, progress)
+    paths = [path for path in (scan.log, scan.path) if path is not None]  # the scan last
     archive = site.retention.archive
     try:
         if not os.access(site.scans.inbox, os.W_OK):
             raise NotReadyError(
-                f"{site.scans.inbox} is read-only: with systemd give ReadWritePaths={site.scans.inbox}"
-                " in a drop-in (systemctl edit), and the group the right to write"
+                f"{site.scans.inbox} is read-only: with systemd, add ReadWritePaths={site.scans.inbox}"
+                " in a drop-in (systemctl edit) and give the group write permission"
             )
         if site.retention.raw == "move" and archive is not None:
-            folder = archived(archive, entry.name, entry.start_utc_s or 0.0).parent
-            for path in going:
-                _copy(path, folder / path.name, sha256_of(path), progress)
-        if fingerprint(arrival.path) != before:
-            raise NotReadyError("the scan changed meanwhile")
-        for path in going:
+            folder = archive_path(archive, entry.name, entry.start_utc_s or 0.0).parent
+            for path in paths:
+                _copy(path, folder / path.name, sha256_file(path), progress)
+        if file_identity(scan.path) != identity:
+            raise NotReadyError("the scan has changed since it was checked")
+        for path in paths:
             path.unlink()
     except OSError as error:
-        raise NotReadyError(f"cannot be let go: {error}") from error
+        raise NotReadyError(f"cannot be moved or deleted: {error}") from error
     return "moved" if site.retention.raw == "move" else "deleted"
 
 
-def _require_proved(
+def _require_verified(
     site: Site,
-    arrival: Arrival,
+    scan: ScanFile,
     entry: Entry,
     files: Mapping[str, str],
-    proved: set[Path],
+    verified: set[Path],
     progress: Progress,
 ) -> None:
-    """Raise ScanError unless these very bytes are stored, in a file of the right checksum."""
-    if sha256_of(arrival.path) != entry.sha256:
-        raise ScanError("the scan is not the one that was stored: kept")
-    if sha256_of_log(arrival) not in {"", entry.log_sha256}:
-        raise ScanError("its inclination log is not the one it was measured with: kept (station reprocess)")
+    """Raise ScanError unless exactly these bytes are stored, in a file with the right checksum."""
+    if sha256_file(scan.path) != entry.sha256:
+        raise ScanError("kept: the scan is not the one that was stored")
+    if sha256_log(scan) not in {"", entry.log_sha256}:
+        raise ScanError(
+            "kept: its inclination log is not the one it was measured with (run station reprocess)"
+        )
     progress()
-    series = series_of(site)
-    holder = _holder(series, entry)
-    if holder in proved:
+    series = series_for(site)
+    holding_file = _file_holding(series, entry)
+    if holding_file in verified:
         return
-    name = str(holder.relative_to(series.folder)) if holder else ""
-    if holder is None or name not in files or sha256_of(holder) != files[name]:
-        raise ScanError(f"its epoch {entry.epoch} is missing or damaged: kept (station check --store)")
-    proved.add(holder)
+    name = str(holding_file.relative_to(series.folder)) if holding_file else ""
+    if holding_file is None or name not in files or sha256_file(holding_file) != files[name]:
+        raise ScanError(f"kept: its epoch {entry.epoch} is missing or damaged (run station check --store)")
+    verified.add(holding_file)
 
 
-def _holder(series: Series, entry: Entry) -> Path | None:
-    """Return the file that holds a row's epoch: itself, or the newest joined one."""
+def _file_holding(series: Series, entry: Entry) -> Path | None:
+    """Return the file that holds an entry's epoch: its own, or the newest compacted one; None without."""
     path = series.folder / str(entry.epoch)
-    told = stored(path)
-    if path.is_file() or told is None:
-        return path if told else None
-    for kind, stamp in JOINED.items():
-        for joint in reversed(joined(series, kind, told.start.strftime(stamp))):
-            if any(row.epoch_file == path.name for row in rows_in(joint)):
-                return joint
+    parsed = parse_epoch_filename(path)
+    if path.is_file() or parsed is None:
+        return path if parsed else None
+    for kind, date_format in COMPACTED.items():
+        for compacted_file in reversed(compacted_files(series, kind, parsed.start.strftime(date_format))):
+            if any(epoch.epoch_file == path.name for epoch in epochs_in_file(compacted_file)):
+                return compacted_file
     return None
 
 
-def _copy(path: Path, place: Path, sha256: str, progress: Progress) -> None:
-    """Copy a file for good: synced, read again, named last. One of the same bytes there stays."""
-    if place.exists():
-        if sha256_of(place) == sha256:
+def _copy(path: Path, target: Path, sha256: str, progress: Progress) -> None:
+    """Copy a file durably: sync, read back, then rename. An identical file at the target is left as it is."""
+    if target.exists():
+        if sha256_file(target) == sha256:
             return
-        stamp = datetime.fromtimestamp(path.stat().st_mtime, UTC).strftime("%Y%m%dT%H%M%SZ")
-        raise ScanError(f"{place} holds other bytes: rename that one (e.g. to {place.name}.{stamp})")
-    place.parent.mkdir(parents=True, exist_ok=True)
-    beside = place.with_name(f".{place.name}.part")
+        timestamp = datetime.fromtimestamp(path.stat().st_mtime, UTC).strftime("%Y%m%dT%H%M%SZ")
+        raise ScanError(f"{target} holds other bytes: rename it (e.g. to {target.name}.{timestamp})")
+    target.parent.mkdir(parents=True, exist_ok=True)
+    tmp_path = target.with_name(f".{target.name}.part")
     try:
-        shutil.copyfile(path, beside, follow_symlinks=False)
-        shutil.copystat(path, beside, follow_symlinks=False)
+        shutil.copyfile(path, tmp_path, follow_symlinks=False)
+        shutil.copystat(path, tmp_path, follow_symlinks=False)
         progress()
-        _sync(beside)
-        if sha256_of(beside) != sha256:
-            raise ScanError(f"{place}: reads otherwise than it was written: is the disk failing?")
-        beside.replace(place)
-        _sync(place.parent)
+        _sync(tmp_path)
+        if sha256_file(tmp_path) != sha256:
+            raise ScanError(f"{target}: reads back differently from what was written: is the disk failing?")
+        tmp_path.replace(target)
+        _sync(target.parent)
     finally:
-        beside.unlink(missing_ok=True)
+        tmp_path.unlink(missing_ok=True)
 
 
 def _sync(path: Path) -> None:

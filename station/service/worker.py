@@ -1,4 +1,4 @@
-"""Takes scans one by one: a child process measures, the journal remembers, the series is published."""
+"""Processes scan after scan: a worker process measures, the journal records, the series is updated."""
 
 from __future__ import annotations
 
@@ -9,48 +9,63 @@ from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import TypeVar
 
-from station.archive.reference import current
-from station.archive.store import series_in
+from station.archive.reference_files import valid_versions
+from station.archive.series.index import series_in
 from station.config import Site
 from station.errors import ConfigError, NotReadyError, ScanError, StationError, StoreError
-from station.service import child
-from station.service.digest import write_digest, yesterday
-from station.service.inbox import Arrival
-from station.service.integrity import (
+from station.inbox.inbox import ScanFile
+from station.inbox.journal import Entry, Journal, State
+from station.inbox.scan_files import find_scan
+from station.logs import logfmt
+from station.monitoring.daily_digest import write_digest, yesterday
+from station.processing import isolation
+from station.processing.integrity import (
+    add_checksums,
     holds_epochs,
     is_reference,
-    lost,
+    missing_epochs,
     quarantine,
-    restore_zeros,
-    seal,
-    unknown,
-    unopened,
-    verify,
+    restore_tilt_offsets,
+    unjournaled_epochs,
+    unreadable_files,
+    verify_checksums,
 )
-from station.service.joining import Joining
-from station.service.journal import Entry, Journal, State
-from station.service.logs import logfmt
-from station.service.places import find_scan
-from station.service.references import (
-    build_reference,
-    improve_reference,
+from station.processing.reference_tasks import (
+    build_reference_version,
     next_version,
-    number_due,
-    scans_due,
+    scans_for_version,
+    scans_needed,
+    update_reference_version,
 )
-from station.service.retention import due_to_go, retire
-from station.service.show import show
-from station.service.stale import count_by_settings, late
-from station.service.tasks import Outcome, Past, Progress, Refused, Same, attend, open_only, series_of
-from station.service.upkeep import OPEN_EPOCHS, Checksums, join_epochs, publish, sweep_store
+from station.processing.scan_tasks import (
+    Duplicate,
+    Progress,
+    Rejected,
+    ScanHistory,
+    StoredResult,
+    check_header,
+    process_new,
+    series_for,
+)
+from station.processing.staleness import count_outdated, late_inputs
+from station.processing.store_tasks import (
+    MAX_UNCOMPACTED,
+    Checksums,
+    compact_epochs,
+    delete_expired,
+    update_series,
+)
+from station.service.background_compaction import BackgroundCompaction
+from station.service.publishing import publish
+from station.service.retention import apply_retention, expired_scans
 
 log = logging.getLogger("station")
 T = TypeVar("T")
-VERIFIED_EVERY_S = 3600.0  # at most, all checksums, when the store makes trouble
+VERIFY_INTERVAL_S = 3600.0  # minimum interval between full checksum runs after store errors
 
 
 class Worker:
-    """Takes scans one by one: child process, journal, series, reference."""
+    """Processes scans one by one: worker process, journal, series, reference."""
 
     def __init__(
         self,
@@ -59,383 +74,395 @@ class Worker:
         *,
         on_progress: Progress = lambda: None,
         should_stop: Callable[[], bool] = lambda: False,
-        on_joined: Callable[[], None] = lambda: None,
-        patient: bool = False,
+        on_compacted: Callable[[], None] = lambda: None,
+        in_service: bool = False,
     ) -> None:
-        """`on_joined` is called, in another thread, when `note_joined` has something to do.
+        """`on_compacted` is called, in another thread, when `publish_compacted` has something to do.
 
-        `patient`: as in the service, scans may wait for weather, and one only touched is not done again.
+        `in_service`: scans may wait for weather, and one with a new mtime but the same bytes is not processed
+        again.
 
-        Raises ConfigError where the store is of another grid.
+        Raises ConfigError if the stored series has another grid.
         """
         _require_same_grid(site)
         self._site = site
-        self._series = series_of(site)
+        self._series = series_for(site)
         self._journal = journal
         self._on_progress = on_progress
         self._should_stop = should_stop
-        self._patient = patient
-        self._taken: dict[str, Arrival] = {}
-        self._verified_s = -math.inf
-        self._told_stale = 0
-        self._joining = Joining(site, on_joined)
+        self._in_service = in_service
+        self._processed: dict[str, ScanFile] = {}
+        self._last_verified_s = -math.inf
+        self._reported_outdated = 0
+        self._compaction = BackgroundCompaction(site, on_compacted)
 
-    def take(self, arrival: Arrival) -> bool:
-        """Measure and store a scan, and say so in the journal and in one log line; tell whether it is stored.
+    def process(self, scan: ScanFile) -> bool:
+        """Measure and store a scan, record it in journal and log; return True if it is stored.
 
-        Raises StoreError where the store cannot be written; the scan stays waiting then.
+        Raises StoreError if the store cannot be written; the scan is then still waiting.
         """
-        self._taken[arrival.name] = arrival
-        entry = self._journal.entry(arrival.name)
-        past = Past(
+        self._processed[scan.name] = scan
+        entry = self._journal.entry(scan.name)
+        history = ScanHistory(
             reference=entry.reference if entry else None,
             revision=(entry.revision if entry else None) or 0,
-            content=_judged(entry) if self._patient else None,
-            stored=self._journal.others_stored(arrival.name, arrival.size),
-            patient=self._patient,
+            last_content=_assessed_content(entry) if self._in_service else None,
+            stored_scans=self._journal.others_stored(scan.name, scan.size),
+            wait_for_weather=self._in_service,
         )
         try:
-            outcome = self._mending(attend, arrival, past)
+            result = self._with_repair(process_new, scan, history)
         except ScanError as error:
-            return self._set_aside(arrival, str(error))
+            return self._set_aside(scan, str(error))
         except NotReadyError as error:
-            pause_s = self._journal.later(arrival.name, str(error))
-            log.info("%s", logfmt(scan=arrival.name, verdict="later", reason=error, retry_s=round(pause_s)))
+            pause_s = self._journal.defer(scan.name, str(error))
+            log.info("%s", logfmt(scan=scan.name, verdict="later", reason=error, retry_s=round(pause_s)))
             return False
-        if isinstance(outcome, Refused):
-            return self._set_aside(arrival, outcome.reason, outcome.sha256, outcome.log_sha256)
-        if isinstance(outcome, Same):
-            return self._note_same(arrival, outcome)
-        alone = self._mending(publish)
-        remember(self._journal, arrival.name, outcome)
-        _say(arrival.name, outcome)
-        self.show(arrival.name, outcome)
-        self._make_reference_when_due()
-        if self._patient and alone > OPEN_EPOCHS:
-            self.begin_joining(in_backlog=True)
+        if isinstance(result, Rejected):
+            return self._set_aside(scan, result.reason, result.sha256, result.log_sha256)
+        if isinstance(result, Duplicate):
+            return self._record_duplicate(scan, result)
+        uncompacted = self._with_repair(update_series)
+        record_result(self._journal, scan.name, result)
+        _log_result(scan.name, result)
+        self.publish(scan.name, result)
+        self._build_reference_if_due()
+        if self._in_service and uncompacted > MAX_UNCOMPACTED:
+            self.start_compaction(in_backlog=True)
         return True
 
-    def glance(self, arrival: Arrival) -> None:
-        """Set a scan aside at once if its headers are broken, rather than after waiting for its log."""
+    def precheck(self, scan: ScanFile) -> None:
+        """Set a scan with broken headers aside at once, without waiting for its log."""
         try:
-            self.run(open_only, arrival)
+            self.run(check_header, scan)
         except ScanError as error:
-            self._set_aside(arrival, str(error))
+            self._set_aside(scan, str(error))
         except NotReadyError:
             return
 
     def recover(self) -> None:
-        """Reconcile after a start or a fault; make a reference that was due.
+        """Reconcile after a start or a fault; build the reference if it is due.
 
-        What comes next is to be measured from it, as without the cut.
+        The next scan is then measured from it, as without the interruption.
         """
         self.reconcile()
-        self._make_reference_when_due()
+        self._build_reference_if_due()
 
     def reconcile(self) -> None:
-        """Make journal and files agree: checksums are completed, lost rows made anew, the series is rebuilt.
+        """Reconcile journal and files: add missing checksums and journal entries, rebuild the series.
 
-        Epochs that are lost or damaged are redone where their scan is still in the inbox. One written just
-        before a power cut is found by `tasks.process` as the same and not stored twice.
+        Lost or damaged epochs are reprocessed if their scan is still in the inbox. `scan_tasks.process`
+        recognises an epoch written just before a power cut and does not store it twice.
         """
-        self._put_aside(self.run(unopened))
-        self.seal()
-        self._adopt()
-        self._have_lost_done_again()
+        self._quarantine(self.run(unreadable_files))
+        self.add_checksums()
+        self._import_unjournaled()
+        self._requeue_missing()
         if holds_epochs(self._series):
-            self._mending(publish)
+            self._with_repair(update_series)
 
-    def seal(self) -> None:
-        """Note the checksums of files that have none; put aside those that cannot be read."""
-        found = self.run(seal, self._journal.files())
-        self._put_aside(found.damaged)
-        self._journal.note_files(found.fresh)
+    def add_checksums(self) -> None:
+        """Record the checksums of files that have none; quarantine files that cannot be read."""
+        result = self.run(add_checksums, self._journal.checksums())
+        self._quarantine(result.damaged)
+        self._journal.add_checksums(result.new_checksums)
 
-    def prove(self) -> None:
-        """Prove every file against its checksum and put aside those that are damaged."""
-        damaged = self.run(verify, self._journal.files()).damaged
-        self._put_aside(damaged)
-        for name in filter(is_reference, damaged):  # a new version is made instead
+    def verify_store(self) -> None:
+        """Verify every file against its checksum; quarantine damaged ones."""
+        damaged = self.run(verify_checksums, self._journal.checksums()).damaged
+        self._quarantine(damaged)
+        for name in filter(is_reference, damaged):  # a new version replaces it
             quarantine(self._series, [name])
-            self._journal.forget_files([name])
+            self._journal.drop_checksums([name])
 
-    def join_closed(self) -> None:
-        """Join closed days and months; sum up the day that is over."""
-        self._note_joined(self._mending(join_epochs, self._journal.files()))
+    def compact(self) -> None:
+        """Compact closed days and months; write the digest of yesterday."""
+        self._record_compacted(self._with_repair(compact_epochs, self._journal.checksums()))
 
-    def begin_joining(self, *, in_backlog: bool = False) -> None:
-        """Have closed days and months joined while scans are taken; `note_joined` ends it."""
-        self._joining.begin(self._journal.files(), in_backlog=in_backlog)
+    def start_compaction(self, *, in_backlog: bool = False) -> None:
+        """Start compaction in the background; `publish_compacted` completes it."""
+        self._compaction.start(self._journal.checksums(), in_backlog=in_backlog)
 
-    def note_joined(self) -> None:
-        """Have the series name what was joined meanwhile, if that is done; sum up the day that is over."""
+    def publish_compacted(self) -> None:
+        """Publish the files of a finished compaction and write the digest of yesterday; else do nothing."""
         try:
-            made = self._joining.take()
+            checksums = self._compaction.result()
         except StoreError:
-            if not self._mend():
+            if not self._repair():
                 raise
-            return  # it is joined at its next time
-        if made is not None:
-            self._note_joined(made)
+            return  # the next scheduled compaction tries again
+        if checksums is not None:
+            self._record_compacted(checksums)
 
     def close(self) -> None:
-        """End what is done beside the scans."""
-        self._joining.close()
+        """Stop background compaction."""
+        self._compaction.close()
 
-    def _note_joined(self, made: Checksums) -> None:
-        if made:
-            self._journal.note_files(made)
-            self._mending(publish)
-        self._sum_up()
+    def _record_compacted(self, checksums: Checksums) -> None:
+        if checksums:
+            self._journal.add_checksums(checksums)
+            self._with_repair(update_series)
+        self._write_digest()
 
-    def _sum_up(self) -> None:
-        """Write the digest of yesterday; what fails there keeps no scan from the store."""
+    def _write_digest(self) -> None:
+        """Write the digest of yesterday; a failure is only logged, so that it never blocks scans."""
         try:
             if self.run(write_digest, yesterday(time.time())):
                 log.info("%s", logfmt(digest="written"))
         except (StationError, RuntimeError) as error:
             log.warning("%s", logfmt(digest="failed", reason=error))
 
-    def sweep(self) -> None:
-        """Delete what no longer serves, redo what came late, tell what is stale, let raw scans go."""
-        self._journal.forget_files(self._mending(sweep_store))
-        came = self._mending(late, self._journal.rows(State.STORED))
-        names = [name for name in came if (self._site.scans.inbox / name).is_file()]
+    def run_maintenance(self) -> None:
+        """Delete expired files, requeue scans with late inputs, report outdated epochs, apply retention."""
+        self._journal.drop_checksums(self._with_repair(delete_expired))
+        affected = self._with_repair(late_inputs, self._journal.rows(State.STORED))
+        names = [name for name in affected if (self._site.scans.inbox / name).is_file()]
         for name in names:
-            log.info("%s", logfmt(scan=name, reason="its log or weather came: done again"))
-        self._journal.again(names)
-        self._tell_stale()
-        self._let_raw_scans_go()
+            log.info("%s", logfmt(scan=name, reason="its log or weather arrived late: reprocessing"))
+        self._journal.requeue(names)
+        self._report_outdated()
+        self._apply_retention()
 
-    def _mending(self, task: Callable[..., T], *args: object) -> T:
-        """Run a task; where the store is found damaged, put the damaged files aside and run it once more."""
+    def _with_repair(self, task: Callable[..., T], *args: object) -> T:
+        """Run a task; if it finds the store damaged, quarantine the damaged files and run it once more."""
         try:
             return self.run(task, *args)
         except StoreError:
-            if not self._mend():
+            if not self._repair():
                 raise
             return self.run(task, *args)
 
-    def _mend(self) -> bool:
-        """Put damaged files aside and have their epochs done again; tell whether there were any."""
-        damaged = self.run(unopened)
-        if not damaged and time.monotonic() > self._verified_s + VERIFIED_EVERY_S:
-            self._verified_s = time.monotonic()
-            damaged = self.run(verify, self._journal.files()).damaged
-        self._put_aside(damaged)
+    def _repair(self) -> bool:
+        """Quarantine damaged files and requeue their epochs; return True if any holds epochs."""
+        damaged = self.run(unreadable_files)
+        if not damaged and time.monotonic() > self._last_verified_s + VERIFY_INTERVAL_S:
+            self._last_verified_s = time.monotonic()
+            damaged = self.run(verify_checksums, self._journal.checksums()).damaged
+        self._quarantine(damaged)
         if damaged:
-            self._have_lost_done_again()
+            self._requeue_missing()
         return not all(map(is_reference, damaged))
 
-    def _put_aside(self, damaged: Iterable[str]) -> None:
+    def _quarantine(self, damaged: Iterable[str]) -> None:
         for name in damaged:
             if is_reference(name):
-                log.error("%s", logfmt(file=name, reason="damaged: restore it, or station reprocess"))
+                log.error("%s", logfmt(file=name, reason="damaged: restore it, or run station reprocess"))
                 continue
             quarantine(self._series, [name])
-            self._journal.forget_files([name])
+            self._journal.drop_checksums([name])
             log.error(
-                "%s", logfmt(file=name, reason="damaged: left out of the series, kept as *.damaged beside it")
+                "%s",
+                logfmt(file=name, reason="damaged: excluded from the series, kept as *.damaged"),
             )
 
-    def _adopt(self) -> None:
-        """Make rows for epochs that the journal does not know: it was lost, or older than the store."""
-        found = self._mending(unknown, self._journal.epochs())
-        if found:
-            log.warning("%s", logfmt(journal="made anew", epochs=len(found), reason="it knew not of them"))
-        self._journal.adopt(found)
-        self.run(restore_zeros)
+    def _import_unjournaled(self) -> None:
+        """Import epochs that the journal lacks because it was lost or is older than the store."""
+        missing = self._with_repair(unjournaled_epochs, self._journal.epochs())
+        if missing:
+            log.warning("%s", logfmt(journal="completed", epochs=len(missing), reason="missing in it"))
+        self._journal.import_entries(missing)
+        self.run(restore_tilt_offsets)
 
-    def _have_lost_done_again(self) -> None:
-        for name in self.run(lost, self._journal.epochs(State.STORED)):
+    def _requeue_missing(self) -> None:
+        for name in self.run(missing_epochs, self._journal.epochs(State.STORED)):
             if (self._site.scans.inbox / name).is_file():
-                log.warning("%s", logfmt(scan=name, reason="its epoch is missing from the store: done again"))
-                self._journal.again([name])
+                log.warning("%s", logfmt(scan=name, reason="epoch missing from the store: reprocessing"))
+                self._journal.requeue([name])
             else:
-                says = "its epoch is missing from the store, and the scan from the inbox: station reprocess"
-                log.error("%s", logfmt(scan=name, reason=says))
+                reason = "epoch missing from the store, scan missing from the inbox: run station reprocess"
+                log.error("%s", logfmt(scan=name, reason=reason))
 
     def _set_aside(
-        self, arrival: Arrival, reason: str, sha256: str | None = None, log_sha256: str = ""
+        self, scan: ScanFile, reason: str, sha256: str | None = None, log_sha256: str = ""
     ) -> bool:
-        self._journal.set_aside(arrival.name, reason, sha256=sha256, log_sha256=log_sha256)
-        log.warning("%s", logfmt(scan=arrival.name, verdict="set_aside", reason=reason))
-        self.show()
+        self._journal.set_aside(scan.name, reason, sha256=sha256, log_sha256=log_sha256)
+        log.warning("%s", logfmt(scan=scan.name, verdict="set_aside", reason=reason))
+        self.publish()
         return False
 
-    def show(self, name: str = "", outcome: Outcome | None = None) -> None:
-        """Bring the page up to what is stored, and say if the scan just stored shows that the scanner moved.
+    def publish(self, name: str = "", result: StoredResult | None = None) -> None:
+        """Update the page; log a warning if the scan just stored reveals that the scanner moved.
 
-        What fails there keeps no scan from the store.
+        A failure is only logged, so that it never blocks scans.
         """
         try:
-            shown = self.run(show, outcome)
+            published = self.run(publish, result)
         except (StationError, RuntimeError) as error:
             log.warning("%s", logfmt(page="failed", reason=error))
             return
-        if shown.news:
-            log.warning("%s", logfmt(scan=name, moved=shown.news))
-        if shown.fault:
-            log.warning("%s", logfmt(page="failed", reason=shown.fault))
+        if published.warning:
+            log.warning("%s", logfmt(scan=name, moved=published.warning))
+        if published.fault:
+            log.warning("%s", logfmt(page="failed", reason=published.fault))
 
-    def _note_same(self, arrival: Arrival, same: Same) -> bool:
-        """Put a scan back where it was, or aside if it is another's copy; tell whether it is stored."""
-        if same.name != arrival.name:
-            return self._set_aside(arrival, f"the same bytes as {same.name}, which is stored", same.sha256)
-        self._journal.same_again(arrival.name, same.sha256)
-        log.info("%s", logfmt(scan=arrival.name, verdict="same", reason="the bytes are those done before"))
-        entry = self._journal.entry(arrival.name)
+    def _record_duplicate(self, scan: ScanFile, duplicate: Duplicate) -> bool:
+        """Restore the entry of an unchanged scan, or set aside a copy of another; return True if stored."""
+        if duplicate.name != scan.name:
+            return self._set_aside(
+                scan, f"the same bytes as {duplicate.name}, which is stored", duplicate.sha256
+            )
+        self._journal.restore_unchanged(scan.name, duplicate.sha256)
+        log.info("%s", logfmt(scan=scan.name, verdict="same", reason="content unchanged"))
+        entry = self._journal.entry(scan.name)
         return entry is not None and entry.state is State.STORED
 
-    def _tell_stale(self) -> None:
-        """Say, when the number changes, how many epochs were made with another SOP or setting."""
-        count = self.run(_count_stale)
-        if count and count != self._told_stale:
-            says = "made with another SOP, setting, flag or reference: station reprocess"
-            log.warning("%s", logfmt(epochs=count, reason=says))
-        self._told_stale = count
+    def _report_outdated(self) -> None:
+        """Log the number of epochs with outdated settings, whenever it changes."""
+        count = self.run(_count_outdated)
+        if count and count != self._reported_outdated:
+            reason = "outdated SOP, setting, flag or reference: run station reprocess"
+            log.warning("%s", logfmt(epochs=count, reason=reason))
+        self._reported_outdated = count
 
-    def _let_raw_scans_go(self) -> None:
-        """Move or delete raw scans as `[retention]` says."""
-        due = due_to_go(self._site, self._journal.rows(State.STORED), self._kept_for_reference())
+    def _apply_retention(self) -> None:
+        """Move or delete raw scans as configured in `[retention]`."""
+        due = expired_scans(self._site, self._journal.rows(State.STORED), self._reserved_for_reference())
         entries = [entry for entry in map(self._journal.entry, due) if entry is not None]
         if not entries or self._should_stop():
             return
         try:
-            told = self.run(retire, entries, self._journal.files())
-        except (ScanError, NotReadyError) as error:  # the child was lost, or the service is to stop
+            actions = self.run(apply_retention, entries, self._journal.checksums())
+        except (ScanError, NotReadyError) as error:  # the worker process died, or the service is to stop
             log.warning("%s", logfmt(retention="waits", reason=error))
             return
-        for name, done, why in told:
-            says = {"reason": why} if why else {}
-            log.log(logging.WARNING if why else logging.INFO, "%s", logfmt(scan=name, retention=done, **says))
+        for name, action, reason in actions:
+            extra = {"reason": reason} if reason else {}
+            log.log(
+                logging.WARNING if reason else logging.INFO,
+                "%s",
+                logfmt(scan=name, retention=action, **extra),
+            )
 
-    def _kept_for_reference(self) -> set[str]:
-        return set(scans_due(self._site, self._usable(), len(current(self._series))))
+    def _reserved_for_reference(self) -> set[str]:
+        return set(scans_for_version(self._site, self._usable_scans(), len(valid_versions(self._series))))
 
-    def _usable(self) -> list[str]:
-        """Return the scans that a reference may be made of, by their time."""
+    def _usable_scans(self) -> list[str]:
+        """Return the names of the scans that a reference may be built from, by time."""
         return self._journal.usable()
 
-    def _make_reference_when_due(self) -> None:
-        """Build the master surface once enough usable scans are stored; make a better one of ever more."""
-        wanted, usable = self._site.reference.scans, self._usable()
-        made = current(self._series)
-        if made and not isinstance(wanted, Path):
-            self._have_bare_done_again()
-        chosen = scans_due(self._site, usable, len(made))
-        if isinstance(wanted, Path) or not chosen or len(usable) < number_due(self._site, len(made)):
+    def _build_reference_if_due(self) -> None:
+        """Build the reference surface once enough usable scans are stored; update it as more arrive."""
+        setting, usable = self._site.reference.scans, self._usable_scans()
+        versions = valid_versions(self._series)
+        if versions and not isinstance(setting, Path):
+            self._requeue_without_reference()
+        chosen = scans_for_version(self._site, usable, len(versions))
+        if isinstance(setting, Path) or not chosen or len(usable) < scans_needed(self._site, len(versions)):
             return
-        arrivals = [self._arrival(name) for name in chosen]
-        there = [arrival for arrival in arrivals if arrival is not None]
-        if len(there) < (wanted if made else len(chosen)):
-            gone = [name for name, arrival in zip(chosen, arrivals, strict=True) if arrival is None]
-            if not made:
-                log.warning("%s", logfmt(reference="waiting", reason=f"no longer there: {', '.join(gone)}"))
+        scans = [self._find_scan(name) for name in chosen]
+        available = [scan for scan in scans if scan is not None]
+        if len(available) < (setting if versions else len(chosen)):
+            missing = [name for name, scan in zip(chosen, scans, strict=True) if scan is None]
+            if not versions:
+                log.warning("%s", logfmt(reference="waiting", reason=f"missing scans: {', '.join(missing)}"))
             return
         try:
             version = next_version(self._series, (row.reference for row in self._journal.rows()))
-            if made:
-                self.run(improve_reference, there, version, list(made)[-1], ())
+            if versions:
+                self.run(update_reference_version, available, version, list(versions)[-1], ())
             else:
-                self.run(build_reference, there, version)
+                self.run(build_reference_version, available, version)
         except (ScanError, NotReadyError) as error:
             log.warning("%s", logfmt(reference="failed", reason=error))
             return
-        self.seal()
-        log.info("%s", logfmt(reference=version, scans=len(there)))
-        if not made:
+        self.add_checksums()
+        log.info("%s", logfmt(reference=version, scans=len(available)))
+        if not versions:
             others = (row.name for row in self._journal.rows(State.STORED) if row.reference != version)
-            self._journal.again(others)
+            self._journal.requeue(others)
 
-    def _have_bare_done_again(self) -> None:
-        """Redo what is stored without change: the power went between the reference and its first use."""
+    def _requeue_without_reference(self) -> None:
+        """Requeue epochs without change: power failed between building the reference and its first use."""
         inbox = self._site.scans.inbox
-        again = [name for name in self._journal.bare() if name in self._taken or (inbox / name).is_file()]
-        self._journal.again(again)
+        names = [
+            name
+            for name in self._journal.without_reference()
+            if name in self._processed or (inbox / name).is_file()
+        ]
+        self._journal.requeue(names)
 
-    def _arrival(self, name: str) -> Arrival | None:
-        """Find a scan again: where it was taken from, in the inbox or in the archive."""
-        taken = self._taken.get(name)
-        if taken is not None and taken.path.is_file():
-            return taken
+    def _find_scan(self, name: str) -> ScanFile | None:
+        """Return a scan file from where it was processed, the inbox or the archive; None if it is gone."""
+        scan = self._processed.get(name)
+        if scan is not None and scan.path.is_file():
+            return scan
         entry = self._journal.entry(name)
         return find_scan(self._site, name, entry.start_utc_s if entry else None)
 
     def run(self, task: Callable[..., T], *args: object) -> T:
-        """Run a task of this site in a child: at most `timeout_s` a scan, one without scans for ever."""
-        listed = [one for arg in args for one in (arg if isinstance(arg, list) else [arg])]
-        scans = sum(isinstance(one, Arrival) for one in listed)
-        return child.run(
+        """Run a task in a worker process, limited to `timeout_s` per scan; without scans, unlimited."""
+        items = [item for arg in args for item in (arg if isinstance(arg, list) else [arg])]
+        scan_count = sum(isinstance(item, ScanFile) for item in items)
+        return isolation.run_isolated(
             task,
             self._site,
             *args,
             memory_gb=self._site.service.memory_gb,
-            timeout_s=self._site.scans.timeout_s * scans if scans else math.inf,
+            timeout_s=self._site.scans.timeout_s * scan_count if scan_count else math.inf,
             on_progress=self._on_progress,
             should_stop=self._should_stop,
         )
 
 
-def _judged(entry: Entry | None) -> tuple[str, str] | None:
-    """Return the checksums of the scan and log that were judged under a name; None where none were."""
+def _assessed_content(entry: Entry | None) -> tuple[str, str] | None:
+    """Return the checksums of the scan and log assessed under this name; None if there are none."""
     if entry is None or entry.outcome is None or not entry.sha256:
         return None
     return entry.sha256, entry.log_sha256
 
 
-def remember(journal: Journal, name: str, outcome: Outcome) -> None:
-    """Note in the journal what a scan gave."""
-    journal.stored(
+def record_result(journal: Journal, name: str, result: StoredResult) -> None:
+    """Record the result of a scan in the journal."""
+    journal.record_stored(
         name,
-        sha256=outcome.sha256,
-        verdict=outcome.verdict,
-        epoch=outcome.epoch,
-        start_utc_s=outcome.start_utc_s,
-        revision=outcome.revision,
-        reference=outcome.reference,
-        reason=outcome.reason,
-        figures=outcome.figures,
-        log_sha256=outcome.log_sha256,
-        epoch_sha256=outcome.epoch_sha256,
+        sha256=result.sha256,
+        verdict=result.verdict,
+        epoch=result.epoch,
+        start_utc_s=result.start_utc_s,
+        revision=result.revision,
+        reference=result.reference,
+        reason=result.reason,
+        metrics=result.metrics,
+        log_sha256=result.log_sha256,
+        epoch_sha256=result.epoch_sha256,
     )
 
 
 def _require_same_grid(site: Site) -> None:
-    """Raise ConfigError where what is stored lies on another grid: a series has one."""
+    """Raise ConfigError if the stored series has another grid: a series has only one."""
     try:
-        held = series_in(site.station.data).grid
-    except StoreError:  # nothing yet, or to be made anew
+        stored = series_in(site.station.data).grid
+    except StoreError:  # nothing stored yet, or to be rebuilt
         return
-    given = site.grid_cells
-    off_m = max(
-        abs(one - other)
-        for one, other in (
-            (held.west_m, given.west_m),
-            (held.north_m, given.north_m),
-            (held.cell_m * held.nx, given.cell_m * given.nx),
+    configured = site.grid_cells
+    deviation_m = max(
+        abs(stored_m - configured_m)
+        for stored_m, configured_m in (
+            (stored.west_m, configured.west_m),
+            (stored.north_m, configured.north_m),
+            (stored.cell_m * stored.nx, configured.cell_m * configured.nx),
         )
     )
-    if held.shape != given.shape or off_m > 1e-3 * given.cell_m:
+    if stored.shape != configured.shape or deviation_m > 1e-3 * configured.cell_m:
         raise ConfigError(
-            f"[grid] is not that of {site.station.data}: {held.nx} x {held.ny} cells of {held.cell_m:.6g} m"
-            f" from west {held.west_m:.10g}, north {held.north_m:.10g}: restore it, or give station.data a"
-            " new folder"
+            f"[grid] differs from that of {site.station.data}: {stored.nx} x {stored.ny} cells of"
+            f" {stored.cell_m:.6g} m from west {stored.west_m:.10g}, north {stored.north_m:.10g}: restore it,"
+            " or give station.data a new folder"
         )
 
 
-def _count_stale(site: Site, progress: Progress) -> int:
+def _count_outdated(site: Site, progress: Progress) -> int:
     progress()
-    return count_by_settings(site)
+    return count_outdated(site)
 
 
-def _say(name: str, outcome: Outcome) -> None:
-    """Log the one line of a scan."""
-    words = {
+def _log_result(name: str, result: StoredResult) -> None:
+    """Log the line of a scan."""
+    fields = {
         "scan": name,
-        "verdict": outcome.verdict,
-        **outcome.figures,
-        "reference": outcome.reference or "none",
-        **({"reason": outcome.reason} if outcome.reason else {}),
+        "verdict": result.verdict,
+        **result.metrics,
+        "reference": result.reference or "none",
+        **({"reason": result.reason} if result.reason else {}),
     }
-    log.log(logging.INFO if outcome.verdict == "good" else logging.WARNING, "%s", logfmt(**words))
+    log.log(logging.INFO if result.verdict == "good" else logging.WARNING, "%s", logfmt(**fields))

@@ -1,4 +1,4 @@
-"""Write what a station's scanner, sensor, weather mast and owner would leave in its folder."""
+"""Write the files of a station's scanner, inclination sensor, weather mast and operator."""
 
 from __future__ import annotations
 
@@ -10,22 +10,22 @@ import laspy
 import numpy as np
 
 from station.quantities import Floats, Grid, InclinationLog, WeatherLog
-from station.simulation.air import SCANNER_SETTING
-from station.simulation.scan import Recorded
+from station.simulation.instrument.scan import SimulatedScan
 from station.simulation.scenario import Scenario
 from station.simulation.truth import CRS, HEIGHT_M, LATITUDE_DEG, LONGITUDE_DEG
+from station.simulation.world.air import SCANNER_SETTING
 
-NAME = "%y%m%d_%H%M%S"  # RIEGL's habit: start of the scan in UTC
-SCALE_M = 0.00025  # RIEGL's habit
+NAME_FORMAT = "%y%m%d_%H%M%S"  # RIEGL's convention: start of the scan in UTC
+SCALE_M = 0.00025  # RIEGL's convention
 
 
 def stem(scenario: Scenario, scan: int) -> str:
-    """Return the name of one scan, without a suffix."""
-    return f"{datetime.fromtimestamp(scenario.scan_start_utc_s(scan), UTC):{NAME}}"
+    """Return the file name of one scan, without a suffix."""
+    return f"{datetime.fromtimestamp(scenario.scan_start_utc_s(scan), UTC):{NAME_FORMAT}}"
 
 
-def write_scan(path: Path, scan: Recorded, start_utc_s: float) -> None:
-    """Write LAZ 1.4, point format 6: scanner's frame, scanner's seconds, one echo a shot."""
+def write_scan(path: Path, scan: SimulatedScan, start_utc_s: float) -> None:
+    """Write LAZ 1.4, point format 6: scanner's frame, scanner's seconds, one echo per shot."""
     header = laspy.LasHeader(point_format=6, version="1.4")
     header.scales = np.full(3, SCALE_M)
     header.offsets = np.zeros(3)
@@ -35,14 +35,14 @@ def write_scan(path: Path, scan: Recorded, start_utc_s: float) -> None:
     las = laspy.LasData(header)
     las.x, las.y, las.z = scan.x_m, scan.y_m, scan.z_m
     las.gps_time = scan.time_s
-    las.intensity = np.rint(65535 * scan.brightness).astype(np.uint16)
+    las.intensity = np.rint(65535 * scan.intensity).astype(np.uint16)
     las.return_number = np.ones(len(scan.x_m), dtype=np.uint8)
     las.number_of_returns = np.ones(len(scan.x_m), dtype=np.uint8)
     las.write(path)
 
 
 def write_inclination(path: Path, log: InclinationLog) -> None:
-    """Write the inclination log as RIEGL's tools do: seconds, degrees at 0.001°."""
+    """Write the inclination log in the format of RIEGL's tools: seconds, degrees at 0.001°."""
     rows = np.stack((log.time_s, np.degrees(log.roll_rad), np.degrees(log.pitch_rad)), axis=1)
     with path.open("w", encoding="ascii", newline="\n") as out:
         out.write("Time,Roll,Pitch\n")
@@ -71,7 +71,7 @@ def write_sop(path: Path, matrix: Floats) -> None:
 
 
 def write_polygons(path: Path, rings_m: dict[str, Floats]) -> None:
-    """Write named polygons as GeoJSON with the map's eastings and northings, to the millimetre.
+    """Write named polygons as GeoJSON with map eastings and northings, to the millimetre.
 
     The member `crs` is that of GeoJSON 2008, which GIS programs still read.
     """
@@ -90,8 +90,8 @@ def write_polygons(path: Path, rings_m: dict[str, Floats]) -> None:
 
 
 def write_site(path: Path, scenario: Scenario, grid: Grid) -> None:
-    """Write the commented site file of the simulated station."""
-    told = SITE.format(
+    """Write the site file of the simulated station, with comments."""
+    text = SITE.format(
         first=stem(scenario, 0),
         sop_from=f"{scenario.start.astimezone(UTC) - timedelta(hours=1):%Y-%m-%dT%H:%M:%SZ}",
         crs=CRS,
@@ -109,37 +109,37 @@ def write_site(path: Path, scenario: Scenario, grid: Grid) -> None:
         reach=scenario.range_max_m,
         reference=scenario.reference_scans,
     )
-    path.write_text(told + (WEATHER if scenario.air else ""), encoding="utf-8")
+    path.write_text(text + (WEATHER if scenario.air else ""), encoding="utf-8")
 
 
 SITE = """\
-# A simulated station. What is true there stands in truth.nc, which the station never reads.
-# Paths are relative to this file; units stand in the key names.
+# A simulated station. Its truth is in truth.nc, which the station never reads.
+# Paths are relative to this file; units are part of the key names.
 
 [station]
 id = "simulated"
 name = "Simulated Hintereisferner"
 institution = "station simulate"
-data = "data"                      # everything the station writes lies below
+data = "data"                      # everything the station writes
 
 [scans]
-inbox = "inbox"                    # scans and their logs arrive here and are never changed
+inbox = "inbox"                    # where scans and their logs arrive; never changed
 name = "%y%m%d_%H%M%S"             # start of the scan in UTC
 frame = "scanner"                  # points are in the scanner's own frame
-settle_s = 2                       # a file that has not grown for so long is whole
+settle_s = 2                       # a file that has not grown for this long is complete
 expected_every_s = 3600
 
 [scanner]
-model = "riegl-vz-6000"            # the rest of the instrument follows from the model
+model = "riegl-vz-6000"            # the other specifications follow from the model
 beam_divergence_mrad = {divergence}
 range_sigma_m = {range_sigma}
 inclination_sigma_deg = {sensor_sigma}
 range_max_m = {reach}
 
 [[sop]]
-from = {sop_from}        # the newest that has begun applies
+from = {sop_from}        # the newest entry that has begun applies
 file = "sop.dat"                   # scanner's frame to east-north-up at the mark below
-scan = "{first}"            # the scan it was solved from: its lean is the zero of relative lean
+scan = "{first}"            # the scan it was solved from: relative tilt is zero there
 
 [map]
 crs = "{crs}"
@@ -151,15 +151,15 @@ cell_m = {cell}
 min_points = 1
 
 [inclination]
-suffix = "-incl.txt"               # <scan>-incl.txt beside each scan
+suffix = "-incl.txt"               # <scan>-incl.txt next to each scan
 required = true
 wait_s = 900
 filter = "blackman"
 cutoff_hz = "auto"                 # from the log's own spectrum
-mode = "relative"                  # the SOP already holds the lean of its own scan
+mode = "relative"                  # the SOP already contains the tilt of its scan
 
 [adjustment]
-method = "joint"                   # from stable ground, log and weather; "none": filtered log only
+method = "joint"                   # stable ground, log and weather; "none": filtered log only
 stable = "stable.geojson"          # or "auto"
 
 [areas]
@@ -169,7 +169,7 @@ file = "areas.geojson"             # named polygons: mean and volume of change i
 model = "rigorous"
 
 [reference]
-scans = {reference}                          # change is measured from the mean of the first so many
+scans = {reference}                          # change is measured from the mean of the first scans
 """
 
 WEATHER = f"""
@@ -180,7 +180,7 @@ max_age_s = 3600
 utc_offset_h = 0
 columns = {{ temperature_c = "TAact_2m_Avg", humidity_pct = "RHact_2m_Avg", pressure_hpa = "Pact" }}
 
-[air]                              # what the scanner turned travel times into ranges with
+[air]                              # assumed by the scanner when it converts travel times
 scanner_setting = {{ temperature_c = {SCANNER_SETTING.temperature_c}, \
 pressure_hpa = {SCANNER_SETTING.pressure_hpa}, humidity_pct = {SCANNER_SETTING.humidity_pct} }}
 scanner_corrects = true

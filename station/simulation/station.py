@@ -1,4 +1,4 @@
-"""A whole station: its place, its scans one by one, and its folder of files with the truth beside them."""
+"""A simulated station: its valley, its scans, and its folder of files with the truth."""
 
 from __future__ import annotations
 
@@ -10,107 +10,112 @@ import xarray as xr
 
 from station.errors import ConfigError, StoreError
 from station.quantities import Floats, InclinationLog
-from station.simulation import files, motion
-from station.simulation.air import weather
-from station.simulation.change import Change, changes, ground_at, white_at
-from station.simulation.ledger import CONVENTIONS, true_errors
-from station.simulation.scan import Conditions, Recorded, conditions, record
-from station.simulation.scenario import Scenario, demo, dense, named, tiny
-from station.simulation.stable import Rectangle, areas, covered, stable_ground
-from station.simulation.terrain import Heights, Valley, valley
+from station.simulation import files
+from station.simulation.instrument import motion
+from station.simulation.instrument.scan import ScanConditions, SimulatedScan, scan_conditions, simulate_scan
+from station.simulation.scenario import Scenario, demo, full_resolution, named, small
+from station.simulation.true_errors import CONVENTIONS, true_errors
 from station.simulation.truth import CRS, TrueSurface, grid_of, true_surface
+from station.simulation.world.air import weather
+from station.simulation.world.change import SurfaceChange, ground_at, snow_cover, surface_changes
+from station.simulation.world.stable import Rectangle, areas, inside_rectangles, stable_ground
+from station.simulation.world.terrain import NodeField, Valley, build_valley
 
-__all__ = ["Scenario", "Station", "demo", "dense", "named", "simulate", "tiny"]
+__all__ = ["Scenario", "Station", "demo", "full_resolution", "named", "simulate", "small"]
 
-WEATHER_MARGIN_S = 3600.0  # the weather log begins before the first scan and ends after the last
-PACKED_M = 1e-4  # last digit of the stored surfaces
+WEATHER_MARGIN_S = 3600.0  # the weather log covers this margin on both sides of the scans
+STORED_STEP_M = 1e-4  # resolution of the stored surfaces
 
 
 class Station:
-    """A station of which everything is known."""
+    """A station whose every error is known."""
 
     def __init__(self, scenario: Scenario) -> None:
         self.scenario = scenario
-        self._conditions: dict[int, Conditions] = {}
+        self._conditions: dict[int, ScanConditions] = {}
 
     @cached_property
-    def place(self) -> Valley:
-        """The valley before anything changes."""
-        told = self.scenario
-        return valley(told.seed, told.size, told.terrain_step_m, told.roughness_m, told.roughness_length_m)
+    def valley(self) -> Valley:
+        """The valley before any surface change."""
+        scenario = self.scenario
+        return build_valley(
+            scenario.seed,
+            scenario.size,
+            scenario.terrain_step_m,
+            scenario.roughness_m,
+            scenario.roughness_length_m,
+        )
 
     @cached_property
-    def happening(self) -> tuple[Change, ...]:
-        """What changes the surface."""
-        return changes(self.scenario, self.place)
+    def changes(self) -> tuple[SurfaceChange, ...]:
+        """The surface changes of the scenario."""
+        return surface_changes(self.scenario, self.valley)
 
     @cached_property
-    def lean(self) -> tuple[motion.Axis, motion.Axis]:
-        """The true lean about the scanner's x (roll) and y (pitch), relative to the SOP's scan."""
-        return motion.axes(self.scenario)
+    def tilt(self) -> tuple[motion.TiltAxis, motion.TiltAxis]:
+        """The true tilt about the scanner's x (roll) and y (pitch), relative to the SOP's scan."""
+        return motion.tilt_axes(self.scenario)
 
     @cached_property
     def surface(self) -> TrueSurface:
         """The true cell means on the map's grid."""
-        return true_surface(self.place, self.happening, grid_of(self.scenario))
+        return true_surface(self.valley, self.changes, grid_of(self.scenario))
 
     @cached_property
     def stable(self) -> list[Rectangle]:
-        """What the owner knows to be stable."""
-        return stable_ground(self.scenario, self.place, self.happening, self.surface)
+        """The known stable ground."""
+        return stable_ground(self.scenario, self.valley, self.changes, self.surface)
 
-    def ground(self, scan: int) -> Heights:
-        """Return the ground that one scan sees."""
-        return ground_at(self.place, self.happening, self.scenario.hours_at(scan))
+    def ground(self, scan: int) -> NodeField:
+        """Return the ground at the time of one scan."""
+        return ground_at(self.valley, self.changes, self.scenario.hours_at(scan))
 
-    def conditions(self, scan: int) -> Conditions:
-        """Return what holds for all shots of one scan."""
+    def conditions(self, scan: int) -> ScanConditions:
+        """Return the conditions common to all shots of one scan."""
         if scan not in self._conditions:
-            self._conditions[scan] = conditions(self.scenario, scan, self.lean)
+            self._conditions[scan] = scan_conditions(self.scenario, scan, self.tilt)
         return self._conditions[scan]
 
-    def scan(self, scan: int) -> Recorded:
-        """Shoot one scan."""
-        white = white_at(self.place, self.happening, self.scenario.hours_at(scan))
-        return record(self.scenario, self.ground(scan), white, self.conditions(scan))
+    def scan(self, scan: int) -> SimulatedScan:
+        """Simulate one scan."""
+        cover = snow_cover(self.valley, self.changes, self.scenario.hours_at(scan))
+        return simulate_scan(self.scenario, self.ground(scan), cover, self.conditions(scan))
 
     def log(self, scan: int) -> InclinationLog:
         """Return the inclination log of one scan."""
-        return motion.sensor_log(self.scenario, scan, self.lean, self.conditions(scan).scanner_start_s)
+        return motion.sensor_log(self.scenario, scan, self.tilt, self.conditions(scan).scanner_start_s)
 
     def truth(self) -> xr.Dataset:
-        """Return everything that is true, scan by scan, at the middle of each."""
-        told, scans = self.scenario, range(self.scenario.hours)
-        errors = true_errors(told, [self.conditions(scan) for scan in scans], self.lean)
-        middle = [told.scan_start_utc_s(scan) + told.scan_s / 2 for scan in scans]
+        """Return all true values, scan by scan, at the middle of each."""
+        scenario, scans = self.scenario, range(self.scenario.hours)
+        errors = true_errors(scenario, [self.conditions(scan) for scan in scans], self.tilt)
+        middle = [scenario.scan_start_utc_s(scan) + scenario.scan_s / 2 for scan in scans]
         return xr.merge([self._true_surfaces(), errors]).assign_coords(
             time=("time", middle, {"units": "seconds since 1970-01-01", "standard_name": "time"}),
-            scan_id=("time", [files.stem(told, scan) for scan in scans]),
+            scan_id=("time", [files.stem(scenario, scan) for scan in scans]),
         ).assign_attrs(
             title="The truth of a simulated station",
             crs=CRS,
             comment=f"Elevations are cell means above the WGS 84 ellipsoid. {CONVENTIONS}",
-            seed=told.seed,
+            seed=scenario.seed,
         )  # fmt: skip
 
     def _true_surfaces(self) -> xr.Dataset:
         surface, scans = self.surface, range(self.scenario.hours)
-        change_m = np.stack(
-            [surface.change_m(self.happening, self.scenario.hours_at(scan)) for scan in scans]
-        )
+        change_m = np.stack([surface.change_m(self.changes, self.scenario.hours_at(scan)) for scan in scans])
         plane, cube = ("y", "x"), ("time", "y", "x")
         return xr.Dataset(
             {
                 "elevation": (cube, surface.elevation_m + change_m, {"units": "m"}),
-                "change": (cube, change_m, {"units": "m", "long_name": "against the unchanged ground"}),
+                "change": (cube, change_m, {"units": "m", "long_name": "relative to the initial ground"}),
                 "unchanged_elevation": (plane, surface.elevation_m, {"units": "m"}),
                 "ice": (plane, surface.ice, {"units": "1", "long_name": "share of ice"}),
                 "stable_polygons": (
                     plane,
-                    covered(surface.grid, self.stable).astype(np.int8),
-                    {"long_name": "inside stable.geojson: rock, on which snow may fall"},
+                    inside_rectangles(surface.grid, self.stable).astype(np.int8),
+                    {"long_name": "inside stable.geojson: rock, snow may fall on it"},
                 ),
-                "stable": (plane, surface.stable().astype(np.int8), {"long_name": "never changes here"}),
+                "stable": (plane, surface.stable().astype(np.int8), {"long_name": "never changes"}),
             },
             coords={"x": surface.grid.x_m, "y": surface.grid.y_m},
         )
@@ -119,21 +124,22 @@ class Station:
 def simulate(folder: Path, scenario: Scenario) -> None:
     """Write a station's folder: inbox, weather.dat, sop.dat, site.toml, polygons, and truth.nc.
 
-    Raises ConfigError if there already is a station, StoreError if it cannot be written.
+    Raises ConfigError if the folder already holds a station, StoreError if it cannot be written.
     """
     station = Station(scenario)
     inbox = folder / "inbox"
     if (folder / "site.toml").exists() or inbox.exists():
-        raise ConfigError(f"{folder} already holds a station: name another folder")
+        raise ConfigError(f"{folder} already holds a station: choose another folder")
     try:
         inbox.mkdir(parents=True)
         files.write_sop(folder / "sop.dat", motion.sop(scenario))
         files.write_site(folder / "site.toml", scenario, grid_of(scenario))
         grid = station.surface.grid
         files.write_polygons(
-            folder / "stable.geojson", {one.name: one.ring_m(grid) for one in station.stable}
+            folder / "stable.geojson",
+            {rectangle.name: rectangle.ring_m(grid) for rectangle in station.stable},
         )
-        files.write_polygons(folder / "areas.geojson", areas(scenario, station.place))
+        files.write_polygons(folder / "areas.geojson", areas(scenario, station.valley))
         if scenario.air:
             files.write_weather(folder / "weather.dat", weather(scenario, _minutes(scenario)))
         for scan in range(scenario.hours):
@@ -155,7 +161,7 @@ def _minutes(scenario: Scenario) -> Floats:
 def _write_truth(path: Path, truth: xr.Dataset) -> None:
     packed = {
         "dtype": "int32",
-        "scale_factor": PACKED_M,
+        "scale_factor": STORED_STEP_M,
         "_FillValue": -(2**31),
         "zlib": True,
         "complevel": 1,

@@ -1,4 +1,4 @@
-"""The series of areas: made from the epochs, kept, appended to, made anew; and read by others."""
+"""`areas.nc`: computed from the epochs, extended, recomputed if the areas change, rebuilt if damaged."""
 
 import dataclasses
 from datetime import UTC, datetime
@@ -8,28 +8,27 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from station.archive import store
-from station.archive.aggregate import AreaChange
-from station.archive.areas import update_areas
-from station.archive.join import join_closed
-from station.archive.series import build_series
+from station.archive import epochs
+from station.archive.areas import AreaChange, update_areas
+from station.archive.compaction import compact
+from station.archive.series.virtual import build_series
 from station.errors import StoreError
 
 
-class Told:
-    """Says of an epoch its hour in centimetres, and remembers what it was asked."""
+class HourAggregator:
+    """Returns the hour of an epoch in centimetres as its change; records file and cells of each call."""
 
     def __init__(self):
-        self.asked = []
+        self.calls = []
 
-    def area(self, cells, row):
-        self.asked.append((row.epoch_file, int(cells.sum())))
-        return AreaChange(row.start.hour / 100, 0.02, row.start.hour / 50, 0.03, 0.5)
+    def area(self, cells, epoch):
+        self.calls.append((epoch.epoch_file, int(cells.sum())))
+        return AreaChange(epoch.start.hour / 100, 0.02, epoch.start.hour / 50, 0.03, 0.5)
 
 
 @pytest.fixture
-def told():
-    return Told()
+def aggregator():
+    return HourAggregator()
 
 
 @pytest.fixture
@@ -41,27 +40,27 @@ def areas(series):
 
 
 @pytest.fixture
-def update(series, areas, told):
-    def update(given=None, by=told):
-        if store.epochs(series):
+def update(series, areas, aggregator):
+    def update(masks=areas, by=aggregator):
+        if epochs.epoch_files(series):
             build_series(series)
-        return update_areas(series, areas if given is None else given, by, lambda: None)
+        return update_areas(series, masks, by, lambda: None)
 
     return update
 
 
 def write(series, epoch, *hours):
-    return [store.write_epoch(series, epoch(hour)) for hour in hours]
+    return [epochs.write_epoch(series, epoch(hour)) for hour in hours]
 
 
-def opened(path):
+def read(path):
     with xr.open_dataset(path) as file:
         return file.load()
 
 
-def test_xarray_opens_it_with_names_times_and_numbers(series, epoch, update):
+def test_xarray_reads_names_times_changes_and_confidence_bounds(series, epoch, update):
     write(series, epoch, 1, 2, 3)
-    file = opened(update())
+    file = read(update())
     assert file.mean_change.dims == ("time", "area")
     assert file.time.values[0] == np.datetime64("2025-11-21T01:07:30")
     assert file.area_name.values.tolist() == ["Zunge Süd", "gate"]
@@ -82,94 +81,100 @@ def test_xarray_opens_it_with_names_times_and_numbers(series, epoch, update):
     assert file.reference_version.values.tolist() == ["1"] * 3
 
 
-def test_nothing_to_do_without_areas_or_epochs(series, epoch, update, told):
+def test_no_file_is_written_without_areas_or_epochs(series, epoch, update, aggregator):
     assert update() is None
     write(series, epoch, 1)
     assert update({}) is None
     assert not (series.folder / "areas.nc").exists()
-    assert not told.asked
+    assert not aggregator.calls
 
 
-def test_twice_changes_nothing(series, epoch, update, told):
+def test_a_second_update_changes_nothing(series, epoch, update, aggregator):
     write(series, epoch, 1, 2)
-    before = update().stat()
-    asked = len(told.asked)
-    after = update().stat()
-    assert (after.st_ino, after.st_mtime_ns, len(told.asked)) == (before.st_ino, before.st_mtime_ns, asked)
+    first = update().stat()
+    aggregator.calls.clear()
+    second = update().stat()
+    assert (second.st_ino, second.st_mtime_ns) == (first.st_ino, first.st_mtime_ns)
+    assert not aggregator.calls
 
 
-def test_only_what_is_new_is_computed_and_the_rest_kept(series, epoch, update, told):
+def test_only_new_epochs_are_computed(series, epoch, update, aggregator):
     write(series, epoch, 1, 4)
-    first = opened(update())
-    told.asked.clear()
-    write(series, epoch, 2)  # it came late
-    file = opened(update())
-    assert told.asked == [("hef_20251121T020000Z.nc", 200), ("hef_20251121T020000Z.nc", 1)]
+    first = read(update())
+    aggregator.calls.clear()
+    write(series, epoch, 2)  # arrives late
+    file = read(update())
+    assert aggregator.calls == [("hef_20251121T020000Z.nc", 200), ("hef_20251121T020000Z.nc", 1)]
     assert file.mean_change.values[:, 0].tolist() == [0.01, 0.02, 0.04]
     assert file.isel(time=[0, 2]).equals(first)
 
 
-def test_a_new_revision_replaces_and_what_is_gone_goes(series, epoch, update, told):
+@pytest.mark.integration
+def test_a_new_revision_replaces_its_epoch_and_a_deleted_epoch_is_removed(series, epoch, update, aggregator):
     written = write(series, epoch, 1, 2, 3)
     update()
-    told.asked.clear()
+    aggregator.calls.clear()
     write(series, epoch, 2)
     written[2].path.unlink()
-    file = opened(update())
-    assert {name for name, _ in told.asked} == {"hef_20251121T020000Z_r2.nc"}
+    file = read(update())
+    assert {name for name, _ in aggregator.calls} == {"hef_20251121T020000Z_r2.nc"}
     assert file.epoch_file.values.tolist() == ["hef_20251121T010000Z.nc", "hef_20251121T020000Z_r2.nc"]
     written[0].path.unlink()
-    assert opened(update()).sizes["time"] == 1
+    assert read(update()).sizes["time"] == 1
 
 
-def test_joining_days_computes_nothing(series, epoch, update, told):
+def test_compaction_recomputes_nothing(series, epoch, update, aggregator):
     write(series, epoch, 1, 2, 26)
-    before = opened(update())
-    told.asked.clear()
-    join_closed(series, datetime(2026, 2, 1, tzinfo=UTC), lambda: None)
+    expected = read(update())
+    aggregator.calls.clear()
+    compact(series, datetime(2026, 2, 1, tzinfo=UTC), lambda: None)
     build_series(series)
-    assert opened(update()).equals(before)
+    assert read(update()).equals(expected)
+    assert not aggregator.calls
     (series.folder / "areas.nc").unlink()
-    assert opened(update()).equals(before)
-    assert len(told.asked) == 6
+    assert read(update()).equals(expected)
+    assert len(aggregator.calls) == 6
 
 
-@pytest.mark.parametrize("change", ["cells", "name", "order", "more"])
-def test_other_areas_are_computed_anew(series, epoch, update, areas, told, change):
+@pytest.mark.parametrize(
+    "change",
+    ["cells", *(pytest.param(name, marks=pytest.mark.integration) for name in ("name", "order", "more"))],
+)
+def test_changed_areas_are_computed_again(series, epoch, update, areas, aggregator, change):
     write(series, epoch, 1, 2)
     update()
-    told.asked.clear()
+    aggregator.calls.clear()
     tongue, gate = areas.values()
-    moved = np.roll(gate, 1)
+    shifted = np.roll(gate, 1)
     other = {
-        "cells": {"Zunge Süd": tongue, "gate": moved},
+        "cells": {"Zunge Süd": tongue, "gate": shifted},
         "name": {"Zunge": tongue, "gate": gate},
         "order": {"gate": gate, "Zunge Süd": tongue},
-        "more": {**areas, "moved": moved},
+        "more": {**areas, "shifted": shifted},
     }[change]
-    assert opened(update(other)).sizes["area"] == len(other)
-    assert len(told.asked) == 2 * len(other)
+    assert read(update(other)).sizes["area"] == len(other)
+    assert len(aggregator.calls) == 2 * len(other)
 
 
-def test_before_there_was_a_reference_all_is_missing(series, epoch, update, told):
+def test_an_epoch_without_a_reference_has_missing_values(series, epoch, update, aggregator):
     early = dataclasses.replace(epoch(1), provenance={})
-    store.write_epoch(series, early)
+    epochs.write_epoch(series, early)
     write(series, epoch, 2)
-    file = opened(update())
-    assert {name for name, _ in told.asked} == {"hef_20251121T020000Z.nc"}
+    file = read(update())
+    assert {name for name, _ in aggregator.calls} == {"hef_20251121T020000Z.nc"}
     for name in ("mean_change", "mean_change_uncertainty", "median_change_low", "volume_change", "coverage"):
         assert np.isnan(file[name].values[0]).all()
         assert np.isfinite(file[name].values[1]).all()
 
 
-def test_unseen_areas_and_areas_beside_the_grid(series, epoch, update, areas):
+def test_unobserved_areas_and_areas_outside_the_grid_have_missing_values(series, epoch, update, areas):
     class Blind:
-        def area(self, cells, _row):
+        def area(self, cells, _epoch):
             assert cells.any()
             return AreaChange(np.nan, np.nan, np.nan, np.nan, 0.0)
 
     write(series, epoch, 1)
-    file = opened(update({**areas, "beside": np.zeros(series.grid.shape, bool)}, by=Blind()))
+    file = read(update({**areas, "outside": np.zeros(series.grid.shape, bool)}, by=Blind()))
     assert np.isnan(file.mean_change.values).all()
     assert np.isnan(file.volume_change_uncertainty.values).all()
     assert file.coverage.values[0, :2].tolist() == [0.0, 0.0]
@@ -177,7 +182,7 @@ def test_unseen_areas_and_areas_beside_the_grid(series, epoch, update, areas):
     assert file.area_size.values[2] == 0
 
 
-def cut(path):
+def truncate(path):
     path.write_bytes(path.read_bytes()[:2000])
 
 
@@ -190,7 +195,7 @@ def without_a_variable(path):
         del file["coverage"]
 
 
-def without_its_mark(path):
+def without_its_hash(path):
     with h5py.File(path, "r+") as file:
         del file.attrs["area_masks_sha256"]
 
@@ -200,33 +205,43 @@ def shortened(path):
         file["coverage"].resize((1, 2))
 
 
-@pytest.mark.parametrize("damage", [cut, empty, without_a_variable, without_its_mark, shortened])
-def test_a_damaged_file_is_made_anew(series, epoch, update, damage):
+@pytest.mark.parametrize(
+    "damage",
+    [
+        truncate,
+        shortened,
+        *(
+            pytest.param(damage, marks=pytest.mark.integration)
+            for damage in (empty, without_a_variable, without_its_hash)
+        ),
+    ],
+)
+def test_a_damaged_file_is_rebuilt(series, epoch, update, damage):
     write(series, epoch, 1, 2)
     path = update()
-    before = opened(path)
+    expected = read(path)
     damage(path)
-    assert opened(update()).equals(before)
+    assert read(update()).equals(expected)
 
 
-def test_an_aggregator_that_fails_leaves_the_old_file(series, epoch, update):
+def test_a_failed_update_leaves_the_old_file(series, epoch, update):
     class Failing:
-        def area(self, _cells, _row):
+        def area(self, _cells, _epoch):
             raise StoreError("damaged")
 
     write(series, epoch, 1)
     path = update()
-    before = path.read_bytes()
+    original = path.read_bytes()
     write(series, epoch, 2)
     with pytest.raises(StoreError, match="damaged"):
         update(by=Failing())
-    assert path.read_bytes() == before
+    assert path.read_bytes() == original
     assert not list(series.folder.glob("**/.*.part"))
 
 
-def test_progress_after_each_epoch(series, epoch, areas, told):
+def test_progress_is_called_after_each_epoch(series, epoch, areas, aggregator):
     write(series, epoch, 1, 2, 3)
     build_series(series)
     steps = []
-    update_areas(series, areas, told, lambda: steps.append(len(told.asked)))
+    update_areas(series, areas, aggregator, lambda: steps.append(len(aggregator.calls)))
     assert steps == [2, 4, 6]

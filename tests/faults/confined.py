@@ -1,4 +1,4 @@
-"""Become a command with no more system calls than a systemd unit leaves it: `confined.py UNIT COMMAND…`."""
+"""Run a command with only the system calls that a systemd unit allows: `confined.py UNIT COMMAND…`."""
 
 from __future__ import annotations
 
@@ -13,11 +13,13 @@ ALLOW, REFUSE = 0x7FFF0000, 0x00050000 | errno.EPERM
 SET_MDWE, REFUSE_EXEC_GAIN = 65, 1
 
 
-def groups():
-    """Return the groups of system calls that systemd knows: their members, which may be groups."""
-    told = subprocess.run(["systemd-analyze", "syscall-filter"], capture_output=True, text=True, check=True)
+def call_groups():
+    """Return the members, calls or groups, of each group of system calls known to systemd."""
+    listing = subprocess.run(
+        ["systemd-analyze", "syscall-filter"], capture_output=True, text=True, check=True
+    )
     known = {}
-    for line in told.stdout.splitlines():
+    for line in listing.stdout.splitlines():
         if line.startswith("@"):
             members = known[line.strip()] = []
         elif line.startswith(" ") and not line.strip().startswith("#"):
@@ -25,29 +27,29 @@ def groups():
     return known
 
 
-def named(names, known):
-    """Return the system calls of some names and groups."""
-    return {one for name in names for one in (named(known[name], known) if name in known else {name})}
+def expand(names, known):
+    """Return the system calls of names and groups."""
+    return {call for name in names for call in (expand(known[name], known) if name in known else {name})}
 
 
-def allowed(values, known):
-    """Return the system calls that lines of SystemCallFilter leave, one after the other."""
-    left = set()
+def allowed_calls(values, known):
+    """Return the system calls allowed by successive lines of SystemCallFilter."""
+    remaining = set()
     for value in values:
-        some = named(value.removeprefix("~").split(), known)
-        left = left - some if value.startswith("~") else left | some
-    return left
+        calls = expand(value.removeprefix("~").split(), known)
+        remaining = remaining - calls if value.startswith("~") else remaining | calls
+    return remaining
 
 
 def confine(keys):
-    """Give up, for good, what the (key, value) lines of a unit refuse."""
+    """Apply the restrictions of the (key, value) lines of a unit to this process, irrevocably."""
     seccomp = ctypes.CDLL("libseccomp.so.2")
     seccomp.seccomp_init.restype = ctypes.c_void_p
     context = ctypes.c_void_p(seccomp.seccomp_init(REFUSE))
-    for name in allowed([value for key, value in keys if key == "SystemCallFilter"], groups()):
-        number = seccomp.seccomp_syscall_resolve_name(name.encode())
-        if number >= 0:
-            assert seccomp.seccomp_rule_add(context, ALLOW, number, 0) == 0
+    for name in allowed_calls([value for key, value in keys if key == "SystemCallFilter"], call_groups()):
+        call_number = seccomp.seccomp_syscall_resolve_name(name.encode())
+        if call_number >= 0:
+            assert seccomp.seccomp_rule_add(context, ALLOW, call_number, 0) == 0
     if ("MemoryDenyWriteExecute", "yes") in keys:
         ctypes.CDLL(None).prctl(SET_MDWE, REFUSE_EXEC_GAIN, 0, 0, 0)  # kernels before 6.3 do not know it
     assert seccomp.seccomp_load(context) == 0

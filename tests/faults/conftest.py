@@ -1,4 +1,4 @@
-"""Undisturbed runs to compare with, and services that end with their test."""
+"""Undisturbed runs for comparison, and services that end with their test."""
 
 from __future__ import annotations
 
@@ -17,50 +17,50 @@ import harness
 
 @pytest.fixture(scope="session")
 def warm():
-    made = harness.Warm()
-    yield made
-    made.close()
+    process = harness.Warm()
+    yield process
+    process.close()
 
 
 @pytest.fixture(scope="session")
-def quiet(tmp_path_factory, warm):
-    """Return the undisturbed run of a method: a station whose scans came one after the other."""
-    known = {}
+def undisturbed(tmp_path_factory, warm):
+    """Return the undisturbed run of an adjustment method: a station whose scans all arrived in order."""
+    stations = {}
 
     def run(method="none"):
-        if method not in known:
-            folder = harness.build(tmp_path_factory.mktemp("quiet") / method, method=method)
+        if method not in stations:
+            folder = harness.build(tmp_path_factory.mktemp("undisturbed") / method, method=method)
             station = harness.Station(folder, warm)
             station.drop(*range(harness.SCANS))
             station.start()
             station.finish(*range(harness.SCANS))
-            known[method] = station
-        return known[method]
+            stations[method] = station
+        return stations[method]
 
     return run
 
 
 @pytest.fixture
-def make(tmp_path, warm, quiet):
-    """Return a function that makes a station with an empty inbox, like that of the undisturbed run."""
-    made = []
+def make_station(tmp_path, warm, undisturbed):
+    """Return a function that creates a copy of the undisturbed station with an empty inbox."""
+    started = []
 
     def station(method="none", *, cold=False, folder=None):
-        folder = folder or tmp_path / f"station{len(made)}"
+        folder = folder or tmp_path / f"station{len(started)}"
         ignored = shutil.ignore_patterns("data", "inbox", "log", "steps.*", "died")
-        shutil.copytree(quiet(method).folder, folder, ignore=ignored)
+        shutil.copytree(undisturbed(method).folder, folder, ignore=ignored)
         (folder / "inbox").mkdir()
-        made.append(harness.Station(folder, None if cold else warm))
-        return made[-1]
+        started.append(harness.Station(folder, None if cold else warm))
+        return started[-1]
 
     yield station
-    for one in made:
-        one.close()
+    for running in started:
+        running.close()
 
 
 @pytest.fixture
-def dice():
-    """Return dice whose seed is told where a test fails, and may be set by STATION_FAULTS_SEED."""
+def rng():
+    """Return a random generator; a failed test prints its seed, STATION_FAULTS_SEED sets it."""
     seed = int(environ.get("STATION_FAULTS_SEED", secrets.randbits(31)))
     print(f"STATION_FAULTS_SEED={seed}")
     return random.Random(seed)  # noqa: S311 - no secret

@@ -1,9 +1,9 @@
-"""Mutated input, read the way the service reads it, in a process with little memory and no patience.
+"""Mutated input, read as the service reads it, in a process with limited memory and time.
 
     python fuzz_cases.py FOLDER FIRST KIND=COUNT...
 
-Prints a line of JSON: by kind, how many cases were accepted and refused, and what was found. A case that
-hangs is ended by SIGALRM, a native crash by its own signal: `FOLDER/at.FIRST` says which it was.
+Prints a line of JSON: by kind, the numbers of accepted and rejected cases, and the findings. SIGALRM ends a
+case that hangs, a native crash its own signal; `FOLDER/at.FIRST` then names the case.
 """
 
 from __future__ import annotations
@@ -27,21 +27,21 @@ import numpy as np
 
 from station.config import read_site
 from station.errors import ConfigError, ScanError
-from station.quantities import Grid, HeadTrack
+from station.quantities import AzimuthTrack, Grid
 from station.readers.inclination import read_inclination
-from station.readers.polygons import mask, read_polygons
+from station.readers.polygons import cells_inside, read_polygons
 from station.readers.scan import open_scan, utc_interval
 from station.readers.sop import read_matrix
-from station.readers.weather import LIMITS, air_at, read_weather
-from station.science import inclination, pose
+from station.readers.weather import VALID_RANGES, interpolate_air, read_weather
+from station.science.geometry import inclination, pose
 from station.sections import WeatherColumns
 
-PATIENCE_S = 5  # for one case of a few kilobytes
-MEMORY = 1 << 29  # beyond what the modules take
+TIMEOUT_S = 5  # for one case of a few kilobytes
+MEMORY_BYTES = 1 << 29  # in addition to the imported modules
 RANGE_M = 3000.0
-NAMED = "%y%m%d_%H%M%S"
+NAME_PATTERN = "%y%m%d_%H%M%S"
 CORPUS = "corpus"
-SOUND = {  # kind: file of the corpus, in the order of `write_corpus`
+VALID_FILES = {  # kind: file of the corpus, in the order of `write_corpus`
     "las": "250715_000000.las",
     "laz": "250715_000000.laz",
     "old_laz": "250715_010000.laz",
@@ -67,79 +67,79 @@ ODD_WORDS = (
 # ---- mutation
 
 
-def mutated(raw, kind, dice):
-    """Return bytes that are no longer what they were, most often by little."""
+def mutate(raw, kind, rng):
+    """Return a copy of the bytes with a few mutations."""
     raw = bytearray(raw)
-    how = TEXT if kind in READ_TEXT else BINARY
-    for _ in range(dice.choice((1, 1, 1, 2, 3, 8))):
+    mutations = TEXT if kind in TEXT_CHECKS else BINARY
+    for _ in range(rng.choice((1, 1, 1, 2, 3, 8))):
         if raw:
-            dice.choice(how)(raw, dice)
+            rng.choice(mutations)(raw, rng)
     return bytes(raw)
 
 
-def _place(raw, dice):
-    """Choose a place, the head of the file more often than the rest."""
-    return dice.randrange(min(len(raw), dice.choice((240, 520, len(raw)))))
+def _position(raw, rng):
+    """Draw a position, in the head of the file more often than in the rest."""
+    return rng.randrange(min(len(raw), rng.choice((240, 520, len(raw)))))
 
 
-def _flip(raw, dice):
-    raw[_place(raw, dice)] ^= 1 << dice.randrange(8)
+def _flip(raw, rng):
+    raw[_position(raw, rng)] ^= 1 << rng.randrange(8)
 
 
-def _byte(raw, dice):
-    raw[_place(raw, dice)] = dice.randrange(256)
+def _byte(raw, rng):
+    raw[_position(raw, rng)] = rng.randrange(256)
 
 
-def _cut(raw, dice):
-    del raw[dice.randrange(len(raw)) :]
+def _cut(raw, rng):
+    del raw[rng.randrange(len(raw)) :]
 
 
-def _drop(raw, dice):
-    at = _place(raw, dice)
-    del raw[at : at + dice.choice((1, 2, 8, 100, 1000))]
+def _drop(raw, rng):
+    at = _position(raw, rng)
+    del raw[at : at + rng.choice((1, 2, 8, 100, 1000))]
 
 
-def _double(raw, dice):
-    at = _place(raw, dice)
-    raw[at:at] = raw[at : at + dice.choice((1, 4, 54, 1000))]
+def _double(raw, rng):
+    at = _position(raw, rng)
+    raw[at:at] = raw[at : at + rng.choice((1, 4, 54, 1000))]
 
 
-def _zero(raw, dice):
-    """Leave a hole, as a power cut does in a file whose blocks were not yet written."""
-    at = dice.randrange(len(raw))
-    size = min(dice.choice((16, 512, 4096)), len(raw) - at)
+def _zero(raw, rng):
+    """Zero a block, as a power cut does in a file whose blocks were not yet written."""
+    at = rng.randrange(len(raw))
+    size = min(rng.choice((16, 512, 4096)), len(raw) - at)
     raw[at : at + size] = bytes(size)
 
 
-def _number(raw, dice):
-    kind = dice.choice(("<B", "<H", "<I", "<Q"))
+def _number(raw, rng):
+    kind = rng.choice(("<B", "<H", "<I", "<Q"))
     size = struct.calcsize(kind)
-    at = _place(raw, dice)
+    at = _position(raw, rng)
     if at + size <= len(raw):
-        struct.pack_into(kind, raw, at, dice.choice(ODD_NUMBERS) % (1 << 8 * size))
+        struct.pack_into(kind, raw, at, rng.choice(ODD_NUMBERS) % (1 << 8 * size))
 
 
-def _double_number(raw, dice):
-    """Put an odd number where the header, or a point, keeps a double."""
-    at = dice.choice((131, 139, 147, 155, 163, 171, 179, 187, 195, 203, 211, 219, _place(raw, dice)))
+def _double_number(raw, rng):
+    """Put an unusual number where the header or a point stores a double."""
+    at = rng.choice((131, 139, 147, 155, 163, 171, 179, 187, 195, 203, 211, 219, _position(raw, rng)))
     if at + 8 <= len(raw):
-        struct.pack_into("<d", raw, at, dice.choice(ODD_DOUBLES))
+        struct.pack_into("<d", raw, at, rng.choice(ODD_DOUBLES))
 
 
-def _word(raw, dice):
+def _word(raw, rng):
     """Replace a word or number of a text."""
     words = list(re.finditer(rb"[^\s,=]+", raw[:20_000]))
     if words:
-        start, end = dice.choice(words).span()
-        raw[start:end] = dice.choice(ODD_WORDS).encode()
+        start, end = rng.choice(words).span()
+        raw[start:end] = rng.choice(ODD_WORDS).encode()
 
 
-def _line(raw, dice):
+def _line(raw, rng):
     """Repeat, drop or move a line."""
     lines = raw.split(b"\n")
-    line = lines.pop(dice.randrange(len(lines)))
-    for _ in range(dice.choice((0, 1, 2, 50))):
-        lines.insert(dice.randrange(len(lines) + 1), line)
+    line = lines.pop(rng.randrange(len(lines)))
+    for _ in range(rng.choice((0, 1, 2, 50))):
+        lines.insert(rng.randrange(len(lines) + 1), line)
     raw[:] = b"\n".join(lines)
 
 
@@ -147,32 +147,34 @@ BINARY = (_flip, _flip, _byte, _cut, _drop, _double, _zero, _number, _number, _d
 TEXT = (_flip, _byte, _cut, _drop, _double, _zero, _word, _word, _word, _line)
 
 
-# ---- what may be accepted
+# ---- properties of accepted input
 
 
-def check_scan(path, dice):
-    range_max_m = dice.choice((RANGE_M, None))
-    pattern = "%Y" if dice.random() > 0.95 else NAMED
+def check_scan(path, rng):
+    range_max_m = rng.choice((RANGE_M, None))
+    pattern = "%Y" if rng.random() > 0.95 else NAME_PATTERN
     with open_scan(path, range_max_m=range_max_m) as scan:
         start, end, _ = utc_interval(scan, pattern)
         blocks = list(scan.blocks(500))
-        track = scan.head_track()
-    assert sum(len(block) for block in blocks) == scan.header.point_count, "another count than its header's"
+        track = scan.azimuth_track()
+    assert sum(len(block) for block in blocks) == scan.header.point_count, (
+        "point count differs from the header"
+    )
     slack_m = 1.0  # no scale is larger
     for block in blocks:
         points_m = block.xyz_m.T
-        assert np.isfinite(points_m).all(), "points that are no numbers"
-        assert (points_m >= np.array(scan.header.low_m) - slack_m).all(), "points outside of the box"
-        assert (points_m <= np.array(scan.header.high_m) + slack_m).all(), "points outside of the box"
+        assert np.isfinite(points_m).all(), "points are not finite"
+        assert (points_m >= np.array(scan.header.low_m) - slack_m).all(), "points outside the bounding box"
+        assert (points_m <= np.array(scan.header.high_m) + slack_m).all(), "points outside the bounding box"
         if range_max_m is not None:
             assert np.linalg.norm(points_m, axis=1).max() <= range_max_m, "points out of range"
-        assert block.time_s is None or np.isfinite(block.time_s).all(), "times that are no numbers"
-    assert datetime(1999, 1, 1, tzinfo=UTC) < start <= end, "a time before there were scanners"
+        assert block.time_s is None or np.isfinite(block.time_s).all(), "times are not finite"
+    assert datetime(1999, 1, 1, tzinfo=UTC) < start <= end, "a time before 1999"
     if range_max_m is not None:
         assert (end - start).total_seconds() <= 86_400, "a scan longer than a day"
         if track is not None:
-            assert np.isfinite(track.azimuth_rad).all(), "a head that looks nowhere"
-            assert (np.diff(track.time_s) > 0).all(), "a head that goes back in time"
+            assert np.isfinite(track.azimuth_rad).all(), "azimuths are not finite"
+            assert (np.diff(track.time_s) > 0).all(), "times of the head do not increase"
 
 
 def check_inclination(path, _dice):
@@ -182,17 +184,17 @@ def check_inclination(path, _dice):
     if len(log.time_s) < 20:
         return
     time_s = np.linspace(0.0, 60.0, 100)
-    track = HeadTrack(time_s, np.linspace(2.6, 2.9, 100))
-    zero = inclination.fit_cycle(log, track, 1.4e-4)
-    lean = inclination.relative_lean(log, track, zero, 1.4e-4, None, filtered=True)
-    assert np.isfinite(lean.mean_roll_rad)
-    assert np.isfinite(lean.mean_pitch_rad)
+    track = AzimuthTrack(time_s, np.linspace(2.6, 2.9, 100))
+    zero = inclination.fit_cyclic_error(log, track, 1.4e-4)
+    tilt = inclination.relative_tilt(log, track, zero, 1.4e-4, None, filtered=True)
+    assert np.isfinite(tilt.mean_roll_rad)
+    assert np.isfinite(tilt.mean_pitch_rad)
 
 
-def check_weather(path, dice):
-    offset_h = dice.choice((0, 1, -7, 5.5))
+def check_weather(path, rng):
+    offset_h = rng.choice((0, 1, -7, 5.5))
     moment_s = datetime(2025, 7, 15, 1, tzinfo=UTC).timestamp()
-    window = dice.choice((None, (moment_s - 3600, moment_s + 3600)))
+    window = rng.choice((None, (moment_s - 3600, moment_s + 3600)))
     columns = COLUMNS[path.name.rpartition(".")[2]]
     log = read_weather(
         path,
@@ -203,12 +205,12 @@ def check_weather(path, dice):
     )
     assert np.isfinite(log.time_utc_s).all()
     assert (np.diff(log.time_utc_s) > 0).all()
-    air = air_at(log, moment_s, 3600.0)
+    air = interpolate_air(log, moment_s, 3600.0)
     if air is not None:
         for value, (low, high) in zip(
-            (air.temperature_c, air.pressure_hpa, air.humidity_pct), LIMITS, strict=True
+            (air.temperature_c, air.pressure_hpa, air.humidity_pct), VALID_RANGES, strict=True
         ):
-            assert low <= value <= high, "air that cannot be"
+            assert low <= value <= high, "impossible air"
 
 
 def check_sop(path, _dice):
@@ -216,16 +218,16 @@ def check_sop(path, _dice):
     assert np.isfinite(matrix).all()
     assert np.abs(matrix[:3, :3] @ matrix[:3, :3].T - np.eye(3)).max() < 1e-5, "no rotation"
     assert np.abs(matrix[:3, 3]).max() < 1e9, "beyond any map"
-    pose.frame_by_origin(matrix, (46.8, 10.8, 3245.0), "EPSG:32632", RANGE_M)
+    pose.scanner_to_map_by_origin(matrix, (46.8, 10.8, 3245.0), "EPSG:32632", RANGE_M)
 
 
 def check_site(path, _dice):
     site = read_site(path)
     assert len(site.science_hash) == 16
     assert site.grid_cells.nx * site.grid_cells.ny <= 100_000_000
-    told = json.dumps(site.model_dump(mode="json"))
-    assert "NaN" not in told
-    assert "Infinity" not in told
+    text = json.dumps(site.model_dump(mode="json"))
+    assert "NaN" not in text
+    assert "Infinity" not in text
     for bound in site.grid.bounds_m:
         assert abs(bound[1]) < 1e9, "a grid beyond any map"
 
@@ -233,14 +235,14 @@ def check_site(path, _dice):
 def check_polygons(path, _dice):
     grid = Grid(635300.0, 5184550.0, 25.0, 38, 18)
     for polygon in read_polygons(path, "EPSG:32632").values():
-        mask(polygon, grid)
+        cells_inside(polygon, grid)
 
 
 COLUMNS = {
     "dat": WeatherColumns(temperature_c="TAact_2m_Avg", humidity_pct="RHact_2m_Avg", pressure_hpa="Pact"),
     "csv": WeatherColumns(time="time", temperature_c="t", humidity_pct="rh", pressure_hpa="p"),
 }
-READ_TEXT = {
+TEXT_CHECKS = {
     "inclination": check_inclination,
     "toa5": check_weather,
     "csv": check_weather,
@@ -254,31 +256,31 @@ READ_TEXT = {
 
 
 def run(kind, first, count, folder, at):
-    """Read `count` mutations of one kind; return what became of them."""
-    whole = (folder / CORPUS / SOUND[kind]).read_bytes()
-    check = READ_TEXT.get(kind, check_scan)
-    path = folder / str(first) / SOUND[kind]
-    told, found = Counter(), []
-    check(_written(path, whole), random.Random(0))  # noqa: S311 - no secret
+    """Read `count` mutations of one kind; return the numbers of outcomes and the findings."""
+    valid = (folder / CORPUS / VALID_FILES[kind]).read_bytes()
+    check = TEXT_CHECKS.get(kind, check_scan)
+    path = folder / str(first) / VALID_FILES[kind]
+    counts, findings = Counter(), []
+    check(_written(path, valid), random.Random(0))  # noqa: S311 - no secret
     for seed in range(first, first + count):
         os.pwrite(at, f"{kind} {seed} ".encode(), 0)
-        dice = random.Random(f"{kind} {seed}")  # noqa: S311 - no secret
-        _written(path, mutated(whole, kind, dice))
-        signal.setitimer(signal.ITIMER_REAL, PATIENCE_S)
+        rng = random.Random(f"{kind} {seed}")  # noqa: S311 - no secret
+        _written(path, mutate(valid, kind, rng))
+        signal.setitimer(signal.ITIMER_REAL, TIMEOUT_S)
         try:
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore")
-                check(path, dice)
-            told["accepted"] += 1
+                check(path, rng)
+            counts["accepted"] += 1
         except (ScanError, ConfigError) as error:
-            told["refused"] += 1
+            counts["refused"] += 1
             if "MemoryError" in str(error) or not str(error):
-                found.append(f"{kind} {seed}: refused by {error!r}")
-        except BaseException as error:  # noqa: BLE001 - whatever it is, it is a find
-            found.append(f"{kind} {seed}: {type(error).__name__}: {str(error)[:200]}")
+                findings.append(f"{kind} {seed}: refused by {error!r}")
+        except BaseException as error:  # noqa: BLE001 - any other exception is a finding
+            findings.append(f"{kind} {seed}: {type(error).__name__}: {str(error)[:200]}")
         signal.setitimer(signal.ITIMER_REAL, 0)
-    _written(path, whole)  # other kinds may name it
-    return {**told, "found": found[:20], "finds": len(found)}
+    _written(path, valid)  # other kinds may refer to it
+    return {**counts, "found": findings[:20], "finds": len(findings)}
 
 
 def _written(path, raw):
@@ -287,10 +289,10 @@ def _written(path, raw):
 
 
 if __name__ == "__main__":
-    folder, first, *counts = sys.argv[1:]
-    opened = os.open(Path(folder) / f"at.{first}", os.O_WRONLY | os.O_CREAT)
+    folder, first, *arguments = sys.argv[1:]
+    at_file = os.open(Path(folder) / f"at.{first}", os.O_WRONLY | os.O_CREAT)
     limit = int(Path("/proc/self/statm").read_text(encoding="ascii").split()[0]) * resource.getpagesize()
-    resource.setrlimit(resource.RLIMIT_AS, (limit + MEMORY, limit + MEMORY))
+    resource.setrlimit(resource.RLIMIT_AS, (limit + MEMORY_BYTES, limit + MEMORY_BYTES))
     shutil.copytree(Path(folder) / CORPUS, Path(folder) / first)
-    wanted = {kind: int(count) for kind, count in (one.split("=") for one in counts)}
-    print(json.dumps({kind: run(kind, int(first), n, Path(folder), opened) for kind, n in wanted.items()}))
+    counts = {kind: int(count) for kind, count in (argument.split("=") for argument in arguments)}
+    print(json.dumps({kind: run(kind, int(first), n, Path(folder), at_file) for kind, n in counts.items()}))

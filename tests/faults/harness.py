@@ -1,4 +1,4 @@
-"""A very small station, a real service on it, and what must hold whatever befell it."""
+"""A very small station, a real service on it, and the invariants that no fault may violate."""
 
 from __future__ import annotations
 
@@ -19,24 +19,24 @@ import netCDF4
 import numpy as np
 import pytest
 
-from benchmarks.cost import family
-from station.service.journal import Journal, State
-from station.simulation.scenario import tiny
+from benchmarks.process_cost import family
+from station.inbox.journal import Journal, State
+from station.simulation.scenario import small
 from station.simulation.station import simulate
 
-HERE = Path(__file__).parent
-HOOKS = HERE / "hooks"
-RECORD = 96  # bytes a boundary takes, see hooks/boundaries.py
-PATIENCE_S = 120.0  # a child that dies again and again is started anew after 1, 5 and 30 s
+FOLDER = Path(__file__).parent
+HOOKS = FOLDER / "hooks"
+RECORD = 96  # bytes per boundary, see hooks/boundaries.py
+TIMEOUT_S = 120.0  # a worker process that keeps dying is restarted after 1, 5 and 30 s
 SCANS = 6
-LATER = "later"  # where scans lie before they arrive
-NOT_VALUES = {"epoch_file"}  # a revision more or less is no other value
+PENDING = "pending"  # folder of the scans that have not arrived yet
+NOT_COMPARED = {"epoch_file"}  # the revision may differ
 
 
 def build(folder, *, method="none", hours=SCANS):
-    """Simulate a station whose scans take a fifth of a second, and empty its inbox."""
-    few = replace(
-        tiny(hours=hours),
+    """Simulate a station whose scans take a fifth of a second to process; its inbox is empty."""
+    scenario = replace(
+        small(hours=hours),
         lines=30,
         shots_per_line=60,
         cell_m=25.0,
@@ -45,23 +45,23 @@ def build(folder, *, method="none", hours=SCANS):
         scan_s=60.0,
         reference_scans=2,
     )
-    simulate(folder, few)
+    simulate(folder, scenario)
     text = (folder / "site.toml").read_text()
     for old, new in (('method = "joint" ', f'method = "{method}" '), ("settle_s = 2 ", "settle_s = 0.05 ")):
         assert old in text
         text = text.replace(old, new)
     (folder / "site.toml").write_text(text)
-    (folder / "inbox").rename(folder / LATER)
+    (folder / "inbox").rename(folder / PENDING)
     (folder / "inbox").mkdir()
     return folder
 
 
 class Warm:
-    """The process that services are forked from (see `warm.py`)."""
+    """The process from which services are forked (see `warm.py`)."""
 
     def __init__(self):
         self.process = subprocess.Popen(
-            [sys.executable, str(HERE / "warm.py")],
+            [sys.executable, str(FOLDER / "warm.py")],
             stdin=subprocess.PIPE, stdout=subprocess.PIPE, encoding="utf-8", env=environment(),
         )  # fmt: skip
         assert self.process.stdout.readline() == "warm\n"
@@ -77,56 +77,56 @@ class Warm:
 
 
 def environment(**more):
-    told = {**os.environ, "OPENBLAS_NUM_THREADS": "1", "PYTHONPATH": os.pathsep.join(sys.path), **more}
+    env = {**os.environ, "OPENBLAS_NUM_THREADS": "1", "PYTHONPATH": os.pathsep.join(sys.path), **more}
     for name in ("NOTIFY_SOCKET", "JOURNAL_STREAM", "WATCHDOG_USEC"):
-        told.pop(name, None)
-    return told
+        env.pop(name, None)
+    return env
 
 
 @dataclass
 class Station:
-    """A folder with a station, and the service that runs on it, if one does."""
+    """A folder with a station and, while it runs, its service."""
 
     folder: Path
     warm: Warm | None = None
     pid: int | None = None
     starts: int = 0
     logged: int = 0  # characters of the log before this start
-    killed: int = 0  # deaths before this start
+    earlier_kills: int = 0  # kills before this start
     steps: Path | None = None
     period_s: float = 5.0
-    clock: Path | None = None  # file that says by how much the service's clock is off
+    clock: Path | None = None  # file with the offset of the service's clock [s]
     popen: subprocess.Popen | None = None
-    before: list[str] = field(default_factory=list)  # of the command that starts it
+    command_prefix: list[str] = field(default_factory=list)
 
-    # ---- the service
+    # ---- service
 
     def start(self, **plan):
-        """Start the service: forked from the warm process, or by its command where there is none."""
+        """Start the service: forked from the warm process if there is one, else by its command."""
         assert self.pid is None
         self.starts += 1
         self.logged = len(self.log())
-        self.killed = self.kills
+        self.earlier_kills = self.kills
         self.steps = self.folder / f"steps.{self.starts}"
         plan = {"steps": str(self.steps), "died": str(self.died), **plan}
         self.died.mkdir(exist_ok=True)
-        orders = {"FAULTS_PLAN": json.dumps(plan)}
+        fault_environment = {"FAULTS_PLAN": json.dumps(plan)}
         site, log = str(self.folder / "site.toml"), str(self.folder / "log")
         if self.warm is not None:
-            order = {"site": site, "log": log, "environment": orders}
+            order = {"site": site, "log": log, "environment": fault_environment}
             order |= {"period_s": self.period_s, "clock": str(self.clock) if self.clock else ""}
             self.pid = self.warm.start(order)
             return
-        orders["PYTHONPATH"] = os.pathsep.join([str(HOOKS), *sys.path])
-        with open(log, "a") as told:  # noqa: PTH123 - a text of a path
+        fault_environment["PYTHONPATH"] = os.pathsep.join([str(HOOKS), *sys.path])
+        with open(log, "a") as log_file:  # noqa: PTH123 - the path is a string
             self.popen = subprocess.Popen(
-                [*self.before, sys.executable, "-m", "station.cli", "run", site],
-                stderr=told, env=environment(**orders),
+                [*self.command_prefix, sys.executable, "-m", "station", "run", site],
+                stderr=log_file, env=environment(**fault_environment),
             )  # fmt: skip
         self.pid = self.popen.pid
 
     def is_alive(self):
-        """Tell whether the service still runs."""
+        """Return True while the service runs."""
         if self.pid is None:
             return False
         if not self._has_ended(0):
@@ -134,20 +134,20 @@ class Station:
         self.pid = self.popen = None
         return False
 
-    def wait(self, within_s=PATIENCE_S):
+    def wait(self, within_s=TIMEOUT_S):
         """Wait for the service to end."""
         assert self._has_ended(within_s), self.log()
         self.pid = self.popen = None
 
     def end(self):
-        """Ask the service to end; it must say so, unless one of its kills came first."""
+        """Stop the service; it must log its end, unless a kill came first."""
         with suppress(ProcessLookupError):
             os.kill(self.pid, signal.SIGTERM)
         self.wait()
-        assert self.log().endswith("service=stopped\n") or self.kills > self.killed, self.log()[-2000:]
+        assert self.log().endswith("service=stopped\n") or self.kills > self.earlier_kills, self.log()[-2000:]
 
     def close(self):
-        """Leave nothing running."""
+        """Kill the service if it still runs."""
         if self.is_alive():
             os.kill(self.pid, signal.SIGKILL)
             self.wait()
@@ -160,24 +160,25 @@ class Station:
                 return False
             return True
         try:
-            watched = os.pidfd_open(self.pid)
+            pidfd = os.pidfd_open(self.pid)
         except ProcessLookupError:
             return True
         try:
-            return bool(select.select([watched], [], [], within_s)[0])
+            return bool(select.select([pidfd], [], [], within_s)[0])
         finally:
-            os.close(watched)
+            os.close(pidfd)
 
     def processes(self):
-        """Return the service and all it has started."""
+        """Return the process ids of the service and its descendants."""
         return family(self.pid)
 
-    def limit_files(self, size):
-        """Let no file of the service grow beyond a size, as on a full disk; None: as before."""
+    def limit_file_size(self, size):
+        """Limit the size of the service's files [bytes], as a full disk does; None removes the limit."""
         for pid in self.processes():
             try:
-                _, most = resource.prlimit(pid, resource.RLIMIT_FSIZE)
-                resource.prlimit(pid, resource.RLIMIT_FSIZE, (most if size is None else size, most))
+                _, hard_limit = resource.prlimit(pid, resource.RLIMIT_FSIZE)
+                soft_limit = hard_limit if size is None else size
+                resource.prlimit(pid, resource.RLIMIT_FSIZE, (soft_limit, hard_limit))
             except ProcessLookupError:
                 continue
 
@@ -185,18 +186,18 @@ class Station:
         """Return how many boundaries the running service has crossed."""
         return self.steps.stat().st_size // RECORD if self.steps.exists() else 0
 
-    # ---- its world
+    # ---- files
 
     @property
     def died(self):
-        """Folder of the boundaries where someone died, or the disk was full."""
+        """Folder with a file per boundary at which a process died or the disk was full."""
         return self.folder / "died"
 
     @property
     def kills(self):
-        """Deaths so far; a full disk is none."""
-        named = [path.name for path in self.died.glob("*") if not path.name.startswith("full ")]
-        return len(named) + len(list(self.folder.glob("steps.*.kill*")))
+        """Number of kills so far, without full disks."""
+        claims = [path.name for path in self.died.glob("*") if not path.name.startswith("full ")]
+        return len(claims) + len(list(self.folder.glob("steps.*.kill*")))
 
     @property
     def inbox(self):
@@ -207,13 +208,13 @@ class Station:
         return self.folder / "data"
 
     def drop(self, *hours, whole=True):
-        """Have scans arrive, log first; `whole`: by a rename, as careful transfers do."""
+        """Put scans into the inbox, log first; `whole`: by a rename, as careful transfers do."""
         for hour in hours:
-            for path in sorted((self.folder / LATER).glob(f"{stem(hour)}*"), reverse=True):
-                beside = self.inbox / (f".{path.name}" if whole else path.name)
-                shutil.copyfile(path, beside)
+            for path in sorted((self.folder / PENDING).glob(f"{scan_name(hour)}*"), reverse=True):
+                partial = self.inbox / (f".{path.name}" if whole else path.name)
+                shutil.copyfile(path, partial)
                 if whole:
-                    beside.replace(self.inbox / path.name)
+                    partial.replace(self.inbox / path.name)
 
     def log(self):
         path = self.folder / "log"
@@ -225,106 +226,115 @@ class Station:
             return {row.name: row for row in journal.rows()}
 
     def is_done(self, *hours):
-        """Tell whether all of these are in their place and nothing waits."""
+        """Return True if these scans are stored or rejected and no scan waits."""
         rows = self.rows()
         at_rest = all(row.state in {State.STORED, State.SET_ASIDE} for row in rows.values())
-        return at_rest and {f"{stem(hour)}.laz" for hour in hours} <= rows.keys()
+        return at_rest and {f"{scan_name(hour)}.laz" for hour in hours} <= rows.keys()
 
     def state(self, name):
-        """Tell where a scan stands, None before it was seen."""
+        """Return the state of a scan; None before the service has recorded it."""
         row = self.rows().get(name)
         return row.state if row else None
 
-    def is_through(self, *hours):
-        """Tell whether the service that runs has looked around and found nothing left to do."""
-        looked = "service=running" in self.log()[self.logged :]
-        return looked and self.is_done(*hours) and not self.processes()[3:]
+    def is_finished(self, *hours):
+        """Return True if the running service has polled the inbox and has nothing left to do."""
+        has_polled = "service=running" in self.log()[self.logged :]
+        return has_polled and self.is_done(*hours) and not self.processes()[3:]
 
-    def await_(self, what, within_s=PATIENCE_S):
-        """Wait until something holds; where it never does, say what all processes are at."""
+    def wait_until(self, condition, within_s=TIMEOUT_S):
+        """Wait for a condition; on failure, report the stacks of all processes."""
         until_s = time.monotonic() + within_s
-        while not what():
+        while not condition():
             if time.monotonic() > until_s:
-                self._tell_stacks()
-                lives = "alive" if self.is_alive() else "dead"
-                pytest.fail(f"{lives}, step {self.step()}, after {within_s:g} s:\n{self.log()[-12_000:]}")
-            nap()
+                self._log_stacks()
+                liveness = "alive" if self.is_alive() else "dead"
+                pytest.fail(f"{liveness}, step {self.step()}, after {within_s:g} s:\n{self.log()[-12_000:]}")
+            pause()
 
-    def _tell_stacks(self):
-        """Have each process write to the log where it is (see hooks/boundaries.py)."""
+    def _log_stacks(self):
+        """Have each process write its stacks to the log (see hooks/boundaries.py)."""
         if self.is_alive():
-            self.limit_files(None)
+            self.limit_file_size(None)
             for pid in self.processes():
                 with suppress(ProcessLookupError):
                     os.kill(pid, signal.SIGUSR1)
-            nap(1.0)
+            pause(1.0)
 
     def finish(self, *hours):
-        """Have an undisturbed service bring all to an end."""
+        """Let an undisturbed service process everything, then stop it."""
         if not self.is_alive():
             self.start()
-        self.await_(lambda: self.is_alive() and self.is_through(*hours))
+        self.wait_until(lambda: self.is_alive() and self.is_finished(*hours))
         self.end()
 
 
-def nap(seconds=0.05):
-    """Wait a moment."""
+def pause(seconds=0.05):
+    """Wait [s]."""
     time.sleep(seconds)
 
 
-def stem(hour):
+def scan_name(hour):
     """Return the name of a scan without its suffix."""
     return f"250715_{hour:02d}0000"
 
 
-# ---- what must hold
+# ---- invariants
 
 
 def values(path):
-    """Return every variable of a file, as it stands there, and its dimensions."""
+    """Return the dimensions and the stored values of every variable of a file."""
     with netCDF4.Dataset(path) as file:
         file.set_auto_mask(False)
         return {
             name: (variable.dimensions, np.asarray(variable[...]))
             for name, variable in file.variables.items()
-            if name not in NOT_VALUES
+            if name not in NOT_COMPARED
         }
 
 
-def assert_same_values(path, quiet_path):
-    """Every value of every variable is that of an undisturbed run, to the last bit."""
-    told, wanted = values(path), values(quiet_path)
-    assert told.keys() == wanted.keys()
-    for name, (dims, value) in wanted.items():
-        assert told[name][0] == dims, name
-        assert told[name][1].tobytes() == value.tobytes(), f"{path.name}: {name} differs"
+def assert_same_values(path, expected_path):
+    """Assert that every variable is bit-identical to that of an undisturbed run."""
+    actual, expected = values(path), values(expected_path)
+    assert actual.keys() == expected.keys()
+    for name, (dims, value) in expected.items():
+        assert actual[name][0] == dims, name
+        assert actual[name][1].tobytes() == value.tobytes(), f"{path.name}: {name} differs"
 
 
-def assert_sound(station, hours, quiet=None):
-    """Everything that arrived is stored once; the series is whole, in order, and as undisturbed."""
+def assert_store_intact(station, hours, undisturbed=None):
+    """Assert that every scan is stored once and that the series is complete and undisturbed."""
     rows = station.rows()
     for hour in hours:
-        row = rows[f"{stem(hour)}.laz"]
-        assert row.state is State.STORED, (row.name, row.state, row.reason, row.waits_for)
+        row = rows[f"{scan_name(hour)}.laz"]
+        assert row.state is State.STORED, (row.name, row.state, row.reason, row.waiting_reason)
     with netCDF4.Dataset(station.data / "series.nc") as file:
-        assert [str(name) for name in file["scan_id"][:]] == [stem(hour) for hour in sorted(hours)]
+        assert [str(name) for name in file["scan_id"][:]] == [scan_name(hour) for hour in sorted(hours)]
         assert np.all(np.diff(file["time"][:]) > 0)
         for name in ("elevation", "elevation_change"):
-            seen = np.isfinite(np.ma.filled(file[name][:], np.nan)).any(axis=(1, 2))
-            assert seen.all(), f"{name} of {np.flatnonzero(~seen)} is half written"
+            observed = np.isfinite(np.ma.filled(file[name][:], np.nan)).any(axis=(1, 2))
+            assert observed.all(), f"{name} of {np.flatnonzero(~observed)} is half written"
     assert_nothing_twice(station)
-    if quiet is not None:
-        for path in sorted(quiet.data.glob("*.nc")):
+    if undisturbed is not None:
+        for path in sorted(undisturbed.data.glob("*.nc")):
             assert_same_values(station.data / path.name, path)
-        assert {path.name for path in station.data.glob("*.nc")} == {p.name for p in quiet.data.glob("*.nc")}
+        assert {path.name for path in station.data.glob("*.nc")} == {
+            p.name for p in undisturbed.data.glob("*.nc")
+        }
     assert "a bug" not in station.log(), station.log()
 
 
 def assert_nothing_twice(station):
-    """No two epochs were made from the same bytes in the same way."""
-    made = []
+    """Assert that no two epochs have the same input bytes and settings."""
+    identities = []
     for path in sorted(station.data.glob("epochs/*/*/*/*.nc")):
         with netCDF4.Dataset(path) as file:
-            names = ("scan_id", "scan_sha256", "log_sha256", "reference_version", "science_hash", "lean_zero")
-            made.append(tuple(str(file[name][0]) for name in names))
-    assert len(set(made)) == len(made), made
+            names = (
+                "scan_id",
+                "scan_sha256",
+                "log_sha256",
+                "reference_version",
+                "science_hash",
+                "sop_tilt_offset",
+            )
+            identities.append(tuple(str(file[name][0]) for name in names))
+    assert len(set(identities)) == len(identities), identities

@@ -1,77 +1,81 @@
-"""Whoever is killed, whenever: no scan is lost, none doubled, and no value is another."""
+"""Kills of the service and its workers at any time: no scan lost or duplicated, no value changed."""
 
 from __future__ import annotations
 
 import harness
 import pytest
 
+pytestmark = pytest.mark.integration
+
 ALL = range(harness.SCANS)
 RANDOM_KILLS = 300
 HOLDS = "lost=0 doubled=0 wrong=0"
 
 
-def test_an_undisturbed_run_is_sound_and_crosses_boundaries(quiet):
-    station = quiet()
-    harness.assert_sound(station, ALL, station)
+def test_undisturbed_run_is_intact_and_crosses_write_boundaries(undisturbed):
+    station = undisturbed()
+    harness.assert_store_intact(station, ALL, station)
     assert station.step() > 200
 
 
-def live_through(station, quiet, plans, capsys, *, hours=ALL):
-    """Start the service, as often as it is killed, until it is through; then everything must hold."""
+def run_until_finished(station, undisturbed, plans, capsys, *, hours=ALL):
+    """Restart the service after each kill until all is processed; then check the invariants."""
     station.drop(*hours)
     for plan in plans:
         station.start(**plan)
-        station.await_(lambda: station.is_through(*hours) or not station.is_alive())
+        station.wait_until(lambda: station.is_finished(*hours) or not station.is_alive())
         if station.is_alive():
             station.end()
             break
     else:
         station.finish(*hours)
-    harness.assert_sound(station, hours, quiet)
+    harness.assert_store_intact(station, hours, undisturbed)
     with capsys.disabled():
         print(f"\n  trials=1 starts={station.starts} kills={station.kills} {HOLDS}")
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("whom", ["both", "child"])
-def test_a_death_at_every_write_boundary(make, quiet, capsys, whom):
-    """At each moment before and after a change of the disk someone dies, once; nobody dies there twice."""
-    station = make()
-    live_through(station, quiet(), [{"once": whom}] * 1000, capsys)
+@pytest.mark.parametrize("victim", ["both", "child"])
+def test_kill_at_every_write_boundary(make_station, undisturbed, capsys, victim):
+    """A process dies once before and once after each change on disk."""
+    station = make_station()
+    run_until_finished(station, undisturbed(), [{"once": victim}] * 1000, capsys)
     assert station.kills > 150
 
 
-def drawn(dice, *, kills, most=60):
-    """Draw moments to kill at, a boundary and a little later: the child so many times, then the service."""
+def draw_kills(rng, *, kills, max_spacing=60):
+    """Draw boundaries and delays of kills: `kills` of the worker process, then one of the service."""
     at, plan = 0, []
     for _ in range(kills):
-        at += dice.randrange(1, most)
-        plan.append([at, dice.choice([0.0, dice.uniform(0.0, 0.15)]), "child"])
-    plan.append([at + dice.randrange(1, most), dice.uniform(0.0, 0.15), dice.choice(["service", "both"])])
+        at += rng.randrange(1, max_spacing)
+        plan.append([at, rng.choice([0.0, rng.uniform(0.0, 0.15)]), "child"])
+    plan.append([at + rng.randrange(1, max_spacing), rng.uniform(0.0, 0.15), rng.choice(["service", "both"])])
     return {"kills": plan}
 
 
-def test_a_few_random_kills(make, quiet, dice, capsys):
-    live_through(make(), quiet(), [drawn(dice, kills=2) for _ in range(3)], capsys)
+def test_few_random_kills(make_station, undisturbed, rng, capsys):
+    run_until_finished(make_station(), undisturbed(), [draw_kills(rng, kills=2) for _ in range(3)], capsys)
 
 
 @pytest.mark.slow
-def test_three_hundred_random_kills(make, quiet, dice, capsys):
-    """Kills of the service by kills -9, and of its child, which decodes, publishes, joins."""
+def test_three_hundred_random_kills(make_station, undisturbed, rng, capsys):
+    """SIGKILL to the service and to its worker process, which decodes, publishes and compacts."""
     stations = []
     while sum(station.kills for station in stations) < RANDOM_KILLS:
         method = "joint" if len(stations) % 5 == 4 else "none"
-        station = make(method)
-        live_through(
-            station, quiet(method), [drawn(dice, kills=dice.randrange(3)) for _ in range(12)], capsys
+        station = make_station(method)
+        run_until_finished(
+            station, undisturbed(method), [draw_kills(rng, kills=rng.randrange(3)) for _ in range(12)], capsys
         )
         stations.append(station)
     with capsys.disabled():
-        kills, starts = (sum(getattr(one, name) for one in stations) for name in ("kills", "starts"))
+        kills, starts = (sum(getattr(station, name) for station in stations) for name in ("kills", "starts"))
         print(f"\n  trials={len(stations)} starts={starts} kills={kills} {HOLDS}")
 
 
 @pytest.mark.slow
-def test_kills_of_a_service_started_by_its_command(make, quiet, dice, capsys):
-    """The same without the shortcut of the other tests, which fork the service from a warm process."""
-    live_through(make(cold=True), quiet(), [drawn(dice, kills=2) for _ in range(5)], capsys)
+def test_kills_of_a_service_started_by_its_command(make_station, undisturbed, rng, capsys):
+    """As above; the service is started by its command, not forked from a warm process."""
+    run_until_finished(
+        make_station(cold=True), undisturbed(), [draw_kills(rng, kills=2) for _ in range(5)], capsys
+    )

@@ -1,7 +1,7 @@
-"""Start services without paying three seconds of imports for each: fork them from a process that has them.
+"""Start services without three seconds of imports each: fork them from a process that has imported all.
 
-What runs is the service's own code, in a process of its own, with a fork server of its own. A line of JSON on
-stdin ({"site", "log", "environment"}) starts one; the answer is its number. It ends with this process.
+Each service runs its own code in a separate process with a separate fork server. A line of JSON on stdin
+({"site", "log", "environment"}) starts one; the answer is its process id.
 """
 
 from __future__ import annotations
@@ -19,8 +19,8 @@ from pathlib import Path
 sys.path.insert(0, str(Path(__file__).with_name("hooks")))
 
 
-def be_service(order):
-    """Be `station run SITE` until it ends."""
+def run_service(order):
+    """Run `station run SITE` until it ends."""
     import boundaries
 
     signal.signal(signal.SIGCHLD, signal.SIG_DFL)
@@ -28,10 +28,10 @@ def be_service(order):
     os.setsid()
     log = os.open(order["log"], os.O_WRONLY | os.O_APPEND | os.O_CREAT, 0o666)
     nothing = os.open(os.devnull, os.O_RDWR)
-    for opened, at in ((nothing, 0), (nothing, 1), (log, 2)):
-        os.dup2(opened, at)
+    for opened, target in ((nothing, 0), (nothing, 1), (log, 2)):
+        os.dup2(opened, target)
     boundaries.install()
-    boundaries.hurry(order["period_s"])
+    boundaries.shorten_delays(order["period_s"])
     if order["clock"]:
         boundaries.set_clock(order["clock"])
     start_fork_server()
@@ -42,67 +42,67 @@ def be_service(order):
 
 
 def start_fork_server():
-    """Start the server of `station.service.child` by a fork too; nothing else of it is different."""
-    from station.service import child
+    """Start the fork server of `station.processing.isolation`, itself by a fork."""
+    from station.processing import isolation
 
     spawn = multiprocessing.util.spawnv_passfds
-    multiprocessing.util.spawnv_passfds = fork_instead
+    multiprocessing.util.spawnv_passfds = fork_server
     try:
-        child.prepare()
+        isolation.start_forkserver()
     finally:
         multiprocessing.util.spawnv_passfds = spawn
 
 
-def fork_instead(_, args, keep):
-    """Start what Python's own would start as `python -c 'from multiprocessing.forkserver import main…'`."""
+def fork_server(_, args, keep):
+    """Fork what Python starts as `python -c 'from multiprocessing.forkserver import main…'`."""
     command = args[-1] if isinstance(args[-1], str) else args[-1].decode()
     pid = os.fork()
     if pid:
         return pid
     status = 1
     try:
-        for number in [int(path.name) for path in Path("/proc/self/fd").iterdir()]:
-            if number > 2 and number not in keep:
+        for descriptor in [int(path.name) for path in Path("/proc/self/fd").iterdir()]:
+            if descriptor > 2 and descriptor not in keep:
                 try:
-                    os.close(number)
+                    os.close(descriptor)
                 except OSError:
                     continue
         multiprocessing.util._finalizer_registry.clear()
         forkserver._forkserver.__init__()
-        exec(command, {})  # noqa: S102 - what the new interpreter would have been given
+        exec(command, {})  # noqa: S102 - the command of the new interpreter
         status = 0
     finally:
         os._exit(status)
 
 
-def tell_fault():
-    """Write to the log why a service ended, also where no file of it may grow."""
-    _, most = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (most, most))
+def log_fault():
+    """Write to the log why a service ended, also under a limit of the file size."""
+    _, hard_limit = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (hard_limit, hard_limit))
     traceback.print_exc()
 
 
 def main():
-    """Take orders until there are no more."""
+    """Start services until stdin ends."""
     import laspy  # noqa: F401
 
     import station.cli
     import station.service.worker  # noqa: F401
 
-    signal.signal(signal.SIGCHLD, signal.SIG_IGN)  # nobody here waits for them
+    signal.signal(signal.SIGCHLD, signal.SIG_IGN)  # no child is waited for
     print("warm", flush=True)
     for line in sys.stdin:
         pid = os.fork()
         if not pid:
             status = 1
             try:
-                be_service(json.loads(line))
+                run_service(json.loads(line))
             except SystemExit as ended:
                 status = ended.code or 0
                 if status:
-                    tell_fault()
+                    log_fault()
             except BaseException:
-                tell_fault()
+                log_fault()
                 raise
             finally:
                 os._exit(status)

@@ -1,4 +1,4 @@
-"""A small store with a reference: change known cell by cell, names that a page must not take for markup."""
+"""A small archive with a reference: known change per cell, and names that look like markup."""
 
 import json
 import shutil
@@ -8,21 +8,21 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from station.archive import store
-from station.archive.aggregate import Aggregates
+from station.archive import epochs
 from station.archive.areas import update_areas
-from station.archive.layout import Series
-from station.archive.reference import write_reference
-from station.archive.series import build_series
+from station.archive.netcdf_layout import Series
+from station.archive.reference_files import write_reference
+from station.archive.series.virtual import build_series
 from station.config import read_site
 from station.quantities import Grid, Measurement, Quality, Reference
-from station.readers.polygons import mask, read_polygons
-from station.science.change import significant
+from station.queries.aggregates import Aggregates
+from station.readers.polygons import cells_inside, read_polygons
+from station.science.gridding.significance import significant
 
 GRID = Grid(west_m=632_000.0, north_m=5_186_000.0, cell_m=10.0, nx=60, ny=45)
 START_S = 1_763_683_200.0  # 2025-11-21 00:00 UTC
 EVIL = "<img src=x onerror=alert(1)>"
-RISE, FALL, UNSEEN = np.s_[5:15, 5:20], np.s_[20:35, 30:50], np.s_[38:42, 10:50]
+RISE, FALL, UNOBSERVED = np.s_[5:15, 5:20], np.s_[20:35, 30:50], np.s_[38:42, 10:50]
 SITE = """
 [station]
 id = "hef"
@@ -51,22 +51,22 @@ def box(name, west, south, east, north):
 
 
 def make_epoch(hour, *, grid=GRID, scan_id=None, reference="1"):
-    """It rises by 5 cm an hour in one place, falls in another, is still with noise in the rest."""
+    """An epoch: rises by 5 cm per hour in one box, falls in another, noise elsewhere."""
     rng = np.random.default_rng(hour)
     random_m = rng.uniform(0.01, 0.03, grid.shape)
     change_m = random_m * rng.normal(size=grid.shape)
     change_m[RISE] += 0.05 * (hour + 1)
     change_m[FALL] -= 0.05 * (hour + 1)
-    seen = rng.uniform(size=grid.shape) < 0.95
-    seen[UNSEEN] = False
-    seen[:, -5:] = False
-    change_m = np.where(seen, change_m, np.nan).astype(np.float32)
-    random_m = np.where(seen, random_m, np.nan).astype(np.float32)
+    observed = rng.uniform(size=grid.shape) < 0.95
+    observed[UNOBSERVED] = False
+    observed[:, -5:] = False
+    change_m = np.where(observed, change_m, np.nan).astype(np.float32)
+    random_m = np.where(observed, random_m, np.nan).astype(np.float32)
     sigma_m = np.hypot(random_m, np.float32(0.01))
-    count = np.where(seen, 4, 0).astype(np.int32)
+    count = np.where(observed, 4, 0).astype(np.int32)
     quality = np.where(significant(change_m, sigma_m), Quality.CHANGE_SIGNIFICANT, 0).astype(np.uint8)
-    elevation_m = np.where(seen, 2800.0, np.nan)
-    measured = Measurement.of(
+    elevation_m = np.where(observed, 2800.0, np.nan)
+    measurement = Measurement.from_rasters(
         grid,
         quality,
         elevation_m=elevation_m,
@@ -76,15 +76,15 @@ def make_epoch(hour, *, grid=GRID, scan_id=None, reference="1"):
         spread_m=random_m,
         count=count,
     )
-    return store.Epoch(
+    return epochs.Epoch(
         start_s=START_S + 3600 * hour,
         end_s=START_S + 3600 * hour + 900,
         scan_id=scan_id or f"251121_{hour % 24:02d}0000",
-        measurement=measured,
+        measurement=measurement,
         shared=None,
         verdict="good" if hour % 2 else "degraded",
         verdict_reason="" if hour % 2 else f"no weather {EVIL}",
-        numbers={
+        scalars={
             "platform_roll": 0.1 + hour / 100, "platform_pitch": -0.2, "air_temperature": -3.5,
             "coverage": 0.8, "air_pressure": 690.0, "point_total": 1234.0,
             "stable_median": 0.001, "stable_nmad": 0.02,
@@ -97,9 +97,9 @@ def make_epoch(hour, *, grid=GRID, scan_id=None, reference="1"):
 def make_reference(grid=GRID, version="1"):
     row, column = np.indices(grid.shape)
     elevation_m = 2800 + 2.0 * row + 20 * np.sin(column / 6)
-    elevation_m[:, -2:] = np.nan  # nobody knows this border
+    elevation_m[:, -2:] = np.nan  # without elevation
     return replace(
-        Reference.given(grid, version, elevation_m),
+        Reference.from_elevation(grid, version, elevation_m),
         random_variance_m2=np.where(np.isfinite(elevation_m), np.float32(0.005**2), np.float32(np.nan)),
     )
 
@@ -107,15 +107,18 @@ def make_reference(grid=GRID, version="1"):
 def fill(series, site, hours):
     for hour in hours:
         scan_id = EVIL if hour == 3 else None
-        store.write_epoch(series, make_epoch(hour, scan_id=scan_id))
+        epochs.write_epoch(series, make_epoch(hour, scan_id=scan_id))
     build_series(series)
-    areas = {name: mask(one, GRID) for name, one in read_polygons(site.areas.file, site.map.crs).items()}
+    areas = {
+        name: cells_inside(polygon, GRID)
+        for name, polygon in read_polygons(site.areas.file, site.map.crs).items()
+    }
     update_areas(series, areas, Aggregates(series), lambda: None)
 
 
 @pytest.fixture(scope="session")
 def stored(tmp_path_factory):
-    """A folder with a site file and six epochs in its store."""
+    """A folder with a site file and an archive of six epochs."""
     folder = tmp_path_factory.mktemp("stored")
     (folder / "inbox").mkdir()
     (folder / "site.toml").write_text(SITE.format(evil=EVIL))
@@ -130,7 +133,7 @@ def stored(tmp_path_factory):
 
 @pytest.fixture
 def site(stored, tmp_path):
-    """A site of its own."""
+    """A site with a private copy of the archive."""
     shutil.copytree(stored, tmp_path, dirs_exist_ok=True)
     return read_site(tmp_path / "site.toml")
 
@@ -142,8 +145,8 @@ def series(site):
 
 @pytest.fixture
 def small():
-    """What the store was made of and by."""
+    """The constants and functions that the archive was built with."""
     return SimpleNamespace(
-        GRID=GRID, EVIL=EVIL, RISE=RISE, FALL=FALL, UNSEEN=UNSEEN, START_S=START_S,
+        GRID=GRID, EVIL=EVIL, RISE=RISE, FALL=FALL, UNOBSERVED=UNOBSERVED, START_S=START_S,
         make_epoch=make_epoch, make_reference=make_reference, fill=fill, box=box,
     )  # fmt: skip

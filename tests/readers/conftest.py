@@ -1,4 +1,4 @@
-"""Scans to read, written by laspy."""
+"""LAS and LAZ scans for the tests of the readers, written with laspy."""
 
 import laspy
 import numpy as np
@@ -9,15 +9,15 @@ RANGE_M = 900.0
 
 
 def sweep(count, seed=0, first_s=40.0, rate_hz=2000.0):
-    """Echoes of a head that turns: x, y, z (3, n) [m] and their times (n,) [s]; azimuth 0.1 rad/s · time."""
+    """Echoes x, y, z (3, n) [m] of a rotating head and their times (n,) [s]; azimuth = 0.1 rad/s · time."""
     random = np.random.default_rng(seed)
     time_s = first_s + np.arange(count) / rate_hz
     azimuth_rad = TURN_RAD_S * time_s
     polar_rad = np.radians(60 + 60 * ((np.arange(count) % 333) / 333))
     range_m = random.uniform(200.0, RANGE_M, count)
-    flat_m = range_m * np.sin(polar_rad)
+    horizontal_m = range_m * np.sin(polar_rad)
     points_m = np.stack(
-        [flat_m * np.cos(azimuth_rad), flat_m * np.sin(azimuth_rad), range_m * np.cos(polar_rad)]
+        [horizontal_m * np.cos(azimuth_rad), horizontal_m * np.sin(azimuth_rad), range_m * np.cos(polar_rad)]
     )
     return points_m, time_s
 
@@ -44,11 +44,11 @@ def write_scan(tmp_path):
 
 
 @pytest.fixture
-def a_sweep(write_scan):
-    """Return a function that writes `count` echoes of a turning head."""
+def write_sweep(write_scan):
+    """Return a function that writes `count` echoes of a rotating head and returns the path."""
 
-    def write(name, count, **how):
+    def write(name, count, **options):
         points_m, time_s = sweep(count)
-        return write_scan(name, points_m, time_s, **how)
+        return write_scan(name, points_m, time_s, **options)
 
     return write

@@ -1,9 +1,9 @@
-"""Bad intervals noted by a person, in a file that may be half written."""
+"""Flags: intervals marked as unusable by a person, in a file that may be incomplete."""
 
 import pytest
 
 from station.errors import ConfigError
-from station.readers.flags import flag_on, read_flags
+from station.readers.flags import read_flags, reasons_for
 
 HOUR_S = 3600.0
 NOON_S = 1_767_268_800.0  # 2026-01-01 12:00 UTC
@@ -19,30 +19,30 @@ def flags(tmp_path):
     return write
 
 
-def test_times_are_utc_unless_a_zone_is_written(flags):
-    found = flags(
+def test_times_are_utc_unless_a_zone_is_given(flags):
+    rows = flags(
         'from,to,reason\n2026-01-01T12:00,2026-01-01T13:00:00Z,"rime, on the window"\n\n'
         "# a remark\n2026-01-01T14:00+01:00,2026-01-01T14:30+01:00,crane\n"
     )  # fmt: skip
-    assert [(one.from_utc_s - NOON_S, one.to_utc_s - NOON_S) for one in found] == [
+    assert [(flag.from_utc_s - NOON_S, flag.to_utc_s - NOON_S) for flag in rows] == [
         (0, HOUR_S),
         (HOUR_S, 1.5 * HOUR_S),
     ]
-    assert [one.reason for one in found] == ["rime, on the window", "crane"]
+    assert [flag.reason for flag in rows] == ["rime, on the window", "crane"]
 
 
-def test_a_scan_is_flagged_where_it_overlaps(flags):
-    found = flags(
+def test_scan_is_flagged_if_it_overlaps_an_interval(flags):
+    rows = flags(
         "from,to,reason\n2026-01-01 12:00,2026-01-01 13:00,rime\n2026-01-01 12:30,2026-01-01 14:00,crane\n"
     )
-    assert flag_on(found, NOON_S - 900, NOON_S - 1) == ""
-    assert flag_on(found, NOON_S - 900, NOON_S) == "rime"
-    assert flag_on(found, NOON_S + 2000, NOON_S + 2900) == "rime; crane"
-    assert flag_on(found, NOON_S + HOUR_S + 1, NOON_S + HOUR_S + 2) == "crane"
+    assert reasons_for(rows, NOON_S - 900, NOON_S - 1) == ""
+    assert reasons_for(rows, NOON_S - 900, NOON_S) == "rime"
+    assert reasons_for(rows, NOON_S + 2000, NOON_S + 2900) == "rime; crane"
+    assert reasons_for(rows, NOON_S + HOUR_S + 1, NOON_S + HOUR_S + 2) == "crane"
 
 
 @pytest.mark.parametrize(
-    ("row", "says"),
+    ("row", "message"),
     [
         ("2026-01-01,2026-13-01,rime", "line 2"),
         ("2026-01-02,2026-01-01,rime", "ends before it begins"),
@@ -50,18 +50,18 @@ def test_a_scan_is_flagged_where_it_overlaps(flags):
         ("2026-01-01,2026-01-02", "not a row from,to,reason"),
     ],
 )
-def test_a_row_that_is_none_is_named(flags, row, says):
-    with pytest.raises(ConfigError, match=says):
+def test_invalid_row_is_rejected(flags, row, message):
+    with pytest.raises(ConfigError, match=message):
         flags(f"from,to,reason\n{row}\n")
 
 
-def test_a_last_row_still_being_written_is_left_out_and_a_whole_one_is_not(flags):
-    whole = "from,to,reason\n2026-01-01,2026-01-02,rime\n"
-    assert len(flags(whole + "2026-02-01,2026-0")) == 1
-    assert len(flags(whole + "2026-02-01,2026-02-02,crane")) == 2
+def test_incomplete_last_row_is_ignored(flags):
+    complete = "from,to,reason\n2026-01-01,2026-01-02,rime\n"
+    assert len(flags(complete + "2026-02-01,2026-0")) == 1
+    assert len(flags(complete + "2026-02-01,2026-02-02,crane")) == 2
 
 
-def test_another_table_is_no_list_of_flags(flags):
+def test_other_columns_are_rejected(flags):
     with pytest.raises(ConfigError, match="must begin with"):
         flags("begin,end,why\n")
     assert flags("") == []

@@ -1,4 +1,4 @@
-"""Polygons on the map: areas against plane geometry, and files that are not what they should be."""
+"""Polygons from GeoJSON: cell masks compared with plane geometry, and invalid files."""
 
 import json
 import math
@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from station.errors import ConfigError
 from station.quantities import Grid
-from station.readers.polygons import mask, read_polygons
+from station.readers.polygons import cells_inside, read_polygons
 
 CRS = "EPSG:32632"
 EAST, NORTH = 632000.0, 5186000.0
@@ -19,9 +19,9 @@ GRID = Grid(EAST, NORTH, 1.0, 500, 400)
 
 
 def ring(*corners):
-    """A closed outline of corners (east, south) of the grid's north-west corner."""
-    placed = [[EAST + east, NORTH - south] for east, south in corners]
-    return [*placed, placed[0]]
+    """A closed ring of corners (east, south) relative to the north-west corner of the grid [m]."""
+    vertices = [[EAST + east, NORTH - south] for east, south in corners]
+    return [*vertices, vertices[0]]
 
 
 def square(west, north, size):
@@ -32,12 +32,12 @@ def polygon(*rings):
     return {"type": "Polygon", "coordinates": list(rings)}
 
 
-def feature(geometry, **told):
-    return {"type": "Feature", "properties": {}, "geometry": geometry} | told
+def feature(geometry, **members):
+    return {"type": "Feature", "properties": {}, "geometry": geometry} | members
 
 
-def collection(*features, **told):
-    return {"type": "FeatureCollection", "features": list(features)} | told
+def collection(*features, **members):
+    return {"type": "FeatureCollection", "features": list(features)} | members
 
 
 @pytest.fixture
@@ -51,7 +51,7 @@ def read(tmp_path):
 
 
 def test_names_and_order(read):
-    found = read(
+    polygons = read(
         collection(
             feature(polygon(square(0, 0, 10)), properties={"name": "Süd ", "id": 5}),
             feature(polygon(square(20, 0, 10)), properties={"name": None, "id": 7}),
@@ -59,27 +59,29 @@ def test_names_and_order(read):
             feature(polygon(square(60, 0, 10)), properties={"name": ""}),
         )
     )
-    assert list(found) == ["Süd", "7", "gate", "area_4"]
-    assert [geometry.area for geometry in found.values()] == [100.0] * 4
+    assert list(polygons) == ["Süd", "7", "gate", "area_4"]
+    assert [geometry.area for geometry in polygons.values()] == [100.0] * 4
 
 
-@pytest.mark.parametrize("wrap", [lambda one: one, feature, lambda one: collection(feature(one))])
+@pytest.mark.parametrize(
+    "wrap", [lambda geometry: geometry, feature, lambda geometry: collection(feature(geometry))]
+)
 def test_geometry_feature_and_collection(read, wrap):
     assert read(wrap(polygon(square(0, 0, 10))))["area_1"].area == 100.0
 
 
-def test_heights_and_a_byte_order_mark_do_no_harm(read):
+def test_heights_and_byte_order_mark_are_ignored(read):
     outline = [[*corner, 2800.0] for corner in square(0, 0, 10)]
     assert not read("\ufeff" + json.dumps(polygon(outline)))["area_1"].has_z
 
 
-def test_the_map_by_another_of_its_names(read):
+def test_equivalent_names_of_the_crs(read):
     named = {"type": "name", "properties": {"name": "urn:ogc:def:crs:EPSG::32632"}}
     assert read(collection(feature(polygon(square(0, 0, 10))), crs=named), "EPSG:32632+3855")
     assert read(collection(feature(polygon(square(0, 0, 10))), crs=None))
 
 
-def test_small_coordinates_are_no_degrees_where_there_is_no_map(read):
+def test_small_coordinates_without_a_crs_are_metres(read):
     local = {"type": "Polygon", "coordinates": [[[0, 0], [50, 0], [50, 50], [0, 0]]]}
     assert read(local, None)["area_1"].area == 1250.0
 
@@ -92,23 +94,23 @@ GOOD = feature(polygon(square(0, 0, 10)), properties={"name": "gate"})
 
 
 @pytest.mark.parametrize(
-    ("content", "says"),
+    ("content", "message"),
     [
         ("{", "areas.geojson: not valid GeoJSON"),
-        ("[]", "an object is missing"),
+        ("[]", "the top level is not an object"),
         ({"type": "Topology"}, "its type is 'Topology'"),
-        ({"type": "FeatureCollection"}, "is no GeoJSON of polygons"),
-        (collection(), "holds no feature"),
-        (collection(5), "feature 1: is none"),
+        ({"type": "FeatureCollection"}, "is not a GeoJSON of polygons"),
+        (collection(), "contains no feature"),
+        (collection(5), "feature 1: is not a GeoJSON feature"),
         (collection(GOOD, feature(None)), r"feature 2 \(area_2\): is without geometry"),
-        (collection(feature({"type": "Point", "coordinates": [1, 2]})), "is Point; wanted are Polygon and"),
+        (collection(feature({"type": "Point", "coordinates": [1, 2]})), "is Point; expected Polygon or"),
         (collection(feature({"type": "GeometryCollection", "geometries": []})), "is GeometryCollection"),
-        (feature(polygon()), "has no corners"),
+        (feature(polygon()), "has no vertices"),
         (feature({"type": "Polygon"}), r"feature 1 \(area_1\): is damaged"),
         (feature(polygon([[EAST, NORTH], ["a", 1], [2, 2], [EAST, NORTH]])), "is damaged"),
         (feature(polygon([[EAST, NORTH], [math.nan, 1], [2, 2], [EAST, NORTH]])), "is damaged"),
         (feature(polygon(square(0, 0, 10)[:-1])), "do not form a closed"),
-        (feature(BOW_TIE, id="bow"), r"feature 1 \(bow\): Self-intersection.*mend its outline"),
+        (feature(BOW_TIE, id="bow"), r"feature 1 \(bow\): Self-intersection.*repair its outline"),
         (collection(GOOD, GOOD), r"feature 2 \(gate\): another feature has this name"),
         (collection(GOOD, feature(DEGREES)), r"feature 2 .*degrees.*ogr2ogr -t_srs EPSG:32632"),
         (collection(GOOD, crs=ZONE_33), "is in WGS 84 / UTM zone 33N, map.crs is EPSG:32632.*ogr2ogr"),
@@ -117,12 +119,12 @@ GOOD = feature(polygon(square(0, 0, 10)), properties={"name": "gate"})
         (collection(GOOD, crs="nowhere"), "not understood"),
     ],
 )
-def test_faults_say_where_and_what(read, content, says):
-    with pytest.raises(ConfigError, match=says):
+def test_invalid_files_are_explained(read, content, message):
+    with pytest.raises(ConfigError, match=message):
         read(content)
 
 
-def test_a_file_that_is_no_text_or_not_there(tmp_path):
+def test_binary_and_missing_files(tmp_path):
     (tmp_path / "photo.geojson").write_bytes(b"\xff\xd8\xff\xe0")
     with pytest.raises(ConfigError, match="not valid GeoJSON"):
         read_polygons(tmp_path / "photo.geojson", CRS)
@@ -130,36 +132,36 @@ def test_a_file_that_is_no_text_or_not_there(tmp_path):
         read_polygons(tmp_path / "none.geojson", CRS)
 
 
-def test_square_is_exact_and_in_its_place():
-    inside = mask(shapely.Polygon(square(100, 50, 30)), GRID)
+def test_square():
+    inside = cells_inside(shapely.Polygon(square(100, 50, 30)), GRID)
     assert inside.sum() == 900
     assert inside[50:80, 100:130].all()
 
 
-def test_circle_with_a_hole():
-    """A ring of 150 m and 60 m has π (150² − 60²) m² of area."""
-    middle = shapely.Point(EAST + 250, NORTH - 200)
-    ring_shaped = middle.buffer(150, quad_segs=500) - middle.buffer(60, quad_segs=500)
-    assert mask(ring_shaped, GRID).sum() == pytest.approx(math.pi * (150**2 - 60**2), rel=2e-3)
+def test_ring():
+    """The area of a ring of radii 150 m and 60 m is π (150² − 60²) m²."""
+    centre = shapely.Point(EAST + 250, NORTH - 200)
+    ring_shaped = centre.buffer(150, quad_segs=500) - centre.buffer(60, quad_segs=500)
+    assert cells_inside(ring_shaped, GRID).sum() == pytest.approx(math.pi * (150**2 - 60**2), rel=2e-3)
 
 
-def test_parts_that_lie_apart_and_across_the_edge():
+def test_multipolygon_across_the_edge_of_the_grid():
     parts = shapely.MultiPolygon(
         [shapely.Polygon(square(-10, -10, 30)), shapely.Polygon(square(490, 390, 50))]
     )
-    inside = mask(parts, GRID)
+    inside = cells_inside(parts, GRID)
     assert inside[:20, :20].all()
     assert inside[390:, 490:].all()
     assert inside.sum() == 20 * 20 + 10 * 10
 
 
-def test_beside_the_grid_and_between_two_centres_is_nothing():
-    assert not mask(shapely.Polygon(square(600, 0, 50)), GRID).any()
-    assert not mask(shapely.Polygon(square(10.6, 10.6, 0.8)), GRID).any()
+def test_polygons_that_contain_no_cell_centre():
+    assert not cells_inside(shapely.Polygon(square(600, 0, 50)), GRID).any()
+    assert not cells_inside(shapely.Polygon(square(10.6, 10.6, 0.8)), GRID).any()
 
 
-def crossings(corners, x_m, y_m):
-    """Whether each point has an odd number of edges to its east."""
+def is_inside_by_crossings(corners, x_m, y_m):
+    """Return True for points with an odd number of edges to their east."""
     odd = np.zeros(np.broadcast(x_m, y_m).shape, bool)
     for (x0, y0), (x1, y1) in zip(corners, np.roll(corners, -1, axis=0), strict=True):
         if y0 != y1:
@@ -168,11 +170,11 @@ def crossings(corners, x_m, y_m):
 
 
 @given(st.lists(st.floats(0.05, 1.6), min_size=3, max_size=25), st.floats(0.001, 0.999))
-def test_stars_by_counting_edges(radii, shift):
+def test_random_stars_equal_the_crossing_number(radii, shift):
     angle = np.linspace(0, 2 * np.pi, len(radii), endpoint=False) + shift
     radius_m = 150 * np.array(radii)
     corners = np.stack(
         [EAST + 250 + shift + radius_m * np.cos(angle), NORTH - 200 + radius_m * np.sin(angle)], axis=-1
     )
-    expected = crossings(corners, GRID.x_m[None, :], GRID.y_m[:, None])
-    assert (mask(shapely.Polygon(corners), GRID) == expected).all()
+    expected = is_inside_by_crossings(corners, GRID.x_m[None, :], GRID.y_m[:, None])
+    assert (cells_inside(shapely.Polygon(corners), GRID) == expected).all()

@@ -1,4 +1,4 @@
-"""A given master surface, cell by cell."""
+"""Reference surfaces from GeoTIFF."""
 
 import sys
 import warnings
@@ -15,8 +15,8 @@ CRS = "EPSG:32632"
 rasterio = pytest.importorskip("rasterio")
 
 
-def written(tmp_path, elevation, west=GRID.west_m, north=GRID.north_m, cell=2.0, **how):
-    path = tmp_path / "master.tif"
+def write_tif(tmp_path, elevation, west=GRID.west_m, north=GRID.north_m, cell=2.0, **options):
+    path = tmp_path / "reference.tif"
     profile = {
         "driver": "GTiff",
         "height": elevation.shape[-2],
@@ -25,10 +25,10 @@ def written(tmp_path, elevation, west=GRID.west_m, north=GRID.north_m, cell=2.0,
         "dtype": elevation.dtype,
         "crs": CRS,
         "transform": rasterio.Affine(cell, 0.0, west, 0.0, -cell, north),
-        **how,
+        **options,
     }
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # written without a place on purpose
+        warnings.simplefilter("ignore")  # about the missing georeference
         tif = rasterio.open(path, "w", **profile)
     with tif:
         tif.write(elevation if elevation.ndim == 3 else elevation[None])
@@ -40,99 +40,99 @@ def hills(shape):
 
 
 @pytest.mark.parametrize("compress", ["deflate", "lzw", None])
-def test_a_raster_on_the_grid_is_read_as_it_is(tmp_path, compress):
-    given = hills(GRID.shape)
+def test_raster_on_the_grid(tmp_path, compress):
+    expected = hills(GRID.shape)
     read = read_geotiff(
-        written(tmp_path, given, compress=compress, predictor=3 if compress else 1), GRID, CRS
+        write_tif(tmp_path, expected, compress=compress, predictor=3 if compress else 1), GRID, CRS
     )
     assert read.dtype == np.float64
-    assert np.array_equal(read, given)
+    assert np.array_equal(read, expected)
 
 
-def test_a_larger_raster_is_cut_and_a_smaller_one_framed(tmp_path):
-    given = hills((50, 60))
-    larger = read_geotiff(written(tmp_path, given, GRID.west_m - 10, GRID.north_m + 6), GRID, CRS)
-    assert np.array_equal(larger, given[3:33, 5:45])
-    given = hills((10, 12))
-    smaller = read_geotiff(written(tmp_path, given, GRID.west_m + 20, GRID.north_m - 4), GRID, CRS)
-    assert np.array_equal(smaller[2:12, 10:22], given)
+def test_larger_raster_is_cropped_and_smaller_one_padded(tmp_path):
+    expected = hills((50, 60))
+    larger = read_geotiff(write_tif(tmp_path, expected, GRID.west_m - 10, GRID.north_m + 6), GRID, CRS)
+    assert np.array_equal(larger, expected[3:33, 5:45])
+    expected = hills((10, 12))
+    smaller = read_geotiff(write_tif(tmp_path, expected, GRID.west_m + 20, GRID.north_m - 4), GRID, CRS)
+    assert np.array_equal(smaller[2:12, 10:22], expected)
     assert np.isfinite(smaller).sum() == 120
 
 
-def test_a_raster_across_the_corner_fills_the_corner(tmp_path):
-    given = hills((20, 20))
-    read = read_geotiff(written(tmp_path, given, GRID.west_m - 20, GRID.north_m + 20), GRID, CRS)
-    assert np.array_equal(read[:10, :10], given[10:, 10:])
+def test_raster_that_overlaps_a_corner(tmp_path):
+    expected = hills((20, 20))
+    read = read_geotiff(write_tif(tmp_path, expected, GRID.west_m - 20, GRID.north_m + 20), GRID, CRS)
+    assert np.array_equal(read[:10, :10], expected[10:, 10:])
     assert np.isfinite(read).sum() == 100
 
 
-def test_nodata_is_unknown(tmp_path):
-    given = hills(GRID.shape)
-    given[3, 4], given[5, 6] = -9999, np.nan
-    read = read_geotiff(written(tmp_path, given, nodata=-9999), GRID, CRS)
+def test_nodata_becomes_nan(tmp_path):
+    expected = hills(GRID.shape)
+    expected[3, 4], expected[5, 6] = -9999, np.nan
+    read = read_geotiff(write_tif(tmp_path, expected, nodata=-9999), GRID, CRS)
     assert np.argwhere(np.isnan(read)).tolist() == [[3, 4], [5, 6]]
 
 
-def test_whole_numbers_are_elevations_too(tmp_path):
-    given = np.full(GRID.shape, 2500, dtype=np.int16)
-    given[0, 0] = -32768
-    read = read_geotiff(written(tmp_path, given, nodata=-32768), GRID, CRS)
+def test_integer_elevations(tmp_path):
+    expected = np.full(GRID.shape, 2500, dtype=np.int16)
+    expected[0, 0] = -32768
+    read = read_geotiff(write_tif(tmp_path, expected, nodata=-32768), GRID, CRS)
     assert np.isnan(read[0, 0])
     assert read[1, 1] == 2500
 
 
 @pytest.mark.parametrize(
-    ("how", "reason"),
+    ("options", "reason"),
     [
-        ({"west": GRID.west_m + 0.5}, "0.250 of a cell beside"),
-        ({"north": GRID.north_m - 1}, "0.500 of a cell beside"),
+        ({"west": GRID.west_m + 0.5}, "0.250 of a cell off"),
+        ({"north": GRID.north_m - 1}, "0.500 of a cell off"),
         ({"cell": 1.0}, r"cells of 1 × 1 m, grid.cell_m is 2"),
         ({"west": GRID.west_m + 5000}, "does not overlap"),
         ({"crs": "EPSG:32633"}, "is in WGS 84 / UTM zone 33N, map.crs is WGS 84 / UTM zone 32N"),
-        ({"crs": None}, "names no CRS"),
+        ({"crs": None}, "declares no CRS"),
         ({"transform": None}, "not georeferenced"),
     ],
 )
-def test_what_does_not_fit_is_said(tmp_path, how, reason):
+def test_mismatch_with_the_grid_is_rejected(tmp_path, options, reason):
     with pytest.raises(ConfigError, match=reason):
-        read_geotiff(written(tmp_path, hills(GRID.shape), **how), GRID, CRS)
+        read_geotiff(write_tif(tmp_path, hills(GRID.shape), **options), GRID, CRS)
 
 
-def test_a_turned_raster_is_refused(tmp_path):
+def test_rotated_raster_is_rejected(tmp_path):
     transform = rasterio.Affine(2.0, 0.1, GRID.west_m, 0.1, -2.0, GRID.north_m)
-    with pytest.raises(ConfigError, match="not north up"):
-        read_geotiff(written(tmp_path, hills(GRID.shape), transform=transform), GRID, CRS)
+    with pytest.raises(ConfigError, match="not north-up"):
+        read_geotiff(write_tif(tmp_path, hills(GRID.shape), transform=transform), GRID, CRS)
 
 
-def test_undeclared_nodata_is_no_elevation(tmp_path):
-    given = hills(GRID.shape)
-    given[3, 4] = -9999
+def test_undeclared_nodata_is_rejected(tmp_path):
+    expected = hills(GRID.shape)
+    expected[3, 4] = -9999
     with pytest.raises(ConfigError, match="nodata value is not declared"):
-        read_geotiff(written(tmp_path, given), GRID, CRS)
+        read_geotiff(write_tif(tmp_path, expected), GRID, CRS)
 
 
-def test_more_bands_are_no_elevation(tmp_path):
+def test_several_bands_are_rejected(tmp_path):
     with pytest.raises(ConfigError, match="has 3 bands"):
-        read_geotiff(written(tmp_path, hills((3, *GRID.shape))), GRID, CRS)
+        read_geotiff(write_tif(tmp_path, hills((3, *GRID.shape))), GRID, CRS)
 
 
-def test_heights_in_a_compound_crs_are_on_the_same_map(tmp_path):
-    given = hills(GRID.shape)
-    assert np.array_equal(read_geotiff(written(tmp_path, given), GRID, "EPSG:32632+5773"), given)
+def test_compound_crs_is_on_the_same_map(tmp_path):
+    expected = hills(GRID.shape)
+    assert np.array_equal(read_geotiff(write_tif(tmp_path, expected), GRID, "EPSG:32632+5773"), expected)
 
 
-def test_what_is_no_tiff_is_said(tmp_path):
-    (tmp_path / "master.tif").write_text("no")
+def test_invalid_file_is_rejected(tmp_path):
+    (tmp_path / "reference.tif").write_text("no")
     with pytest.raises(ConfigError, match="cannot be read"):
-        read_geotiff(tmp_path / "master.tif", GRID, CRS)
+        read_geotiff(tmp_path / "reference.tif", GRID, CRS)
 
 
-def test_real_terrain_by_degrees_is_refused_for_a_map_grid(shared_data):
+def test_geographic_raster_is_rejected_for_a_map_grid(shared_data):
     with pytest.raises(ConfigError, match="WGS 84"):
         read_geotiff(shared_data / "hef_terrain/hef_srtm.tif", GRID, CRS)
 
 
-def test_without_the_extra_it_says_how_to_get_it(tmp_path, monkeypatch):
+def test_missing_rasterio_is_explained(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "rasterio", None)
     with pytest.raises(ConfigError, match=r"pip install 'tls-station\[geotiff\]'"):
-        read_geotiff(tmp_path / "master.tif", GRID, CRS)
+        read_geotiff(tmp_path / "reference.tif", GRID, CRS)

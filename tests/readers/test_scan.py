@@ -1,4 +1,4 @@
-"""Which reader, and when a scan was made."""
+"""Choice of the reader by suffix, and the start time and time base of a scan."""
 
 import logging
 from datetime import UTC, datetime, timedelta
@@ -10,18 +10,18 @@ import pytest
 from station.errors import NotReadyError, ScanError
 from station.readers import scan
 from station.readers.scan import (
-    TimeKind,
+    TimeBase,
+    detect_time_base,
     gps_seconds,
     gps_to_utc,
     open_scan,
-    require_begun,
-    time_kind,
+    reject_future,
     utc_interval,
 )
 
 NAMED = "%y%m%d_%H%M%S"
 START = datetime(2024, 10, 1, 12, 0, 0, tzinfo=UTC)
-# worked out by date(1) and the 18 s of IERS Bulletin C: 1727784000 - 315964800 + 18
+# from date(1) and the 18 s of IERS Bulletin C: 1727784000 - 315964800 + 18
 START_GPS_S = 1_411_819_218.0
 START_WEEK_S = 216_018.0  # a Tuesday noon: 2.5 days and the leap seconds
 START_STANDARD_S = 411_819_218.0
@@ -36,12 +36,12 @@ START_STANDARD_S = 411_819_218.0
         (datetime(2017, 1, 1, tzinfo=UTC), 1_167_264_018.0),
     ],
 )
-def test_gps_time_counts_leap_seconds(when, gps_s):
+def test_gps_time_includes_leap_seconds(when, gps_s):
     assert gps_seconds(when) == gps_s
     assert gps_to_utc(gps_s) == when
 
 
-def test_no_date_before_there_were_scanners():
+def test_implausible_dates_are_rejected():
     with pytest.raises(ScanError, match="check the clocks"):
         gps_seconds(datetime(1990, 1, 1, tzinfo=UTC))
     with pytest.raises(ScanError, match="corrupt"):
@@ -49,70 +49,72 @@ def test_no_date_before_there_were_scanners():
 
 
 @pytest.mark.parametrize(
-    ("first_s", "start", "standard", "kind"),
+    ("first_s", "start", "standard", "expected"),
     [
-        (0.0, START, False, TimeKind.SCANNER),
-        (91.8, START, False, TimeKind.SCANNER),
-        (91.8, START, True, TimeKind.SCANNER),  # the flag of many writers, whatever they write
-        (91.8, None, True, TimeKind.SCANNER),
-        (START_WEEK_S + 3, START, False, TimeKind.WEEK),
-        (START_WEEK_S + 3, START, True, TimeKind.WEEK),
-        (START_WEEK_S - 86_400, START, False, TimeKind.SCANNER),
-        (START_STANDARD_S + 3, START, True, TimeKind.STANDARD),
-        (START_STANDARD_S + 3, START, False, TimeKind.STANDARD),
-        (START_STANDARD_S + 3, None, False, TimeKind.STANDARD),
-        (START_STANDARD_S - 30 * 86_400, START, False, TimeKind.STANDARD),  # clocks a month apart
-        (-2e7, None, True, TimeKind.STANDARD),  # before September 2011
+        (0.0, START, False, TimeBase.SCANNER),
+        (91.8, START, False, TimeBase.SCANNER),
+        (91.8, START, True, TimeBase.SCANNER),  # many writers set this flag regardless of the time base
+        (91.8, None, True, TimeBase.SCANNER),
+        (START_WEEK_S + 3, START, False, TimeBase.WEEK),
+        (START_WEEK_S + 3, START, True, TimeBase.WEEK),
+        (START_WEEK_S - 86_400, START, False, TimeBase.SCANNER),
+        (START_STANDARD_S + 3, START, True, TimeBase.STANDARD),
+        (START_STANDARD_S + 3, START, False, TimeBase.STANDARD),
+        (START_STANDARD_S + 3, None, False, TimeBase.STANDARD),
+        (START_STANDARD_S - 30 * 86_400, START, False, TimeBase.STANDARD),  # clocks a month apart
+        (-2e7, None, True, TimeBase.STANDARD),  # before September 2011
     ],
 )
-def test_the_kind_of_time_is_seen_in_the_numbers(first_s, start, standard, kind):
-    assert time_kind(first_s, first_s + 900, start, standard=standard) is kind
+def test_time_base_is_detected(first_s, start, standard, expected):
+    assert detect_time_base(first_s, first_s + 900, start, standard=standard) is expected
 
 
-def test_stamps_all_zero_are_none():
-    assert time_kind(0.0, 0.0, START, standard=True) is TimeKind.NONE
+def test_time_stamps_that_are_all_zero():
+    assert detect_time_base(0.0, 0.0, START, standard=True) is TimeBase.NONE
 
 
-def test_a_week_that_ends_is_still_the_week():
+def test_week_seconds_at_the_end_of_the_week():
     sunday = datetime(2024, 10, 5, 23, 59, 45, tzinfo=UTC)  # the GPS week began 18 s before midnight
-    assert time_kind(3.2, 900.0, sunday, standard=False) is TimeKind.WEEK
-    assert time_kind(604_799.0, 605_700.0, sunday - timedelta(seconds=4), standard=False) is TimeKind.WEEK
+    assert detect_time_base(3.2, 900.0, sunday, standard=False) is TimeBase.WEEK
+    assert (
+        detect_time_base(604_799.0, 605_700.0, sunday - timedelta(seconds=4), standard=False) is TimeBase.WEEK
+    )
 
 
 def times(first_s, count=100):
     return first_s + np.arange(count) * 9.0
 
 
-def made(write_scan, name, first_s, **how):
+def write_timed_scan(write_scan, name, first_s, **options):
     points_m = np.random.default_rng(0).normal(size=(3, 100))
-    return write_scan(name, points_m, None if first_s is None else times(first_s), **how)
+    return write_scan(name, points_m, None if first_s is None else times(first_s), **options)
 
 
 @pytest.mark.parametrize(
-    ("first_s", "kind", "lasts_s"),
+    ("first_s", "expected", "duration_s"),
     [
-        (None, TimeKind.NONE, 0.0),
-        (40.0, TimeKind.SCANNER, 891.0),
-        (START_WEEK_S, TimeKind.WEEK, 891.0),
-        (START_STANDARD_S, TimeKind.STANDARD, 891.0),
+        (None, TimeBase.NONE, 0.0),
+        (40.0, TimeBase.SCANNER, 891.0),
+        (START_WEEK_S, TimeBase.WEEK, 891.0),
+        (START_STANDARD_S, TimeBase.STANDARD, 891.0),
     ],
 )
-def test_the_name_tells_the_start_and_the_stamps_the_end(write_scan, first_s, kind, lasts_s):
-    with open_scan(made(write_scan, "241001_120000.laz", first_s)) as reader:
-        start, end, found = utc_interval(reader, NAMED)
-    assert (start, found) == (START, kind)
-    assert (end - start).total_seconds() == pytest.approx(lasts_s)
+def test_start_is_from_the_name_and_duration_from_the_time_stamps(write_scan, first_s, expected, duration_s):
+    with open_scan(write_timed_scan(write_scan, "241001_120000.laz", first_s)) as reader:
+        start, end, time_base = utc_interval(reader, NAMED)
+    assert (start, time_base) == (START, expected)
+    assert (end - start).total_seconds() == pytest.approx(duration_s)
 
 
-def test_absolute_stamps_stand_in_for_the_name(write_scan):
-    with open_scan(made(write_scan, "flight.laz", START_STANDARD_S, standard=True)) as reader:
+def test_start_from_absolute_time_stamps(write_scan):
+    with open_scan(write_timed_scan(write_scan, "flight.laz", START_STANDARD_S, standard=True)) as reader:
         assert utc_interval(reader, NAMED)[0] == START
 
 
 @pytest.mark.parametrize("first_s", [None, 40.0, START_WEEK_S])
-def test_an_unknown_start_says_what_to_do(write_scan, first_s):
+def test_unknown_start_is_explained(write_scan, first_s):
     with (
-        open_scan(made(write_scan, "noon.laz", first_s)) as reader,
+        open_scan(write_timed_scan(write_scan, "noon.laz", first_s)) as reader,
         pytest.raises(ScanError, match=r"does not match scans\.name = '%y%m%d_%H%M%S'"),
     ):
         utc_interval(reader, NAMED)
@@ -127,23 +129,23 @@ def test_an_unknown_start_says_what_to_do(write_scan, first_s):
         ("241001_123000.laz", "check the scanner's clock"),
     ],
 )
-def test_a_name_that_contradicts_gps_is_refused(write_scan, name, hint):
+def test_name_that_contradicts_gps_time_is_rejected(write_scan, name, hint):
     with (
-        open_scan(made(write_scan, name, START_STANDARD_S)) as reader,
+        open_scan(write_timed_scan(write_scan, name, START_STANDARD_S)) as reader,
         pytest.raises(ScanError, match=hint),
     ):
         utc_interval(reader, NAMED)
 
 
-def test_a_scan_from_the_future_is_held_back():
+def test_scan_from_the_future_is_not_ready():
     now_s = START.timestamp()
-    require_begun(START, now_s)
-    require_begun(START + timedelta(minutes=14), now_s)  # clocks differ, and names are rounded
+    reject_future(START, now_s)
+    reject_future(START + timedelta(minutes=14), now_s)  # clocks differ, names are rounded
     with pytest.raises(NotReadyError, match=r"begins at 2024-10-01 12:16:00 UTC, 0:16:00 ahead of this"):
-        require_begun(START + timedelta(minutes=16), now_s)
+        reject_future(START + timedelta(minutes=16), now_s)
 
 
-def test_time_stamps_that_no_calendar_reaches_are_refused(write_scan):
+def test_time_stamps_beyond_any_calendar_are_rejected(write_scan):
     points_m, time_s = np.random.default_rng(0).normal(size=(3, 100)), times(40.0)
     time_s[-1] = 1e300
     with (
@@ -153,26 +155,26 @@ def test_time_stamps_that_no_calendar_reaches_are_refused(write_scan):
         utc_interval(reader, NAMED)
 
 
-def test_a_zone_in_the_name_is_heeded(write_scan):
-    with open_scan(made(write_scan, "241001_140000+0200.laz", 40.0)) as reader:
+def test_time_zone_in_the_name(write_scan):
+    with open_scan(write_timed_scan(write_scan, "241001_140000+0200.laz", 40.0)) as reader:
         assert utc_interval(reader, NAMED + "%z")[0] == START
 
 
-def test_a_real_flight_dates_itself(shared_data):
+def test_real_airborne_scan_has_absolute_time(shared_data):
     with open_scan(shared_data / "als/coromandel_points.laz") as reader:
-        start, end, kind = utc_interval(reader, NAMED)
-    assert kind is TimeKind.STANDARD
+        start, end, time_base = utc_interval(reader, NAMED)
+    assert time_base is TimeBase.STANDARD
     assert start.date().isoformat() == "2024-04-27"
     assert 0 < (end - start).total_seconds() < 3600
 
 
-def test_las_is_built_in(a_sweep):
+def test_las_reader_is_built_in(write_sweep):
     assert {".las", ".laz"} <= set(scan.suffixes())
-    with open_scan(a_sweep("UPPER.LAZ", 100)) as reader:
+    with open_scan(write_sweep("UPPER.LAZ", 100)) as reader:
         assert reader.header.point_count == 100
 
 
-def test_an_unknown_suffix_names_the_known(tmp_path):
+def test_unknown_suffix_lists_the_known_ones(tmp_path):
     with pytest.raises(ScanError, match=r"no reader for '\.rxp': \.las, \.laz"):
         open_scan(tmp_path / "scan.rxp")
 
@@ -185,33 +187,33 @@ class DotReader:
 
 
 @pytest.fixture
-def plugged_in(monkeypatch):
-    """Plug in by entry point, as an installed package would."""
+def register_readers(monkeypatch):
+    """Return a function that registers readers as entry points, as an installed package would."""
 
-    def plug(**values):
+    def register(**values):
         entries = [EntryPoint(name, value, "station.readers") for name, value in values.items()]
         monkeypatch.setattr(scan, "entry_points", lambda **_: entries)
         scan._readers.cache_clear()
 
-    yield plug
+    yield register
     scan._readers.cache_clear()
 
 
-def test_a_broken_plug_in_disables_only_itself(plugged_in, caplog, a_sweep):
-    plugged_in(
+def test_broken_plug_in_disables_only_itself(register_readers, caplog, write_sweep):
+    register_readers(
         absent="no.such.module:Reader",
-        hollow="station.errors:ScanError",
+        invalid="station.errors:ScanError",
         las="station.readers.las:LasScan",
     )
     with caplog.at_level(logging.WARNING):
         assert scan.suffixes() == (".las", ".laz")
     assert "absent" in caplog.text
-    assert "hollow" in caplog.text
-    assert open_scan(a_sweep("s.las", 10)).header.point_count == 10
+    assert "invalid" in caplog.text
+    assert open_scan(write_sweep("s.las", 10)).header.point_count == 10
 
 
-def test_what_a_plug_in_throws_is_the_scans_fault(plugged_in, monkeypatch, tmp_path):
+def test_errors_of_a_plug_in_become_scan_errors(register_readers, monkeypatch, tmp_path):
     monkeypatch.setattr(scan, "DotReader", DotReader, raising=False)
-    plugged_in(dot="station.readers.scan:DotReader")
+    register_readers(dot="station.readers.scan:DotReader")
     with pytest.raises(ScanError, match=r"RuntimeError: cannot make sense of a\.dot within 900"):
         open_scan(tmp_path / "a.dot", range_max_m=900)

@@ -1,4 +1,4 @@
-"""Matrices as people write them, and which holds when."""
+"""SOP and POP matrices in files, and the SOP valid at a time."""
 
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
@@ -8,48 +8,50 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from station.errors import ConfigError, ScanError
-from station.readers.sop import read_matrix, sop_for
+from station.readers.sop import read_matrix, valid_sop
 from station.sections import SopSection
 
-TURN = Rotation.from_euler("xyz", [0.1, 0.59, -1.2]).as_matrix()
+ROTATION = Rotation.from_euler("xyz", [0.1, 0.59, -1.2]).as_matrix()
 
 
-def written(tmp_path, rotation, *, last="0 0 0 1", head="# solved from 241001_120000\n", digits=16):
+def write_matrix(tmp_path, rotation, *, last="0 0 0 1", head="# solved from 241001_120000\n", digits=16):
     rows = [f"{a:.{digits}f} {b:.{digits}f}\t{c:.{digits}f}  12.5" for a, b, c in rotation]
     path = tmp_path / "sop.dat"
     path.write_text(head + "\n".join(rows) + f"  # right\n\n{last}\n")
     return path
 
 
-def test_a_matrix_is_read_as_it_stands(tmp_path):
-    matrix = read_matrix(written(tmp_path, TURN))
-    assert matrix[:3, :3] == pytest.approx(TURN, abs=1e-15)
+def test_matrix_is_read_as_written(tmp_path):
+    matrix = read_matrix(write_matrix(tmp_path, ROTATION))
+    assert matrix[:3, :3] == pytest.approx(ROTATION, abs=1e-15)
     assert list(matrix[:3, 3]) == [12.5, 12.5, 12.5]
     assert list(matrix[3]) == [0, 0, 0, 1]
 
 
 @pytest.mark.parametrize("digits", [9, 7])
-def test_the_digits_people_write_are_enough(tmp_path, digits):
-    assert read_matrix(written(tmp_path, TURN, digits=digits))[:3, :3] == pytest.approx(TURN, abs=1e-6)
+def test_few_digits_are_enough(tmp_path, digits):
+    assert read_matrix(write_matrix(tmp_path, ROTATION, digits=digits))[:3, :3] == pytest.approx(
+        ROTATION, abs=1e-6
+    )
 
 
-def test_lost_digits_are_mended(tmp_path):
-    turn = read_matrix(written(tmp_path, TURN, digits=4))[:3, :3]
-    assert turn @ turn.T == pytest.approx(np.eye(3), abs=1e-14)
-    assert turn == pytest.approx(TURN, abs=1e-4)
-    assert np.abs(np.round(TURN, 4) @ np.round(TURN, 4).T - np.eye(3)).max() > 1e-6  # it was not one
+def test_rounded_rotation_is_made_orthonormal(tmp_path):
+    rotation = read_matrix(write_matrix(tmp_path, ROTATION, digits=4))[:3, :3]
+    assert rotation @ rotation.T == pytest.approx(np.eye(3), abs=1e-14)
+    assert rotation == pytest.approx(ROTATION, abs=1e-4)
+    assert np.abs(np.round(ROTATION, 4) @ np.round(ROTATION, 4).T - np.eye(3)).max() > 1e-6  # not orthonormal
 
 
 @pytest.mark.parametrize(
-    ("season", "lean_deg"),
+    ("season", "tilt_deg"),
     [("2019-2020", None), ("2020-2021", None), ("2021-2022", None), ("2023-2024", 33.8)],
 )
 @pytest.mark.parametrize("kind", ["SOP", "POP"])
-def test_real_matrices_are_accepted(shared_data, season, kind, lean_deg):
+def test_real_matrices_are_accepted(shared_data, season, kind, tilt_deg):
     matrix = read_matrix(shared_data / f"mammoth/{season}-{kind}.dat")
     assert matrix[:3, :3] @ matrix[:3, :3].T == pytest.approx(np.eye(3), abs=1e-8)
-    if kind == "SOP" and lean_deg:
-        assert np.degrees(np.arccos(matrix[2, 2])) == pytest.approx(lean_deg, abs=0.1)
+    if kind == "SOP" and tilt_deg:
+        assert np.degrees(np.arccos(matrix[2, 2])) == pytest.approx(tilt_deg, abs=0.1)
     if kind == "POP":
         assert 6.36e6 < np.linalg.norm(matrix[:3, 3]) < 6.39e6  # on the Earth
 
@@ -57,40 +59,40 @@ def test_real_matrices_are_accepted(shared_data, season, kind, lean_deg):
 @pytest.mark.parametrize(
     ("rotation", "last", "reason"),
     [
-        (TURN * 1000, "0 0 0 1", "also scales by 1000"),
-        (TURN * [1, 1, -1], "0 0 0 1", "mirrors"),
-        (TURN + [[0, 0, 0.01]] * 3, "0 0 0 1", "not at right angles"),
-        (TURN, "0 0 0 2", "last row must be 0 0 0 1"),
-        (TURN, "0 0 1", r"rows of \[4, 4, 4, 3\]"),
-        (TURN, "", r"rows of \[4, 4, 4\]"),
-        (TURN, "0 0 0 eins", "could not convert"),
-        (TURN * [1, 1, np.nan], "0 0 0 1", "not a finite number"),
+        (ROTATION * 1000, "0 0 0 1", "also scales by 1000"),
+        (ROTATION * [1, 1, -1], "0 0 0 1", "is a reflection"),
+        (ROTATION + [[0, 0, 0.01]] * 3, "0 0 0 1", "not at right angles"),
+        (ROTATION, "0 0 0 2", "last row must be 0 0 0 1"),
+        (ROTATION, "0 0 1", r"rows of \[4, 4, 4, 3\]"),
+        (ROTATION, "", r"rows of \[4, 4, 4\]"),
+        (ROTATION, "0 0 0 eins", "could not convert"),
+        (ROTATION * [1, 1, np.nan], "0 0 0 1", "not a finite number"),
     ],
 )
-def test_what_is_no_pose_is_explained(tmp_path, rotation, last, reason):
+def test_invalid_matrix_is_explained(tmp_path, rotation, last, reason):
     with pytest.raises(ConfigError, match=reason):
-        read_matrix(written(tmp_path, rotation, last=last))
+        read_matrix(write_matrix(tmp_path, rotation, last=last))
 
 
 @pytest.mark.parametrize("value", ["1e200", "-1e300", "2e8"])
-@pytest.mark.parametrize("place", [0, 3])
-def test_what_overflows_is_refused(tmp_path, value, place):
+@pytest.mark.parametrize("column", [0, 3])
+def test_values_beyond_any_map_are_rejected(tmp_path, value, column):
     rows = np.eye(4).astype(str)
-    rows[0, place] = value
+    rows[0, column] = value
     (tmp_path / "sop.dat").write_text("\n".join(" ".join(row) for row in rows))
     with pytest.raises(ConfigError, match="beyond any map"):
         read_matrix(tmp_path / "sop.dat")
 
 
-def test_a_transposed_matrix_is_recognised(tmp_path):
+def test_transposed_matrix_is_recognised(tmp_path):
     matrix = np.eye(4)
-    matrix[:3, :3], matrix[:3, 3] = TURN, (1, 2, 3)
+    matrix[:3, :3], matrix[:3, 3] = ROTATION, (1, 2, 3)
     np.savetxt(tmp_path / "t.dat", matrix.T)
     with pytest.raises(ConfigError, match="transposed"):
         read_matrix(tmp_path / "t.dat")
 
 
-def test_a_lost_matrix_is_a_fault_of_the_site_file(tmp_path):
+def test_missing_matrix_is_a_config_error(tmp_path):
     with pytest.raises(ConfigError, match="cannot be read"):
         read_matrix(tmp_path / "none.dat")
 
@@ -111,10 +113,10 @@ SOPS = [
         (MAY + timedelta(days=999), "may.dat"),
     ],
 )
-def test_the_newest_sop_that_has_begun_holds(when, file):
-    assert sop_for(SOPS, when).file == Path(file)
+def test_latest_sop_that_has_begun_is_valid(when, file):
+    assert valid_sop(SOPS, when).file == Path(file)
 
 
-def test_before_the_first_sop_there_is_none():
+def test_time_before_the_first_sop_is_rejected():
     with pytest.raises(ScanError, match=r"no \[\[sop\]\] .* has begun by 2024-09-30 23:59:59"):
-        sop_for(SOPS, OCTOBER - timedelta(seconds=1))
+        valid_sop(SOPS, OCTOBER - timedelta(seconds=1))

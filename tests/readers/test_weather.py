@@ -1,4 +1,4 @@
-"""The weather log, as loggers leave it."""
+"""The weather log, with the faults of sensors, loggers and transfers."""
 
 from datetime import UTC, datetime
 
@@ -7,7 +7,7 @@ import pytest
 
 from station.errors import NotReadyError, ScanError
 from station.quantities import Air, WeatherLog
-from station.readers.weather import air_at, read_weather
+from station.readers.weather import interpolate_air, read_weather
 from station.sections import WeatherColumns
 
 REAL = WeatherColumns(temperature_c="TAact_2m_Avg", humidity_pct="RHact_2m_Avg", pressure_hpa="Pact")
@@ -17,16 +17,16 @@ TOA5 = (
     '"TS","RN","C","%","mbar"\r\n"","","Avg","Avg","Smp"\r\n'
 )
 LOGGER = WeatherColumns(temperature_c="T", humidity_pct="RH", pressure_hpa="P")
-FIVE = datetime(2024, 10, 1, 5, 0, tzinfo=UTC).timestamp()
+START_S = datetime(2024, 10, 1, 5, 0, tzinfo=UTC).timestamp()
 
 
-def written(tmp_path, text):
+def write_log(tmp_path, text):
     path = tmp_path / "weather.dat"
     path.write_bytes(text.encode())
     return path
 
 
-def test_a_real_log_is_read(shared_data):
+def test_real_log(shared_data):
     path = shared_data / "weather/hintereis_toa5_excerpt.dat"
     log = read_weather(path, format="toa5", columns=REAL, utc_offset_h=0)
     assert log.time_utc_s[0] == datetime(2018, 6, 22, 8, 52, tzinfo=UTC).timestamp()
@@ -38,33 +38,33 @@ def test_a_real_log_is_read(shared_data):
     assert len(log.time_utc_s) == len(path.read_bytes().splitlines()) - 4
 
 
-def test_faults_of_sensor_and_transfer_leave_gaps(tmp_path):
+def test_faulty_values_become_gaps(tmp_path):
     rows = [
         '"2024-10-01 05:00:00",1,-1.5,50,684.5',
         '"2024-10-01 05:01:00",2,"NAN",50,684.6',
         '"2024-10-01 05:02:00",3,-7999,104,"INF"',
-        '"2024-10-01 05:03:00",4,-1.6,50',  # torn
+        '"2024-10-01 05:03:00",4,-1.6,50',  # incomplete
         "garbage",
         '"2024-10-01 05:05:00",6,-1.7,50,684.8',
         '"2024-10-01 05:05:00",6,-1.8,50,684.9',  # sent twice
         '"2024-10-01 05:04:00",5,-1.9,50,685.0',  # late
         '"2024-10-01 05:06:00.5",7,-2.0,50,685.1',
     ]
-    path = written(tmp_path, TOA5 + "\r\n".join(rows) + '\r\n"2024-10-01 05:07:00",8,-2.1,50,68')
+    path = write_log(tmp_path, TOA5 + "\r\n".join(rows) + '\r\n"2024-10-01 05:07:00",8,-2.1,50,68')
     log = read_weather(path, format="toa5", columns=LOGGER, utc_offset_h=0)
-    assert list(log.time_utc_s - FIVE) == [0, 60, 120, 240, 300, 360.5]
+    assert list(log.time_utc_s - START_S) == [0, 60, 120, 240, 300, 360.5]
     nan = np.nan
     assert log.temperature_c == pytest.approx([-1.5, nan, nan, -1.9, -1.8, -2.0], nan_ok=True)
     assert log.pressure_hpa == pytest.approx([684.5, 684.6, nan, 685.0, 684.9, 685.1], nan_ok=True)
     assert log.humidity_pct == pytest.approx([50, 50, 100, 50, 50, 50])  # wet sensors read beyond 100
 
 
-def test_csv_with_a_clock_of_its_own(tmp_path):
+def test_csv_with_time_zones(tmp_path):
     times = ["2024-10-01T06:00:00", "2024-10-01T05:10:00Z", "2024-10-01 07:30+01:00"]
     rows = [f"{time},{number},50,700\n" for number, time in enumerate(times)]
-    path = written(tmp_path, "time,t,rh,p\n" + "".join(rows))
+    path = write_log(tmp_path, "time,t,rh,p\n" + "".join(rows))
     log = read_weather(path, format="csv", columns=PLAIN, utc_offset_h=1)
-    assert list(log.time_utc_s - FIVE) == [0, 600, 5400]
+    assert list(log.time_utc_s - START_S) == [0, 600, 5400]
     assert list(log.temperature_c) == [0, 1, 2]
 
 
@@ -77,30 +77,30 @@ def test_csv_with_a_clock_of_its_own(tmp_path):
         (TOA5 + '"2024-10-01 05:00:00",1,-1.5,50,68.45\r\n', "toa5", "wrong columns or units"),
     ],
 )
-def test_a_log_that_cannot_be_meant_is_refused(tmp_path, text, format_, reason):
+def test_invalid_log_is_rejected(tmp_path, text, format_, reason):
     with pytest.raises(ScanError, match=reason):
-        read_weather(written(tmp_path, text), format=format_, columns=LOGGER, utc_offset_h=0)
+        read_weather(write_log(tmp_path, text), format=format_, columns=LOGGER, utc_offset_h=0)
 
 
-def test_a_log_without_rows_yet_holds_nothing(tmp_path):
-    log = read_weather(written(tmp_path, TOA5), format="toa5", columns=LOGGER, utc_offset_h=0)
+def test_log_without_rows_is_empty(tmp_path):
+    log = read_weather(write_log(tmp_path, TOA5), format="toa5", columns=LOGGER, utc_offset_h=0)
     assert len(log.time_utc_s) == 0
-    assert air_at(log, FIVE, 3600) is None
+    assert interpolate_air(log, START_S, 3600) is None
 
 
-def test_a_lost_log_waits(tmp_path):
+def test_missing_log_is_not_ready(tmp_path):
     with pytest.raises(NotReadyError, match="No such file"):
         read_weather(tmp_path / "none.dat", format="csv", columns=PLAIN, utc_offset_h=0)
 
 
 @pytest.fixture(scope="module")
 def long_log(tmp_path_factory):
-    """Sixty days by the minute, with a tear, a gap and a row of a wrong clock in the middle."""
+    """Sixty days of minutes, with damaged rows, a gap and a row with a wrong time."""
     rows = [
-        f"{datetime.fromtimestamp(FIVE + 60 * minute, UTC):%Y-%m-%dT%H:%M:%S},{minute / 1e4},50,700\n"
+        f"{datetime.fromtimestamp(START_S + 60 * minute, UTC):%Y-%m-%dT%H:%M:%S},{minute / 1e4},50,700\n"
         for minute in range(86_400)
     ]
-    rows[43_000:43_400] = [" torn \n"] * 15
+    rows[43_000:43_400] = [" damaged \n"] * 15
     rows[30_000] = "2031-01-01T00:00:00,1,50,700\n"
     path = tmp_path_factory.mktemp("weather") / "long.csv"
     path.write_text("time,t,rh,p\n" + "".join(rows))
@@ -110,15 +110,15 @@ def long_log(tmp_path_factory):
 @pytest.mark.parametrize(
     "minute", [0, 1, 700, 29_999, 30_001, 42_990, 43_410, 43_600, 86_000, 86_399, 99_999]
 )
-def test_a_window_is_found_in_years_of_log(long_log, minute):
-    window = (FIVE + 60 * (minute - 60), FIVE + 60 * (minute + 60))
-    some = read_weather(long_log, format="csv", columns=PLAIN, utc_offset_h=0, window_utc_s=window)
+def test_time_window_of_a_long_log(long_log, minute):
+    window = (START_S + 60 * (minute - 60), START_S + 60 * (minute + 60))
+    log = read_weather(long_log, format="csv", columns=PLAIN, utc_offset_h=0, window_utc_s=window)
     minutes = [
-        m
-        for m in range(max(minute - 60, 0), min(minute + 61, 86_400))
-        if m != 30_000 and not 43_000 <= m < 43_400
+        row
+        for row in range(max(minute - 60, 0), min(minute + 61, 86_400))
+        if row != 30_000 and not 43_000 <= row < 43_400
     ]
-    assert list((some.time_utc_s - FIVE) / 60) == minutes
+    assert list((log.time_utc_s - START_S) / 60) == minutes
 
 
 def log_of(*rows):
@@ -127,12 +127,12 @@ def log_of(*rows):
 
 def test_air_is_interpolated_between_complete_samples():
     log = log_of((0, -1, 680, 20), (500, np.nan, 999, 99), (1000, -3, 690, 40))
-    assert air_at(log, 250, 3600) == Air(-1.5, 682.5, 25.0)
+    assert interpolate_air(log, 250, 3600) == Air(-1.5, 682.5, 25.0)
 
 
 @pytest.mark.parametrize(
     ("time_s", "temperature_c"), [(-50, -1), (90, -1), (910, -3), (1099, -3), (500, None)]
 )
-def test_air_is_no_older_than_allowed(time_s, temperature_c):
-    air = air_at(log_of((0, -1, 680, 20), (1000, -3, 690, 40)), time_s, 100)
+def test_air_is_not_older_than_allowed(time_s, temperature_c):
+    air = interpolate_air(log_of((0, -1, 680, 20), (1000, -3, 690, 40)), time_s, 100)
     assert (air and air.temperature_c) == temperature_c

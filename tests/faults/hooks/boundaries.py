@@ -1,16 +1,16 @@
-"""Count what a service does to the disk, and have it die, or the disk be full, at a chosen step.
+"""Count the changes a service makes on disk, and kill it, or report a full disk, at a chosen one.
 
-Loaded into every process of the service under test, and there only: by `sitecustomize` beside it where the
-service is started by its command, by `warm.py` where it is forked. `FAULTS_PLAN` (JSON) says what to do:
+Loaded into every process of the service under test: by `sitecustomize` if the service is started by its
+command, by `warm.py` if it is forked. `FAULTS_PLAN` (JSON) has the keys:
 
-    steps     file; each boundary that any process crosses appends a record of 96 bytes to it
-    kills     [[step, delay_s, whom], ...]: at that step or the first after it, so much later
-    once      whom to kill at every boundary that has no file in the folder `died` yet; "full": nobody dies,
-              but the disk is full there
-    died      folder with an empty file for each boundary where that has been
+    steps     file to which each boundary crossed by any process appends a record of 96 bytes
+    kills     [[step, delay_s, victim], ...]: kills, delayed, at that step or the first after it
+    once      victim at every boundary that has no file in the folder `died` yet; "full": no process dies,
+              but the disk is full
+    died      folder with an empty file for each boundary at which that has happened
 
-`whom`: "child" (that decodes), "service" (its child must end by itself), "both" at once. A boundary is the
-moment before and the moment after each fsync, rename, link, new folder, deletion and commit.
+`victim`: "child" (the worker process), "service" (its worker must then end without help), or "both". There is
+a boundary before and one after each fsync, rename, link, mkdir, unlink and commit.
 """
 
 from __future__ import annotations
@@ -36,26 +36,28 @@ _append = os.O_WRONLY | os.O_APPEND | os.O_CREAT | os.O_CLOEXEC
 
 
 def install():
-    """Hook into the calls that make changes last, in this process and those forked from it.
+    """Wrap the calls that make changes durable, in this process and those forked from it.
 
-    At SIGUSR1 each of them writes to stderr what its threads are at.
+    At SIGUSR1 each of them writes the stacks of its threads to stderr.
     """
     faulthandler.register(signal.SIGUSR1)
     _state["plan"] = json.loads(os.environ["FAULTS_PLAN"])
     _state["service"] = int(os.environ.setdefault("FAULTS_SERVICE", str(os.getpid())))
     for name in ("fsync", "replace", "rename", "link", "unlink", "mkdir"):
         setattr(os, name, _watched(name, getattr(os, name)))
-    sqlite3.connect = functools.partial(sqlite3.connect, factory=_Rows)
+    sqlite3.connect = functools.partial(sqlite3.connect, factory=_Connection)
 
 
-def set_clock(by_path):
-    """Have all of the service believe in a wall clock that is off by what stands in a file [s]."""
-    from station.service import daemon, inbox, jobs, journal, tasks
+def set_clock(offset_path):
+    """Offset the wall clock of the service by the content of a file [s]."""
+    from station.inbox import inbox, journal
+    from station.processing import store_tasks
+    from station.service import daemon, scheduler
 
     true_s = time.time
 
     def now_s():
-        return true_s() + float(Path(by_path).read_text(encoding="ascii"))
+        return true_s() + float(Path(offset_path).read_text(encoding="ascii"))
 
     class Clock(datetime):
         @classmethod
@@ -63,37 +65,39 @@ def set_clock(by_path):
             return cls.fromtimestamp(now_s(), tz)
 
     time.time = now_s
-    tasks.datetime = Clock
-    for made in (inbox.Inbox, journal.Journal, jobs.Clockwork):
-        made.__init__.__kwdefaults__["now_s"] = now_s
+    store_tasks.datetime = Clock
+    for clocked in (inbox.Inbox, journal.Journal, scheduler.JobScheduler):
+        clocked.__init__.__kwdefaults__["now_s"] = now_s
     assert daemon.time.time is now_s
 
 
-def hurry(period_s=5.0):
-    """Have the service wait for fractions of a second where it waits for minutes."""
-    from station.service import child, daemon, journal
+def shorten_delays(period_s=5.0):
+    """Shorten the delays of the service from minutes to fractions of a second."""
+    from station.inbox import journal
+    from station.processing import isolation
+    from station.service import daemon
 
-    journal.FIRST_PAUSE_S = journal.LONGEST_PAUSE_S = 0.1
-    child.PAUSES_S = (0.01,) * 100
-    daemon.Pace.__init__.__defaults__ = (period_s, 0.02, 5.0, 0.05, 3600.0)
+    journal.FIRST_RETRY_S = journal.MAX_RETRY_S = 0.1
+    isolation.RETRY_DELAYS_S = (0.01,) * 100
+    daemon.LoopTiming.__init__.__defaults__ = (period_s, 0.02, 5.0, 0.05, 3600.0)
 
 
 def _watched(name, call):
     @functools.wraps(call)
     def watched(target, *args, **kwargs):
-        shown = _shown(args[0] if name in {"replace", "rename", "link"} else target)
-        if shown is None:
+        label = _label(args[0] if name in {"replace", "rename", "link"} else target)
+        if label is None:
             return call(target, *args, **kwargs)
-        _cross(f"before {name} {shown}")
-        told = call(target, *args, **kwargs)
-        _cross(f"after {name} {shown}")
-        return told
+        _cross(f"before {name} {label}")
+        result = call(target, *args, **kwargs)
+        _cross(f"after {name} {label}")
+        return result
 
     return watched
 
 
-class _Rows(sqlite3.Connection):
-    """A connection whose commits are boundaries, by the statement they make last."""
+class _Connection(sqlite3.Connection):
+    """A connection whose commits are boundaries, labelled by their last statement."""
 
     _last = ""
 
@@ -104,9 +108,9 @@ class _Rows(sqlite3.Connection):
             return super().execute(statement, values)
         full = sqlite3.OperationalError("database or disk is full")
         _cross(f"before commit {self._last}", full)
-        told = super().execute(statement, values)
+        result = super().execute(statement, values)
         _cross(f"after commit {self._last}", full)
-        return told
+        return result
 
     def executemany(self, statement, rows):
         rows = list(rows)
@@ -115,51 +119,53 @@ class _Rows(sqlite3.Connection):
         return super().executemany(statement, rows)
 
 
-def _shown(target):
-    """Name a file or descriptor in the data folder, without what differs from run to run; None elsewhere."""
+def _label(target):
+    """Return a name of a file or descriptor in the data folder that is equal in all runs; None elsewhere."""
     path = Path(f"/proc/self/fd/{target}").readlink() if isinstance(target, int) else Path(target)
-    _, found, below = f"{path}/".partition("/data/")
-    return re.sub(r"\.\d+\.part/$", ".part/", below) if found else None
+    _, separator, relative = f"{path}/".partition("/data/")
+    return re.sub(r"\.\d+\.part/$", ".part/", relative) if separator else None
 
 
 def _cross(label, full=None):
     plan = _state["plan"]
     step = _record(plan["steps"], label)
-    for number, (at, delay_s, whom) in enumerate(plan.get("kills", ())):
-        ours = whom != "child" or multiprocessing.parent_process() is not None
+    for number, (at, delay_s, victim) in enumerate(plan.get("kills", ())):
+        is_this_process = victim != "child" or multiprocessing.parent_process() is not None
         claim = f"{plan['steps']}.kill{number}"
-        if step < at or not ours or number in _state["pending"] or os.path.exists(claim):  # noqa: PTH110 - is quick
+        if step < at or not is_this_process or number in _state["pending"]:
+            continue
+        if os.path.exists(claim):  # noqa: PTH110 - is faster
             continue
         _state["pending"].add(number)
         if delay_s:
-            threading.Thread(target=_kill, args=(whom, delay_s, claim), daemon=True).start()
+            threading.Thread(target=_kill, args=(victim, delay_s, claim), daemon=True).start()
         else:
-            _kill(whom, 0.0, claim)
+            _kill(victim, 0.0, claim)
     if not plan.get("once"):
         return
-    claim = os.path.join(plan["died"], f"{plan['once']} {label}".replace("/", "|"))  # noqa: PTH118 - is quick
+    claim = os.path.join(plan["died"], f"{plan['once']} {label}".replace("/", "|"))  # noqa: PTH118 - is faster
     if plan["once"] != "full":
         _kill(plan["once"], 0.0, claim)
-    elif _is_first(claim) and label.split(" ", 2)[2]:  # without its data folder no service starts
+    elif _is_first(claim) and label.split(" ", 2)[2]:  # without its data folder the service does not start
         raise full or OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), label)
 
 
-def _kill(whom, delay_s, claim):
+def _kill(victim, delay_s, claim):
     time.sleep(delay_s)
     if not _is_first(claim):
         return
-    if whom == "child" and multiprocessing.parent_process() is not None:
+    if victim == "child" and multiprocessing.parent_process() is not None:
         os.kill(os.getpid(), signal.SIGKILL)
     os.kill(_state["service"], signal.SIGKILL)
-    if whom == "both":
+    if victim == "both":
         os.kill(os.getpid(), signal.SIGKILL)
 
 
 def _record(path, label):
-    """Append a record; return how many there are."""
+    """Append a record; return the number of records."""
     steps = os.open(path, _append, 0o666)
     try:
-        with suppress(OSError):  # where no file may grow we count on when one may
+        with suppress(OSError):  # under a limit of the file size the count goes on later
             os.write(steps, label.encode("utf-8", "replace")[:RECORD].ljust(RECORD))
         return os.fstat(steps).st_size // RECORD
     finally:
@@ -167,7 +173,7 @@ def _record(path, label):
 
 
 def _is_first(claim):
-    """Claim a death for this process; False where it or another was quicker."""
+    """Return True if this process is the first to claim a kill."""
     try:
         os.close(os.open(claim, os.O_CREAT | os.O_EXCL | os.O_WRONLY))
     except FileExistsError:

@@ -8,4 +8,4 @@ if "FAULTS_PLAN" in os.environ:
     is_service = "FAULTS_SERVICE" not in os.environ
     boundaries.install()
     if is_service:
-        boundaries.hurry()
+        boundaries.shorten_delays()

@@ -1,0 +1,246 @@
+"""NetCDF layout shared by all files of a store: dimensions, coordinates, map projection, attributes."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import netCDF4
+import numpy as np
+from pyproj import CRS
+
+from station._version import __version__
+from station.archive.schema import CHANGE_LENGTH, FILL, TEXT_LENGTH, Variable
+from station.quantities import Grid
+
+CHUNK = 128  # rows and columns of a chunk
+TIMES_PER_CHUNK = 512  # epochs per chunk of a variable that is small per scan, in a file of many epochs
+CONVENTIONS = "CF-1.11"
+ENCODING = "utf-8"  # of texts; older files declare ascii, a subset
+
+
+@dataclass(frozen=True)
+class Series:
+    """The store of a station: its folder, and the station's metadata written to every file."""
+
+    folder: Path
+    station_id: str
+    grid: Grid
+    crs: str | None
+    vertical_datum: str = ""
+    name: str = ""
+    institution: str = ""
+
+    @property
+    def path(self) -> Path:
+        """Path of `series.nc`, the file that users open."""
+        return self.folder / "series.nc"
+
+
+def create_file(
+    file: netCDF4.Dataset,
+    series: Series,
+    title: str,
+    times: int | None,
+    parameters: tuple[tuple[str, ...], tuple[str, ...]] = ((), ()),
+) -> None:
+    """Write dimensions, coordinates and metadata; no time dimension if `times` is None.
+
+    `parameters` are the names and units of the shared parameters.
+    """
+    write_global_attrs(file, series, title)
+    if times is not None:
+        file.createDimension("time", None)
+    for axis, coordinate in (("y", series.grid.y_m), ("x", series.grid.x_m)):
+        _create_axis(file, series, axis, coordinate)
+    if times is not None:
+        create_time_axis(file, times)
+    for dim, length in TEXT_LENGTH.items():
+        file.createDimension(dim, length)
+    if series.crs is not None:
+        _create_crs(file, series)
+    _create_parameter_names(file, *parameters)
+
+
+def write_global_attrs(file: netCDF4.Dataset, series: Series, title: str) -> None:
+    """Write the global attributes: conventions, title, origin, station."""
+    file.setncatts(
+        {
+            "Conventions": CONVENTIONS,
+            "title": title,
+            "institution": series.institution or "not given",
+            "source": "terrestrial laser scanner, permanently mounted",
+            "history": f"written by station {__version__}",
+            "station_id": series.station_id,
+            "station_name": series.name or series.station_id,
+        }
+    )
+
+
+def _create_axis(file: netCDF4.Dataset, series: Series, axis: str, coordinate: np.ndarray[Any, Any]) -> None:
+    if "bnds" not in file.dimensions:
+        file.createDimension("bnds", 2)
+    file.createDimension(axis, len(coordinate))
+    half_m = series.grid.cell_m / 2
+    variable = file.createVariable(axis, "f8", (axis,))
+    variable.setncatts(
+        {
+            "standard_name": f"projection_{axis}_coordinate",
+            "long_name": {"x": "easting", "y": "northing"}[axis],
+            "units": "m",
+            "axis": axis.upper(),
+            "bounds": f"{axis}_bnds",
+        }
+    )
+    variable[:] = coordinate
+    bounds = file.createVariable(f"{axis}_bnds", "f8", (axis, "bnds"))
+    half_step_m = half_m if axis == "x" else -half_m  # rows run from north to south
+    bounds[:] = np.stack([coordinate - half_step_m, coordinate + half_step_m], axis=-1)
+
+
+def create_time_axis(file: netCDF4.Dataset, times: int) -> None:
+    """Create the time coordinate and its bounds, chunked for a file of `times` epochs."""
+    chunk_times = min(times, TIMES_PER_CHUNK)
+    time = file.createVariable("time", "f8", ("time",), chunksizes=(chunk_times,))
+    time.setncatts(
+        {
+            "standard_name": "time",
+            "long_name": "middle of the scan",
+            "units": "seconds since 1970-01-01 00:00:00",
+            "units_metadata": "leap_seconds: none",
+            "calendar": "standard",
+            "axis": "T",
+            "bounds": "time_bnds",
+        }
+    )
+    file.createVariable("time_bnds", "f8", ("time", "bnds"), chunksizes=(chunk_times, 2))
+
+
+def _create_crs(file: netCDF4.Dataset, series: Series) -> None:
+    """Write the map projection in every form that some tool needs: horizontal only, ASCII, no +type=crs.
+
+    Each form fixes a tool that failed without it. Source: store.md, 4.
+    """
+    full_crs = CRS.from_user_input(series.crs)
+    crs = full_crs.sub_crs_list[0] if full_crs.is_compound else full_crs.to_2d()
+    attrs = {k: v for k, v in crs.to_cf().items() if v not in (None, "")}
+    wkt = crs.to_wkt().encode("ascii", "ignore").decode()
+    grid = series.grid
+    attrs |= {
+        "crs_wkt": wkt,
+        "spatial_ref": wkt,
+        "GeoTransform": f"{grid.west_m!r} {grid.cell_m!r} 0 {grid.north_m!r} 0 {-grid.cell_m!r}",
+        "proj_params": _proj4(crs),
+    }
+    if series.vertical_datum:
+        attrs["geoid_name"] = series.vertical_datum
+    variable = file.createVariable("crs", "i4", ())
+    variable.setncatts({k: _ascii(v) for k, v in attrs.items()})
+    variable[...] = 0
+
+
+def _proj4(crs: CRS) -> str:
+    """Return the PROJ string without +type=crs, which makes CDO misplace the grid without an error."""
+    import warnings  # noqa: PLC0415 - used here only
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)  # the loss of information is known; crs_wkt is complete
+        text = crs.to_proj4()
+    return text.replace(" +type=crs", "")
+
+
+def _ascii(value: object) -> object:
+    return value.encode("ascii", "ignore").decode() if isinstance(value, str) else value
+
+
+def _create_parameter_names(file: netCDF4.Dataset, names: tuple[str, ...], units: tuple[str, ...]) -> None:
+    if not names:
+        return
+    file.createDimension("parameter", len(names))
+    file.createDimension("parameter_2", len(names))
+    if "time" in file.dimensions:
+        for dim, length in CHANGE_LENGTH.items():
+            file.createDimension(dim, length)
+    for name, values, long_name in (
+        ("parameter_name", names, "name of the shared parameter"),
+        ("parameter_unit", units, "unit of the shared parameter"),
+    ):
+        variable = file.createVariable(name, "S1", ("parameter", "text"))
+        variable.setncatts({"long_name": long_name, "_Encoding": ENCODING})
+        variable[:] = encode_text(values, "text")
+
+
+def create_variable(
+    file: netCDF4.Dataset, spec: Variable, series: Series, times: int
+) -> netCDF4.Variable[Any]:
+    """Create a variable of the schema in a file of `times` epochs."""
+    chunks = None
+    if spec.is_raster:
+        height, width = min(CHUNK, series.grid.ny), min(CHUNK, series.grid.nx)
+        chunks = (1, height, width)[-len(spec.dims) :]
+    elif spec.is_large:
+        chunks = (1, *(len(file.dimensions[dim]) for dim in spec.dims[1:]))
+    elif spec.dims[:1] == ("time",):
+        chunks = (min(times, TIMES_PER_CHUNK), *(len(file.dimensions[dim]) for dim in spec.dims[1:]))
+    fill = {"f4": FILL, "f8": FILL, "S1": None}.get(spec.dtype, False)
+    variable = file.createVariable(
+        spec.name,
+        spec.dtype,
+        spec.dims,
+        compression="zlib",
+        complevel=1,
+        shuffle=True,
+        chunksizes=chunks,
+        fill_value=fill,
+        least_significant_digit=spec.digits,
+    )
+    variable.setncatts(attributes(spec, mapped=series.crs is not None))
+    return variable
+
+
+def attributes(spec: Variable, *, mapped: bool) -> dict[str, Any]:
+    """Return the NetCDF attributes of a variable of the schema."""
+    attrs: dict[str, Any] = {
+        key: getattr(spec, key)
+        for key in ("long_name", "standard_name", "units", "cell_methods", "comment", "flag_meanings")
+        if getattr(spec, key) is not None
+    }
+    for key in ("flag_masks", "flag_values"):
+        if getattr(spec, key):
+            attrs[key] = np.array(getattr(spec, key), dtype=spec.dtype)
+    if spec.digits is not None:  # netCDF4 writes 64 bits, which classic files cannot hold
+        attrs["least_significant_digit"] = np.int32(spec.digits)
+    if spec.is_raster and mapped:
+        attrs["grid_mapping"] = "crs"
+    if spec.standard_name == "air_temperature":
+        attrs["units_metadata"] = "temperature: on_scale"
+    if spec.dtype == "S1":
+        attrs["_Encoding"] = ENCODING
+    return attrs
+
+
+def encode_text(values: Sequence[str], dim: str) -> np.ndarray[Any, Any]:
+    """Return strings as characters (n, length), truncated and padded with NUL."""
+    length = TEXT_LENGTH[dim]
+    encoded = np.array([_truncate(value, dim) for value in values], dtype=f"S{length}")
+    return encoded.view("S1").reshape(-1, length)
+
+
+def roundtrip_text(value: str, dim: str) -> str:
+    """Return a string as it reads back after `encode_text`, truncated to the length of `dim`."""
+    return _truncate(value, dim).decode(ENCODING)
+
+
+def _truncate(value: str, dim: str) -> bytes:
+    """Encode as many whole characters as fit; characters that cannot be encoded become question marks."""
+    prefix = value.encode(ENCODING, "replace")[: TEXT_LENGTH[dim]]
+    return prefix.decode(ENCODING, "ignore").encode(ENCODING)
+
+
+def decode_text(characters: np.ndarray[Any, Any]) -> list[str]:
+    """Return characters (n, length) as strings; inverse of `encode_text`."""
+    rows = np.ascontiguousarray(characters).view(f"S{characters.shape[-1]}")
+    joined_bytes = b"\0".join(rows[:, 0].tolist())
+    return joined_bytes.decode(ENCODING, "replace").split("\0") if len(rows) else []  # one call for all

@@ -1,0 +1,299 @@
+"""`reference.nc`: the reference surface from which change is measured, with all its versions."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, fields, replace
+from pathlib import Path
+from typing import Any
+
+import netCDF4
+import numpy as np
+
+from station.archive.atomic_files import atomic_write
+from station.archive.netcdf_layout import Series, create_file, create_variable, decode_text
+from station.archive.raster_io import LazyRaster, rounded, write_rasters
+from station.archive.schema import FILL, Variable
+from station.errors import StoreError
+from station.quantities import Floats32, Reference, SharedParameters, VarianceComponents
+
+# Prefix of the attributes with the variance components of the station, one sigma each.
+COMPONENT_PREFIX = "component_"
+_VARIABLES = (
+    Variable(
+        "reference_elevation", ("y", "x"), "f4", "elevation of the reference surface at the cell centre", "m",
+        "surface_altitude", 3, None, "bilinear between cell centres",
+    ),
+    Variable(
+        "reference_random_uncertainty", ("y", "x"), "f4", "random uncertainty of the reference surface", "m",
+        None, 4, None, "one standard deviation of a single cell",
+    ),
+    Variable(
+        "reference_roughness",
+        ("y", "x"),
+        "f4",
+        "standard deviation of the terrain around the reference surface within the cell",
+        "m",
+        None,
+        4,
+    ),
+    Variable(
+        "reference_variance_factor",
+        ("y", "x"),
+        "f4",
+        "ratio of empirical to modelled random variance of the cell between scans",
+        "1",
+        None,
+        3,
+    ),
+    Variable(
+        "reference_intensity", ("y", "x"), "f4", "mean echo intensity of the cell, 0 to 1", "1", None, 4
+    ),
+    Variable(
+        "reference_stable", ("y", "x"), "i1", "stable ground: steep and without change", None, None,
+        flag_values=(0, 1), flag_meanings="other stable",
+    ),
+    Variable(
+        "reference_visibility", ("y", "x"), "f4", "share of the scans that observed the cell", "1", None, 3
+    ),
+    Variable(
+        "shared_parameter_line_tilt_variance", ("parameter",), "f8",
+        "variance of the tilt of each group of scan lines in excess of the parameter",
+        comment="units are squares of parameter_unit",
+    ),
+    Variable(
+        "shared_parameter_covariance", ("parameter", "parameter_2"), "f8",
+        "covariance of the parameters shared by all points of the reference",
+        comment="units are products of parameter_unit",
+    ),
+)  # fmt: skip
+
+
+@dataclass(frozen=True)
+class ReferenceProvenance:
+    """Provenance of a version of the reference; `base` is the version whose moving ground it shares."""
+
+    base: str
+    science_hash: str = ""
+    replaces: tuple[str, ...] = ()  # superseded versions with the same base
+    scan_provenance: tuple[dict[str, str], ...] = ()  # epoch provenance of each of its scans
+
+
+def version_path(series: Series, version: str) -> Path:
+    """Return the file of a version of the reference."""
+    return series.folder / f"reference_{version}.nc"
+
+
+def reference_path(series: Series, version: str) -> Path:
+    """Return the file to read a version from: its own file if it exists, otherwise `reference.nc`."""
+    path = version_path(series, version)
+    return path if path.is_file() else series.folder / "reference.nc"
+
+
+def versions(series: Series) -> list[str]:
+    """Return the versions built by the station itself, oldest first."""
+    names = (path.stem.removeprefix("reference_") for path in series.folder.glob("reference_*.nc"))
+    return sorted((version for version in names if version.isdigit()), key=int)
+
+
+def valid_versions(series: Series) -> dict[str, ReferenceProvenance]:
+    """Return the versions built by the station that epochs may be measured against, oldest first.
+
+    They share the moving ground of the newest version, so that change refers to one surface.
+    """
+    provenances = {version: read_reference_provenance(series, version) for version in versions(series)}
+    if not provenances:
+        return {}
+    base = list(provenances.values())[-1].base
+    replaced = {version for provenance in provenances.values() for version in provenance.replaces}
+    return {
+        version: provenance
+        for version, provenance in provenances.items()
+        if provenance.base == base and version not in replaced
+    }
+
+
+def read_reference_provenance(series: Series, version: str) -> ReferenceProvenance:
+    """Return the provenance of a version; raise StoreError if it cannot be read."""
+    path = version_path(series, version)
+    try:
+        with netCDF4.Dataset(path) as file:
+            attributes = set(file.ncattrs())
+            return ReferenceProvenance(
+                base=str(file.base) if "base" in attributes else version,
+                science_hash=str(file.science_hash) if "science_hash" in attributes else "",
+                replaces=tuple(str(file.replaces).split()) if "replaces" in attributes else (),
+                scan_provenance=tuple(json.loads(str(file.scan_provenance)))
+                if "scan_provenance" in attributes
+                else (),
+            )
+    except (OSError, RuntimeError, ValueError) as error:
+        raise StoreError(f"{path}: cannot be read: {error}") from error
+
+
+def write_reference(
+    series: Series, reference: Reference, provenance: ReferenceProvenance | None = None
+) -> None:
+    """Write a version of the reference, and make `reference.nc` a hard link to it.
+
+    Without a provenance, the version is its own base. Raises StoreError if it cannot be written.
+    """
+    provenance = provenance or ReferenceProvenance(reference.version)
+    path = version_path(series, reference.version)
+    with atomic_write(path) as tmp_path:
+        with netCDF4.Dataset(tmp_path, "w", clobber=False) as file:
+            _write(file, series, reference, provenance)
+        rasters = [spec for spec in _VARIABLES if spec.is_raster]
+        write_rasters(
+            tmp_path, rasters, lambda grid_rows: map(rounded, rasters, _raster_rows(reference, grid_rows))
+        )
+    _link_newest(series, path)
+
+
+def _write(
+    file: netCDF4.Dataset, series: Series, reference: Reference, provenance: ReferenceProvenance
+) -> None:
+    """Write everything but the values of the rasters, whose variables are created."""
+    shared = reference.shared
+    parameters = (shared.names, shared.units) if shared is not None else ((), ())
+    create_file(file, series, f"Reference surface of {series.name or series.station_id}", None, parameters)
+    file.setncatts({"reference_version": reference.version, "scan_ids": " ".join(reference.scan_ids)})
+    file.setncatts({"base": provenance.base, "science_hash": provenance.science_hash})
+    file.setncatts({"replaces": " ".join(provenance.replaces)})
+    file.setncatts({"scan_provenance": json.dumps(provenance.scan_provenance)})
+    file.setncatts(
+        {f"{COMPONENT_PREFIX}{name}": value for name, value in asdict(reference.components).items()}
+    )
+    for spec in _VARIABLES:
+        if all(dim in file.dimensions for dim in spec.dims):
+            create_variable(file, spec, series, 1)
+    if shared is not None:
+        file["shared_parameter_covariance"][:] = shared.covariance
+        file["shared_parameter_line_tilt_variance"][:] = shared.line_tilt_variance
+
+
+def _raster_rows(reference: Reference, rows: slice) -> list[np.ndarray[Any, Any]]:
+    """Return a block of rows of each raster, in the order of `_VARIABLES`."""
+    return [
+        reference.elevation_m[rows],
+        np.sqrt(reference.random_variance_m2[rows]),
+        np.sqrt(reference.roughness_m2[rows]),
+        reference.variance_factor[rows],
+        reference.intensity[rows],
+        reference.stable[rows],
+        reference.visibility[rows],
+    ]
+
+
+def repair_reference_link(series: Series) -> None:
+    """Link `reference.nc` to the newest version, in case a power cut prevented it.
+
+    Raises StoreError if it cannot be linked.
+    """
+    newest = max(series.folder.glob("reference_*.nc"), key=_written_ns, default=None)
+    link = series.folder / "reference.nc"
+    if newest is not None and (not link.is_file() or _written_ns(link) < _written_ns(newest)):
+        _link_newest(series, newest)
+
+
+def _link_newest(series: Series, path: Path) -> None:
+    with atomic_write(series.folder / "reference.nc") as tmp_path:
+        os.link(path, tmp_path)
+
+
+def _written_ns(path: Path) -> int:
+    return path.stat().st_mtime_ns
+
+
+def read_reference(series: Series, version: str | None = None) -> Reference | None:
+    """Return the newest reference or a version, read into memory; None if there is none.
+
+    Raises StoreError if it cannot be read or is on another grid.
+    """
+    reference = open_reference(series, version)
+    if reference is None:
+        return None
+    rasters: dict[str, Any] = {name: np.asarray(getattr(reference, name)) for name, _, _ in _RASTER_FIELDS}
+    return replace(reference, **rasters)
+
+
+def open_reference(series: Series, version: str | None = None) -> Reference | None:
+    """Return the reference as `read_reference` does, but with rasters that are read on access."""
+    path = series.folder / "reference.nc" if version is None else version_path(series, version)
+    if not path.is_file():
+        return None
+    try:
+        with netCDF4.Dataset(path) as file:
+            return _reference_from_file(file, reference_path(series, str(file.reference_version)), series)
+    except (OSError, RuntimeError, KeyError, IndexError, AttributeError) as error:
+        raise StoreError(f"{path}: cannot be read: {error}") from error
+
+
+def read_variance_components(series: Series) -> VarianceComponents:
+    """Return the variance components in the newest reference; start values if there is none."""
+    path = series.folder / "reference.nc"
+    if not path.is_file():
+        return VarianceComponents()
+    try:
+        with netCDF4.Dataset(path) as file:
+            return _read_components(file)
+    except (OSError, RuntimeError, AttributeError) as error:
+        raise StoreError(f"{path}: cannot be read: {error}") from error
+
+
+def _reference_from_file(file: netCDF4.Dataset, path: Path, series: Series) -> Reference:
+    grid = series.grid
+    if (
+        file["x"].shape != (grid.nx,)
+        or file["y"].shape != (grid.ny,)
+        or (abs(file["x"][0] - grid.x_m[0]) + abs(file["y"][0] - grid.y_m[0]) > 1e-6)
+    ):
+        raise StoreError(f"{file.filepath()}: is on another grid: move it away or restore [grid]")
+    file.set_auto_chartostring(False)
+    shared = None
+    if "parameter_name" in file.variables:
+        names, units = (
+            tuple(decode_text(np.ma.getdata(file[name][:]))) for name in ("parameter_name", "parameter_unit")
+        )
+        covariance = np.asarray(file["shared_parameter_covariance"][:], dtype=np.float64)
+        line_tilt_variance = np.asarray(file["shared_parameter_line_tilt_variance"][:], dtype=np.float64)
+        shared = SharedParameters(names, units, np.zeros(len(names)), covariance, line_tilt_variance)
+    rasters: dict[str, Any] = {
+        field: LazyRaster(path, name, transform)
+        for field, name, transform in _RASTER_FIELDS
+        if name in file.variables
+    }
+    return Reference(
+        grid=grid,
+        version=str(file.reference_version),
+        shared=shared,
+        scan_ids=tuple(str(file.scan_ids).split()),
+        components=_read_components(file),
+        **rasters,
+    )
+
+
+def _read_components(file: netCDF4.Dataset) -> VarianceComponents:
+    return VarianceComponents(
+        **{
+            field.name: float(file.getncattr(f"{COMPONENT_PREFIX}{field.name}"))
+            for field in fields(VarianceComponents)
+        }
+    )
+
+
+def _replace_fill(values: np.ndarray[Any, Any], fill: float = np.nan) -> Floats32:
+    return np.where(values == np.float32(FILL), np.float32(fill), values)
+
+
+_RASTER_FIELDS: tuple[tuple[str, str, Callable[[np.ndarray[Any, Any]], np.ndarray[Any, Any]]], ...] = (
+    ("elevation_m", "reference_elevation", lambda values: _replace_fill(values).astype(np.float64)),
+    ("random_variance_m2", "reference_random_uncertainty", lambda values: _replace_fill(values) ** 2),
+    ("roughness_m2", "reference_roughness", lambda values: _replace_fill(values) ** 2),
+    ("variance_factor", "reference_variance_factor", lambda values: _replace_fill(values, 1.0)),
+    ("intensity", "reference_intensity", _replace_fill),
+    ("stable", "reference_stable", lambda values: values == 1),
+    ("visibility", "reference_visibility", _replace_fill),
+)

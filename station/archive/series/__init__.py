@@ -1,0 +1,1 @@
+"""Series of epochs: index, epoch reader, manifest, virtual file, lazy dataset."""

@@ -1,0 +1,157 @@
+"""Index of a store: its epochs in order of time, from the files themselves or from `series.nc` alone."""
+
+from __future__ import annotations
+
+from bisect import bisect_right
+from collections.abc import Sequence
+from datetime import datetime
+from pathlib import Path
+from typing import overload
+
+import h5py
+import netCDF4
+import numpy as np
+from isal.igzip_lib import IsalError
+
+from station.archive.chunk_codec import read_column
+from station.archive.epochs import (
+    COMPACTED,
+    EpochRef,
+    compacted_files,
+    compacted_revision,
+    epoch_files,
+    epochs_in_file,
+    parse_epoch_filename,
+)
+from station.archive.netcdf_layout import Series
+from station.archive.schema import TEXT_LENGTH
+from station.errors import StoreError
+from station.quantities import Grid
+
+
+def list_epochs(series: Series) -> list[EpochRef]:
+    """Return the epochs of the store in order of time, the newest revision of each start.
+
+    If several files contain that revision, months take precedence over days and days over epoch files, and a
+    newer compacted file over an older one.
+    """
+    best: dict[datetime, tuple[tuple[int, int, int], EpochRef]] = {}
+    for rank, kind in enumerate(COMPACTED, start=1):
+        for path in compacted_files(series, kind):
+            for epoch in epochs_in_file(path):
+                key = (epoch.revision, rank, compacted_revision(path))
+                if epoch.start not in best or key > best[epoch.start][0]:
+                    best[epoch.start] = key, epoch
+    newest = {
+        epoch_file.start: epoch_file for epoch_file in epoch_files(series)
+    }  # sorted, so the newest revision wins
+    for start, epoch_file in newest.items():
+        if start not in best or epoch_file.revision > best[start][0][0]:
+            best[start] = (epoch_file.revision, 0, 0), epochs_in_file(epoch_file.path)[0]
+    return _drop_simultaneous(
+        sorted((epoch for _, epoch in best.values()), key=lambda epoch: (epoch.time_s, epoch.start))
+    )
+
+
+def _drop_simultaneous(refs: list[EpochRef]) -> list[EpochRef]:
+    """Drop epochs that are not later than their predecessor: two scans cannot have the same mid-time."""
+    kept: list[EpochRef] = []
+    for epoch in refs:
+        if not kept or epoch.time_s > kept[-1].time_s:
+            kept.append(epoch)
+    return kept
+
+
+class SeriesIndex(Sequence[EpochRef]):
+    """The epochs of a `series.nc`, read from that file alone; each `EpochRef` is created on access.
+
+    `time_s` and `start_s` (n,) are seconds since 1970, `epoch_file` (n,) are file names as bytes.
+    """
+
+    def __init__(self, series: Series) -> None:
+        """Read the index; empty if there is no series, StoreError if it cannot be read."""
+        self.time_s, self.start_s = np.empty((2, 0))
+        self.epoch_file = np.empty(0, f"S{TEXT_LENGTH['text']}")
+        self._file_starts: list[int] = []  # index of the first epoch of each file
+        self._locations: list[tuple[Path, int]] = []
+        if not series.path.is_file():
+            return
+        try:
+            with h5py.File(series.path, "r") as file:
+                self.time_s = np.asarray(file["time"][:], dtype=np.float64)
+                self.start_s = np.asarray(file["time_bnds"][:, 0], dtype=np.float64)
+                self.epoch_file = read_column(file["epoch_file"]).view(self.epoch_file.dtype)[:, 0]
+                for source in file["elevation"].virtual_sources():
+                    is_whole_file = source.src_space.get_select_type() == h5py.h5s.SEL_ALL
+                    file_start = 0 if is_whole_file else source.src_space.get_select_bounds()[0][0]
+                    self._file_starts.append(source.vspace.get_select_bounds()[0][0])
+                    self._locations.append((series.folder / source.file_name, file_start))
+        except (OSError, RuntimeError, KeyError, ValueError, IsalError) as error:  # type: ignore[misc] # the stub has no class
+            raise StoreError(f"{series.path}: damaged, cannot be read: {error}") from error
+
+    @property
+    def files(self) -> set[Path]:
+        """Files that contain the epochs."""
+        return {path for path, _ in self._locations}
+
+    def __len__(self) -> int:
+        """Return the number of epochs."""
+        return len(self.time_s)
+
+    @overload
+    def __getitem__(self, position: int) -> EpochRef: ...
+
+    @overload
+    def __getitem__(self, position: slice) -> list[EpochRef]: ...
+
+    def __getitem__(self, position: int | slice) -> EpochRef | list[EpochRef]:
+        """Return the epoch at an index, or a list of epochs for a slice."""
+        if isinstance(position, slice):
+            return [self[index] for index in range(*position.indices(len(self)))]
+        index = range(len(self))[position]
+        name = self.epoch_file[index].decode("ascii")
+        epoch_file = parse_epoch_filename(Path(name))
+        if epoch_file is None:
+            raise StoreError(f"series.nc: damaged, entry {index} names no epoch file")
+        file_number = bisect_right(self._file_starts, index) - 1
+        path, file_start = self._locations[file_number]
+        file_index = file_start + index - self._file_starts[file_number]
+        return EpochRef(
+            name, epoch_file.start, epoch_file.revision, path, file_index, float(self.time_s[index])
+        )
+
+
+def source_files(series_path: Path) -> set[Path]:
+    """Return the files that a `series.nc` refers to; empty if there is no series."""
+    if not series_path.is_file():
+        return set()
+    try:
+        with h5py.File(series_path, "r") as file:
+            return {series_path.parent / source.file_name for source in file["elevation"].virtual_sources()}
+    except (OSError, RuntimeError, KeyError) as error:
+        raise StoreError(f"{series_path}: damaged, cannot be read: {error}") from error
+
+
+def data_folder(site_or_folder: str | Path) -> Path:
+    """Return the data folder of a site file, or the folder itself."""
+    path = Path(site_or_folder)
+    if path.is_file() and path.suffix == ".toml":
+        from station.config import read_site  # noqa: PLC0415 - a folder does not need pydantic
+
+        return read_site(path).station.data
+    return path
+
+
+def series_in(site_or_folder: str | Path) -> Series:
+    """Return the store of a site file or data folder; raise StoreError if there is no series yet."""
+    folder = data_folder(site_or_folder)
+    try:
+        with netCDF4.Dataset(folder / "series.nc") as file:
+            x_m, y_m = (np.asarray(file[axis][:], dtype=np.float64) for axis in "xy")
+            x_bounds, y_bounds = (file[f"{axis}_bnds"][0] for axis in "xy")
+            west_m, north_m = float(x_bounds.min()), float(y_bounds.max())
+            grid = Grid(west_m, north_m, float(np.ptp(x_bounds)), len(x_m), len(y_m))
+            crs = str(file["crs"].crs_wkt) if "crs" in file.variables else None
+            return Series(folder, str(file.station_id), grid, crs)
+    except (OSError, RuntimeError, KeyError, IndexError, AttributeError) as error:
+        raise StoreError(f"{folder}: holds no readable series (see station status): {error}") from error

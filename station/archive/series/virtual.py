@@ -1,0 +1,206 @@
+"""Building `series.nc`: the whole series as a virtual HDF5 file over the files of epochs, days and months."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from dataclasses import replace
+from itertools import groupby, product
+from pathlib import Path
+from typing import Any
+
+import h5py
+import netCDF4
+import numpy as np
+
+from station.archive.atomic_files import atomic_write
+from station.archive.netcdf_layout import TIMES_PER_CHUNK, Series, attributes, create_file, create_variable
+from station.archive.schema import FILL, Variable
+from station.archive.series.epoch_reader import (
+    LARGE_VARIABLES,
+    SMALL_VARIABLES,
+    EpochSource,
+    Parameters,
+    contiguous_runs,
+    copy_unchanged,
+    read_source,
+)
+from station.archive.series.index import list_epochs, source_files
+from station.archive.series.manifest import SeriesManifest, pending_epochs, write_manifest
+from station.errors import StoreError
+
+LIBVER_VIRTUAL = ("v110", "v110")  # HDF5 version bounds; with newer ones only xarray can read the file
+
+
+def build_series(series: Series) -> Path:
+    """Bring `series.nc` up to date with the files of the store, by atomic replacement, and return its path.
+
+    If only later epochs were added, the other epochs are copied from the old `series.nc` and no other file is
+    opened. Raises StoreError if a file is damaged, nothing is stored yet, or the file cannot be written.
+    """
+    pending = pending_epochs(series)
+    if pending is None:
+        return _rebuild(series)
+    manifest, new_sources = pending
+    if not new_sources:
+        return series.path
+    unchanged = manifest.count // TIMES_PER_CHUNK * TIMES_PER_CHUNK
+    last_chunk = read_source(series.path, unchanged, unchanged, manifest.count - unchanged)
+    with atomic_write(series.path) as tmp_path:
+        with netCDF4.Dataset(tmp_path, "w", clobber=False) as file:
+            write_scalars(file, series, _title(series), [last_chunk, *new_sources], manifest.parameters)
+        with h5py.File(tmp_path, "r+", libver=LIBVER_VIRTUAL) as file:
+            with h5py.File(series.path, "r") as old_file:
+                copy_unchanged(
+                    old_file, file, ("time", "time_bnds", *(spec.name for spec in SMALL_VARIABLES)), unchanged
+                )
+            _link_rasters(file, series, [*manifest.sources, *new_sources], manifest.parameters)
+    write_manifest(series, replace(manifest, sources=[*manifest.sources, *new_sources]))
+    return series.path
+
+
+def _rebuild(series: Series) -> Path:
+    epochs = list_epochs(series)
+    if not epochs:
+        raise StoreError(f"{series.folder}: nothing is stored yet")
+    epoch_sources = [read_source(*run) for run in contiguous_runs(epochs)]
+    parameters: Parameters = {}
+    for source in reversed(epoch_sources):
+        parameters = source.parameters | parameters
+    with atomic_write(series.path) as tmp_path:
+        with netCDF4.Dataset(tmp_path, "w", clobber=False) as file:
+            write_scalars(file, series, _title(series), epoch_sources, parameters)
+        with h5py.File(tmp_path, "r+", libver=LIBVER_VIRTUAL) as file:
+            _link_rasters(file, series, epoch_sources, parameters)
+        _touch(source_files(series.path) - {source.path for source in epoch_sources})
+    newest_start_s = max(epoch.start for epoch in epochs).timestamp()
+    write_manifest(series, SeriesManifest(epoch_sources, parameters, epochs[-1].time_s, newest_start_s))
+    return series.path
+
+
+def _title(series: Series) -> str:
+    return f"Elevation change at {series.name or series.station_id}"
+
+
+def _touch(paths: set[Path]) -> None:
+    """Restart the grace period of files that the series no longer refers to."""
+    for path in paths:
+        if path.is_file():
+            os.utime(path)
+
+
+def write_scalars(
+    file: netCDF4.Dataset,
+    series: Series,
+    title: str,
+    epoch_sources: list[EpochSource],
+    parameters: Parameters,
+) -> None:
+    """Write all of a file of many epochs but the large variables; missing values keep the fill value.
+
+    Epochs that precede the first source are not written.
+    """
+    file.set_auto_mask(False)
+    file.set_auto_chartostring(False)
+    first, count = epoch_sources[0].series_start, epoch_sources[-1].series_start + epoch_sources[-1].count
+    create_file(file, series, title, count, (tuple(parameters), tuple(parameters.values())))
+    for spec in SMALL_VARIABLES:
+        if all(dim in file.dimensions for dim in spec.dims):
+            create_variable(file, spec, series, count)
+    for name, variable in file.variables.items():
+        if variable.dimensions[:1] != ("time",):
+            continue
+        fill = {"S": b"", "f": FILL}.get(variable.dtype.kind, 0)
+        values = np.full((count - first, *variable.shape[1:]), fill, variable.dtype)
+        for source in epoch_sources:
+            if name in source.scalars:
+                target = slice(source.series_start - first, source.series_start + source.count - first)
+                indices = (
+                    _parameter_indices(source, parameters) if "parameter" in variable.dimensions else ...
+                )
+                values[target, indices] = source.scalars[name]
+        variable[first:count] = values
+
+
+def _parameter_indices(source: EpochSource, parameters: Parameters) -> list[int]:
+    """Return the indices of the shared parameters of a source among all parameters (p,)."""
+    if source.parameters is parameters:  # nearly always, when a series grows
+        return list(range(len(parameters)))
+    index_of = {name: index for index, name in enumerate(parameters)}
+    return [index_of[name] for name in source.parameters]
+
+
+def _link_rasters(
+    file: Any,  # noqa: ANN401 - h5py has no types
+    series: Series,
+    epoch_sources: list[EpochSource],
+    parameters: Parameters,
+) -> None:
+    """Add the large variables as virtual datasets, with paths relative to the series.
+
+    Uses h5py's low-level API, because the high-level API dominates the time for a hundred files.
+    """
+    paths = [str(source.path.relative_to(series.folder)).encode() for source in epoch_sources]
+    spaces: dict[tuple[object, ...], list[tuple[Any, Any]]] = {}  # the same for all rasters
+    for spec in LARGE_VARIABLES:
+        if not any(spec.name in source.raster_shapes for source in epoch_sources):
+            continue
+        shape = tuple(len(file[dim]) for dim in spec.dims)
+        layout = h5py.h5p.create(h5py.h5p.DATASET_CREATE)
+        layout.set_fill_value(np.array(FILL if spec.dtype[0] == "f" else 0, spec.dtype))
+        for source, path in zip(epoch_sources, paths, strict=True):
+            if spec.name in source.raster_shapes:
+                key = (source.series_start, spec.dims, source.raster_shapes[spec.name])
+                if key not in spaces:
+                    spaces[key] = list(_hyperslabs(source, spec, parameters, shape))
+                for series_space, file_space in spaces[key]:
+                    layout.set_virtual(series_space, path, spec.name.encode(), file_space)
+        dtype = h5py.h5t.py_create(np.dtype(spec.dtype), logical=True)
+        dataset_id = h5py.h5d.create(
+            file.id, spec.name.encode(), dtype, h5py.h5s.create_simple(shape), layout
+        )
+        _write_raster_attrs(h5py.Dataset(dataset_id), file, spec, series)
+
+
+def _hyperslabs(
+    source: EpochSource, spec: Variable, parameters: Parameters, shape: tuple[int, ...]
+) -> Iterator[tuple[Any, Any]]:
+    """Yield the HDF5 selections (series, file) that map a source to a large variable."""
+    parameter_blocks = _contiguous_blocks(_parameter_indices(source, parameters))
+    blocks = [
+        parameter_blocks if dim.startswith("parameter") else [(0, 0, size)]
+        for dim, size in zip(spec.dims[1:], shape[1:], strict=True)
+    ]
+    for (file_1, series_1, size_1), (file_2, series_2, size_2) in product(*blocks):
+        series_corner, file_corner = (
+            (source.series_start, series_1, series_2),
+            (source.file_start, file_1, file_2),
+        )
+        size = source.count, size_1, size_2
+        series_space, file_space = (
+            h5py.h5s.create_simple(extent) for extent in (shape, source.raster_shapes[spec.name])
+        )
+        series_space.select_hyperslab(series_corner, size)
+        file_space.select_hyperslab(file_corner, size)
+        yield series_space, file_space
+
+
+def _contiguous_blocks(indices: list[int]) -> list[tuple[int, int, int]]:
+    """Split indices into contiguous blocks: (index in the source, index in the series, count)."""
+    if indices == list(range(len(indices))):
+        return [(0, 0, len(indices))]
+    blocks = []
+    for _, group in groupby(enumerate(indices), key=lambda pair: pair[1] - pair[0]):
+        pairs = list(group)
+        blocks.append((*pairs[0], len(pairs)))
+    return blocks
+
+
+def _write_raster_attrs(dataset: Any, file: Any, spec: Variable, series: Series) -> None:  # noqa: ANN401 - h5py has no types
+    """Write dimensions and attributes of a virtual dataset the way netCDF expects them."""
+    for axis, dim in enumerate(spec.dims):
+        dataset.dims[axis].attach_scale(file[dim])
+    for key, value in attributes(spec, mapped=series.crs is not None).items():
+        dataset.attrs[key] = np.bytes_(value) if isinstance(value, str) else value
+    if spec.dtype[0] == "f":
+        dataset.attrs["_FillValue"] = np.array([FILL], dtype=spec.dtype)

@@ -1,0 +1,46 @@
+"""`station init` and `station check`."""
+
+from __future__ import annotations
+
+import json
+import sys
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from station.commands._options import Json, SiteArgument
+
+
+def init(
+    folder: Annotated[Path, typer.Argument(metavar="DIR", help="Where to write it.", show_default=False)],
+    like: Annotated[str, typer.Option(help="hef: glacier, VZ-6000. mammoth: snow field, VZ-400i.")] = "hef",
+) -> None:
+    """Write a commented site file to start from."""
+    from station.config import write_site
+
+    print(write_site(folder, like))
+
+
+def check(
+    site: SiteArgument,
+    *,
+    store: Annotated[
+        bool, typer.Option("--store", help="Check the store against its journal and checksums instead.")
+    ] = False,
+    json_: Json = False,
+) -> None:
+    """Check the site file, SOP, folders, weather and newest scan.
+
+    Everything that can be known before going live. Exits with 1 if something has to be fixed.
+    """
+    from station.operations.site_check import site_findings, store_findings
+
+    findings = store_findings(site) if store else site_findings(site)
+    if json_:
+        print(json.dumps(findings, indent=2))
+    else:
+        for finding in findings:
+            print(f"{finding['level']:7} {finding['what']}: {finding['message']}")
+    if any(finding["level"] == "fault" for finding in findings):
+        sys.exit(1)

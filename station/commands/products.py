@@ -1,0 +1,151 @@
+"""`station areas`, `station plot`, `station export` and `station serve`."""
+
+from __future__ import annotations
+
+import sys
+from enum import StrEnum
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from station.commands._options import Against, FromOption, SiteArgument, ToOption, progress_bar
+
+
+class PlotKind(StrEnum):
+    """What `station plot` draws."""
+
+    map = "map"
+    curve = "curve"
+    film = "film"
+
+
+class MapVariable(StrEnum):
+    """The variable of a map."""
+
+    change = "change"
+    sigma = "sigma"
+    points = "points"
+
+
+class ExportFormat(StrEnum):
+    """What `station export` writes."""
+
+    geotiff = "geotiff"
+    csv = "csv"
+    stac = "stac"
+
+
+def areas(
+    site: SiteArgument,
+    polygons: Annotated[
+        Path | None,
+        typer.Argument(
+            metavar="[POLYGONS]",
+            help="GeoJSON of named polygons; without it, those of the site.",
+            show_default=False,
+        ),
+    ] = None,
+    first: FromOption = None,
+    last: ToOption = None,
+    against: Against = "reference",
+    table: Annotated[
+        str | None, typer.Option("--csv", metavar="FILE", help="Write CSV; - is stdout.", show_default=False)
+    ] = None,
+) -> None:
+    """Print how areas changed, with 95 % intervals.
+
+    Mean, median and volume; also for polygons drawn later, and between any two epochs.
+    """
+    from station.config import read_site
+    from station.products.area_tables import Span, area_records, as_csv, as_text
+
+    span = Span.parse(first, last)
+    records = area_records(read_site(site), polygons, span, against, progress_bar("summing up"))
+    if table is None:
+        print(as_text(records))
+    elif table == "-":
+        print(as_csv(records), end="")
+    else:
+        Path(table).write_text(as_csv(records), encoding="utf-8")
+
+
+def plot(
+    site: SiteArgument,
+    kind: Annotated[
+        PlotKind, typer.Argument(metavar="map|curve|film", help="What to draw.", show_default=False)
+    ],
+    epoch: Annotated[str, typer.Option(metavar="EPOCH", help="Map: a scan's name or a time.")] = "last",
+    against: Against = "reference",
+    show: Annotated[MapVariable, typer.Option(help="Map: the variable.")] = MapVariable.change,
+    area: Annotated[
+        str | None, typer.Option(help="Curve: one area instead of all.", show_default=False)
+    ] = None,
+    polygons: Annotated[
+        Path | None, typer.Option(metavar="GEOJSON", help="Curve: other areas.", show_default=False)
+    ] = None,
+    first: FromOption = None,
+    last: ToOption = None,
+    limit: Annotated[
+        float | None, typer.Option(help="End of the colour scale, m.", min=1e-3, show_default=False)
+    ] = None,
+    width: Annotated[
+        int | None, typer.Option(help="Width of a map, pixels.", min=300, max=8000, show_default=False)
+    ] = None,
+    out: Annotated[Path | None, typer.Option("--out", "-o", metavar="FILE", show_default=False)] = None,
+) -> None:
+    """Draw a map, the curve of an area, or a film.
+
+    The suffix of the file decides its format: png, webp, jpg; curves also svg, pdf; films webp, gif.
+    """
+    from station.config import read_site
+    from station.products import plots
+    from station.products.area_tables import Span, area_records
+
+    settings, span = read_site(site), Span.parse(first, last)
+    out = out or Path(f"{settings.station.id}_{kind.value}.{'webp' if kind is PlotKind.film else 'png'}")
+    if kind is PlotKind.map:
+        plots.plot_map(settings, epoch, against, show.value, out, width, limit)
+    elif kind is PlotKind.film:
+        plots.plot_film(settings, span, out, width, limit, progress_bar("drawing"))
+    else:
+        records = area_records(settings, polygons, span, against, progress_bar("summing up"))
+        plots.plot_curve(records, area, plots.curve_title(settings, against), out)
+    print(out)
+
+
+def export(
+    site: SiteArgument,
+    kind: Annotated[
+        ExportFormat, typer.Argument(metavar="geotiff|csv|stac", help="The format.", show_default=False)
+    ],
+    folder: Annotated[Path, typer.Argument(metavar="[DIR]", help="Where to write.")] = Path(),
+    first: FromOption = None,
+    last: ToOption = None,
+) -> None:
+    """Write files for tools that do not read NetCDF.
+
+    The newest epoch, or those of a span: change and its uncertainty as GeoTIFF with QGIS styles, a STAC
+    catalogue of these, or scans and areas as CSV.
+    """
+    from station.config import read_site
+    from station.products.area_tables import Span
+    from station.products.export import export as write_files
+
+    span = Span.parse(first, last) if first or last else None
+    for path in write_files(read_site(site), kind.value, span, folder, progress_bar("writing")):
+        print(path)
+
+
+def serve(
+    site: SiteArgument,
+    port: Annotated[int, typer.Option(min=1, max=65535, help="On 127.0.0.1.")] = 8750,
+) -> None:
+    """Serve the station's page on this machine, read-only."""
+    from station.config import read_site
+    from station.processing.previews import page_folder
+    from station.products.serve import serve as serve_folder
+
+    folder = page_folder(read_site(site))
+    print(f"http://127.0.0.1:{port}/ (Ctrl-C ends it)", file=sys.stderr)
+    serve_folder(folder, port)

@@ -1,0 +1,46 @@
+"""Content hash of a file, and a check that the file did not change while it was read."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import stat
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from station.errors import NotReadyError, ScanError
+
+
+@contextmanager
+def hash_if_unchanged(path: Path) -> Iterator[str]:
+    """Yield the SHA-256 of a regular file; raise NotReadyError on exit if the file changed meanwhile."""
+    identity = file_identity(path)
+    yield sha256_file(path)
+    if file_identity(path) != identity:
+        raise NotReadyError("the file changed while it was read")
+
+
+def file_identity(path: Path) -> tuple[int, int, int]:
+    """Return (inode, size, mtime_ns) of a file.
+
+    Raises ScanError if it is not a regular file, NotReadyError if it does not exist or cannot be accessed.
+    """
+    try:
+        status = path.lstat()
+    except FileNotFoundError as error:
+        raise NotReadyError("the file no longer exists") from error
+    except OSError as error:
+        raise NotReadyError(f"the file cannot be accessed: {error.strerror}") from error
+    if not stat.S_ISREG(status.st_mode):
+        raise ScanError("not a regular file: links, pipes and devices are rejected")
+    return status.st_ino, status.st_size, status.st_mtime_ns
+
+
+def sha256_file(path: Path) -> str:
+    """Return the SHA-256 of a file; links are not followed. Raises NotReadyError if it cannot be read."""
+    try:
+        with os.fdopen(os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK), "rb") as file:
+            return hashlib.file_digest(file, "sha256").hexdigest()
+    except OSError as error:
+        raise NotReadyError(f"{path.name} cannot be read: {error.strerror}") from error

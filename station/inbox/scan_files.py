@@ -1,0 +1,45 @@
+"""Paths of a scan and its inclination log, in the inbox or in the archive of raw scans."""
+
+from __future__ import annotations
+
+from datetime import UTC, datetime
+from pathlib import Path
+
+from station.config import Site
+from station.inbox.inbox import ScanFile
+
+
+def scan_file(site: Site, path: Path) -> ScanFile:
+    """Return a scan with its inclination log, if that is in the same folder."""
+    status = path.lstat()
+    return ScanFile(path.name, path.absolute(), _log_path(site, path), status.st_size, status.st_mtime_ns)
+
+
+def find_scan(site: Site, name: str, start_utc_s: float | None) -> ScanFile | None:
+    """Return a processed scan from the inbox or the archive; None if it no longer exists.
+
+    If the log arrived after the scan was archived, it is taken from the inbox.
+    """
+    path = site.scans.inbox / name
+    if path.is_file() and not path.is_symlink():
+        return scan_file(site, path)
+    if site.retention.archive is None or start_utc_s is None:
+        return None
+    path = archive_path(site.retention.archive, name, start_utc_s)
+    if not path.is_file():
+        return None
+    scan = scan_file(site, path)
+    log = scan.log or _log_path(site, site.scans.inbox / name)
+    return ScanFile(name, path, log, scan.size, scan.mtime_ns)
+
+
+def archive_path(archive: Path, name: str, start_utc_s: float) -> Path:
+    """Return the path of a scan in the archive: one folder per month."""
+    return archive / datetime.fromtimestamp(start_utc_s, UTC).strftime("%Y/%m") / name
+
+
+def _log_path(site: Site, scan: Path) -> Path | None:
+    if site.inclination is None:
+        return None
+    log_path = scan.with_name(f"{scan.stem}{site.inclination.suffix}").absolute()
+    return log_path if log_path.is_file() and not log_path.is_symlink() else None

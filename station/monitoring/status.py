@@ -1,0 +1,169 @@
+"""Status of a station for `station status`: counts, waiting scans, the last stored scan, faults."""
+
+from __future__ import annotations
+
+import math
+import shutil
+import time
+from typing import TYPE_CHECKING, Any
+
+from station.errors import NotReadyError, StationError, StoreError
+from station.inbox.inbox import is_scan, list_folder, safe_name
+from station.inbox.journal import Entry, Journal, State
+from station.inbox.lock import is_locked
+from station.monitoring.alarm_state import active
+from station.monitoring.preconditions import clock_problem, format_utc, require_disk_space
+from station.readers.scan import suffixes
+
+if TYPE_CHECKING:
+    from station.config import Site
+
+Status = dict[str, Any]  # printed by `station status --json`
+
+
+def status(site: Site) -> Status:
+    """Return the status: counts, waiting and rejected scans with reasons, quality of the last scan, faults.
+
+    Works with or without a running service. Raises StoreError if the journal cannot be read.
+    """
+    data = site.station.data
+    with Journal(data / "journal.sqlite", read_only=True) as journal:
+        queue = _queue_status(site, journal)
+        counts = journal.counts()
+        last = journal.last_stored()
+    return {
+        "station": site.station.id,
+        "name": site.station.name,
+        "service": "running" if is_locked(data) else "not running",
+        "counts": counts,
+        "waiting": queue["waiting"],
+        "set_aside": queue["set_aside"],
+        "last": _last_scan(last) if last else None,
+        "moved": _last_pose_step(site),
+        "alarms": active(data),
+        "stale": _count_outdated(site),
+        "series": str(data / "series.nc") if (data / "series.nc").exists() else None,
+        "disk_free_gb": round(shutil.disk_usage(data).free / 1e9, 2) if data.is_dir() else None,
+        "faults": [*queue["faults"], *filter(None, [_log_clock_problem(site)])],
+    }
+
+
+def queue_status(site: Site) -> Status:
+    """Return the part of `status` that needs no series: waiting scans, scans set aside, faults."""
+    with Journal(site.station.data / "journal.sqlite", read_only=True) as journal:
+        return _queue_status(site, journal)
+
+
+def _queue_status(site: Site, journal: Journal) -> Status:
+    waiting = [_waiting_scan(entry) for entry in journal.waiting()]
+    set_aside = [
+        {"scan": entry.name, "reason": entry.reason, "since": format_utc(entry.changed_utc_s)}
+        for entry in journal.rows(State.SET_ASIDE)
+    ]
+    inbox_problem = ""
+    try:
+        names = {safe_name(name) for name in list_folder(site.scans.inbox) if is_scan(name, suffixes())}
+    except NotReadyError as error:
+        names, inbox_problem = set(), str(error)
+    running = is_locked(site.station.data)
+    new_scans_wait_for = "the service to read it" if running else "the service, which is not running"
+    waiting += [
+        {"scan": name, "state": "new", "for": new_scans_wait_for, "next_try": None}
+        for name in journal.unrecorded(names)
+    ]
+    faults = (inbox_problem, _disk_space_problem(site), clock_problem(site.station.data, time.time()))
+    return {"waiting": waiting, "set_aside": set_aside, "faults": [fault for fault in faults if fault]}
+
+
+def format_status(report: Status) -> str:
+    """Return a status as text, one fact per line."""
+    counts, waiting = report["counts"], len(report["waiting"])
+    lines = [
+        f"{report['name'] or report['station']}: service {report['service']}",
+        f"scans    {counts['stored']} stored, {len(report['set_aside'])} set aside, {waiting} waiting",
+    ]
+    if last := report["last"]:
+        metrics = " ".join(f"{key}={value}" for key, value in last["figures"].items() if value is not None)
+        reason = f" ({last['reason']})" if last["reason"] else ""
+        lines.append(f"last     {last['scan']} of {last['start']}: {last['verdict']}{reason} {metrics}")
+    if outdated := report["stale"]:
+        lines.append(
+            f"stale    {outdated} epochs with an outdated SOP, setting, flag or reference:"
+            " run station reprocess"
+        )
+    free_gb = report["disk_free_gb"]
+    lines.append(f"disk     {f'{free_gb:.2f} GB free' if free_gb is not None else 'no data folder yet'}")
+    lines.append(f"series   {report['series'] or 'none yet'}")
+    lines += [f"moved    {report['moved']}"] if report["moved"] else []
+    lines += [f"alarm    {text}" for text in report["alarms"].values()]
+    lines += [f"fault    {fault}" for fault in report["faults"]]
+    for scan in report["waiting"]:
+        next_try = f", next try {scan['next_try']}" if scan["next_try"] else ""
+        lines.append(f"waits    {scan['scan']}: {scan['for'] or 'its turn'}{next_try}")
+    lines += [f"aside    {scan['scan']}: {scan['reason']}" for scan in report["set_aside"]]
+    return "\n".join(lines)
+
+
+def _waiting_scan(entry: Entry) -> dict[str, str | None]:
+    next_try = format_utc(entry.next_try_utc_s) if entry.next_try_utc_s is not None else None
+    return {
+        "scan": entry.name,
+        "state": entry.state.value,
+        "for": entry.waiting_reason or "its turn",
+        "next_try": next_try,
+    }
+
+
+def _last_scan(entry: Entry) -> Status:
+    metrics = {
+        key: None if isinstance(value, float) and not math.isfinite(value) else value  # JSON knows no NaN
+        for key, value in entry.metrics.items()
+    }
+    return {
+        "scan": entry.name,
+        "start": format_utc(entry.start_utc_s) if entry.start_utc_s is not None else None,
+        "stored": format_utc(entry.changed_utc_s),
+        "verdict": entry.verdict,
+        "reason": entry.reason,
+        "epoch": entry.epoch,
+        "reference": entry.reference,
+        "figures": metrics,
+    }
+
+
+def _last_pose_step(site: Site) -> str:
+    from station.monitoring.pose_stability import latest_step  # noqa: PLC0415 - not needed without a series
+
+    try:
+        return latest_step(site) if (site.station.data / "series.nc").is_file() else ""
+    except StoreError as error:
+        return str(error)
+
+
+def _log_clock_problem(site: Site) -> str:
+    from station.monitoring.log_clock import log_clock_offset  # noqa: PLC0415 - as above
+
+    try:
+        return log_clock_offset(site) if site.adjusts and (site.station.data / "series.nc").is_file() else ""
+    except StoreError as error:
+        return str(error)
+
+
+def _count_outdated(site: Site) -> int | None:
+    """Return the number of epochs whose settings are outdated; None if it cannot be determined now."""
+    if not (site.station.data / "series.nc").is_file():
+        return 0
+    from station.processing.staleness import count_outdated  # noqa: PLC0415 - a second of imports
+
+    try:
+        return count_outdated(site)
+    except StationError:
+        return None
+
+
+def _disk_space_problem(site: Site) -> str:
+    try:
+        require_disk_space(site)
+    except StoreError as error:
+        return str(error)
+    return ""

@@ -1,0 +1,1 @@
+"""What an operator starts by hand: batches, reprocessing, checks, SOPs and reports."""

@@ -1,0 +1,200 @@
+"""Checks of site file, inputs and store that need no running service."""
+
+from __future__ import annotations
+
+import math
+import os
+import shutil
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+from station.config import Site, read_site
+from station.errors import NotReadyError, ScanError, StationError
+from station.inbox.journal import Journal
+from station.inbox.lock import is_locked
+from station.inbox.scan_files import scan_file
+from station.monitoring.preconditions import EARLIEST_S
+from station.processing import isolation
+from station.processing.integrity import check_store
+from station.processing.scan_inputs import scanner_to_map
+from station.processing.scan_tasks import dry_run, load_areas, polygon_cells, series_for
+from station.readers.flags import read_flags
+from station.readers.scan import suffixes
+from station.readers.weather import interpolate_air, read_weather
+
+Finding = dict[str, str]  # level (ok, warning, fault), what, message
+EPOCH_BYTES_PER_CELL = 16  # typical, uncompressed
+
+
+def site_findings(site_path: Path) -> list[Finding]:
+    """Return findings on the site file and all it names; raise ConfigError if the file cannot be read."""
+    site = read_site(site_path)
+    return [
+        _finding("ok", "config", f"{site_path}: {site.station.name or site.station.id}"),
+        *_sop_poses(site),
+        *_polygons(site),
+        *_folders(site),
+        *_flags(site),
+        *_clock(),
+        *_weather(site),
+        *_newest_scan(site),
+    ]
+
+
+def store_findings(site_path: Path) -> list[Finding]:
+    """Return findings on the store, compared with journal and checksums; the service may be running.
+
+    Raises ConfigError if the site file cannot be read, StoreError if the journal cannot.
+    """
+    site = read_site(site_path)
+    findings = _check_store_isolated(site)
+    if is_locked(site.station.data) and any(level != "ok" for level, *_ in findings):
+        repeated = _check_store_isolated(site)  # work of the service in the meantime is no finding
+        findings = [finding for finding in repeated if finding[0] == "ok" or finding in findings]
+    return [_finding(level, what, message) for level, what, message in findings]
+
+
+def _check_store_isolated(site: Site) -> list[tuple[str, str, str]]:
+    with Journal(site.station.data / "journal.sqlite", read_only=True) as journal:
+        entries, known = journal.rows(), journal.checksums()
+    return isolation.run_isolated(
+        check_store, site, entries, known, memory_gb=site.service.memory_gb, timeout_s=math.inf
+    )
+
+
+def _finding(level: str, what: str, message: str) -> Finding:
+    return {"level": level, "what": what, "message": message}
+
+
+def _sop_poses(site: Site) -> Iterator[Finding]:
+    """Yield position and tilt of the scanner under each SOP, and a fault if the grid is out of range."""
+    grid = site.grid_cells
+    if site.scans.frame == "map" and site.map.origin is None:
+        message = "map.origin, the scanner's position, is missing: sigma contains only the scatter of points"
+        yield _finding("warning", "map", message)
+    for sop in site.sop:
+        try:
+            frame = scanner_to_map(site, sop)
+        except StationError as error:
+            yield _finding("fault", "sop", str(error))
+            continue
+        east_m, north_m, height_m = frame.position_m
+        tilt_deg = math.degrees(math.acos(min(1.0, frame.to_local[2, 2])))
+        yield _finding(
+            "ok",
+            "sop",
+            f"{sop.file.name} from {sop.from_:%Y-%m-%d}: scanner at"
+            f" {east_m:.2f} {north_m:.2f} {height_m:.2f}, tilt {tilt_deg:.2f}°",
+        )
+        distance_m = math.hypot(
+            max(grid.west_m - east_m, 0.0, east_m - grid.west_m - grid.nx * grid.cell_m),
+            max(north_m - grid.north_m, 0.0, grid.north_m - grid.ny * grid.cell_m - north_m),
+        )
+        if distance_m > site.scanner.range_max_m:
+            yield _finding(
+                "fault", "grid", f"begins {distance_m:,.0f} m from the scanner: beyond range_max_m"
+            )
+
+
+def _polygons(site: Site) -> Iterator[Finding]:
+    """Yield the number of cells in each named polygon."""
+    try:
+        areas = {f"area {name}": cells for name, cells in load_areas(site).items()}
+        if isinstance(site.adjustment.stable, Path) and site.adjustment.method == "joint":
+            areas["stable ground"] = polygon_cells(site.adjustment.stable, site)
+    except StationError as error:
+        yield _finding("fault", "polygons", str(error))
+        return
+    for name, cells in areas.items():
+        message = f"{name}: {int(cells.sum()):,} cells of the grid"
+        yield _finding("ok" if cells.any() else "fault", "polygons", message)
+
+
+def _folders(site: Site) -> Iterator[Finding]:
+    inbox, data = site.scans.inbox, site.station.data
+    if not inbox.is_dir():
+        yield _finding("fault", "inbox", f"{inbox}: no such folder")
+    elif not os.access(inbox, os.R_OK | os.X_OK):
+        yield _finding("fault", "inbox", f"{inbox}: no permission to read")
+    else:
+        yield _finding("ok", "inbox", f"{inbox}: {len(_scans(site))} scans")
+    if site.retention.raw != "leave" and not os.access(inbox, os.W_OK):
+        message = f"{inbox}: no permission to write, but retention.raw is {site.retention.raw!r}"
+        yield _finding("warning", "retention", message)
+    existing = next(parent for parent in (data, *data.parents) if parent.exists())
+    if not os.access(existing, os.W_OK | os.X_OK):
+        yield _finding("fault", "data", f"{existing}: no permission to write")
+        return
+    free = shutil.disk_usage(existing).free
+    required = 24 * EPOCH_BYTES_PER_CELL * math.prod(series_for(site).grid.shape)
+    message = f"{data}: {free / 1e9:.1f} GB free; a day of hourly epochs needs up to {required / 1e9:.2f} GB"
+    yield _finding("ok" if free > required else "warning", "data", message)
+
+
+def _flags(site: Site) -> Iterator[Finding]:
+    """Yield the number of bad intervals in the flags file."""
+    if site.flags is None:
+        return
+    try:
+        yield _finding("ok", "flags", f"{site.flags.file}: {len(read_flags(site.flags.file))} intervals")
+    except StationError as error:
+        yield _finding("fault", "flags", str(error))
+
+
+def _clock() -> Iterator[Finding]:
+    now_s = time.time()
+    text = time.strftime("%Y-%m-%d %H:%M:%S UTC", time.gmtime(now_s))
+    yield _finding("ok" if now_s > EARLIEST_S else "fault", "clock", text)
+
+
+def _weather(site: Site) -> Iterator[Finding]:
+    settings = site.weather
+    if settings is None:
+        return
+    try:
+        log = read_weather(
+            settings.file,
+            format=settings.format,
+            columns=settings.columns,
+            utc_offset_h=settings.utc_offset_h,
+        )
+    except (ScanError, NotReadyError) as error:
+        yield _finding("warning", "weather", str(error))
+        return
+    if len(log.time_utc_s) == 0:
+        yield _finding("warning", "weather", f"{settings.file}: no rows yet")
+        return
+    last_s = float(log.time_utc_s[-1])
+    air = interpolate_air(log, last_s, settings.max_age_s)
+    message = f"{len(log.time_utc_s)} rows up to {time.strftime('%Y-%m-%d %H:%M UTC', time.gmtime(last_s))}"
+    if air is not None:
+        message += f": {air.temperature_c:.1f} °C, {air.pressure_hpa:.1f} hPa, {air.humidity_pct:.0f} %"
+    yield _finding("ok", "weather", message)
+
+
+def _scans(site: Site) -> list[Path]:
+    return sorted(path for path in site.scans.inbox.iterdir() if path.suffix.lower() in suffixes())
+
+
+def _newest_scan(site: Site) -> Iterator[Finding]:
+    """Measure the newest scan without storing it."""
+    scans = _scans(site) if site.scans.inbox.is_dir() else []
+    if not scans:
+        yield _finding("warning", "scan", "no scan in the inbox to measure")
+        return
+    scan = scan_file(site, scans[-1])
+    try:
+        verdict, reason, metrics = isolation.run_isolated(
+            dry_run,
+            site,
+            scan,
+            memory_gb=site.service.memory_gb,
+            timeout_s=site.scans.timeout_s,
+        )
+    except StationError as error:
+        yield _finding("fault", "scan", f"{scan.name}: {error}")
+        return
+    text = " ".join(f"{key}={value}" for key, value in metrics.items())
+    message = f"{scan.name}: {verdict}{f' ({reason})' if reason else ''} {text}"
+    yield _finding("ok" if verdict == "good" else "warning", "scan", message)

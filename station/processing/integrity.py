@@ -1,0 +1,332 @@
+"""Consistency of store and journal: checksums, quarantine of damaged files, recovery of a lost journal.
+
+Functions with a `progress` argument read many files and run in a worker process.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from datetime import datetime
+from pathlib import Path
+
+import h5py
+import numpy as np
+
+from station.archive.epochs import (
+    EpochRef,
+    compacted_files,
+    epoch_files,
+    epochs_in_file,
+    parse_epoch_filename,
+)
+from station.archive.netcdf_layout import Series, decode_text
+from station.archive.reference_files import version_path
+from station.archive.schema import VERDICTS
+from station.archive.series.index import list_epochs, source_files
+from station.archive.series.manifest import index_if_current
+from station.config import Site
+from station.errors import StoreError
+from station.inbox.file_hash import sha256_file
+from station.inbox.journal import Entry, State
+from station.inbox.scan_files import find_scan
+from station.processing.provenance import StoredEpoch, stored_epochs
+from station.processing.scan_inputs import read_tilt_offset, write_tilt_offset
+from station.processing.scan_tasks import Progress, series_for
+from station.readers.scan import suffixes
+from station.science.geometry.inclination import CyclicError
+
+DAMAGED = ".damaged"  # appended to the file name; such a file is never read and never deleted
+
+
+@dataclass(frozen=True)
+class Verification:
+    """Result of a verification: new checksums of intact files, and damaged files (relative paths)."""
+
+    new_checksums: dict[str, str]  # SHA-256 by file
+    damaged: tuple[str, ...]
+
+
+def store_files(series: Series) -> list[Path]:
+    """Return the immutable files of the store: epochs, compacted files, versions of the reference."""
+    return [
+        *(epoch_file.path for epoch_file in epoch_files(series)),
+        *compacted_files(series, "days"),
+        *compacted_files(series, "months"),
+        *sorted(series.folder.glob("reference_*.nc")),
+    ]
+
+
+def is_reference(path: Path | str) -> bool:
+    """Return True if a file is a version of the reference, False if it contains epochs."""
+    return Path(path).name.startswith("reference_")
+
+
+def holds_epochs(series: Series) -> bool:
+    """Return True if the store contains epochs."""
+    return any(not is_reference(path) for path in store_files(series))
+
+
+def verify_checksums(
+    site: Site, checksums: Mapping[str, str], progress: Progress, *, deep: bool = True
+) -> Verification:
+    """Verify files against their checksums; read files without a checksum completely.
+
+    With `deep=False`, only files without a checksum are read.
+    """
+    series = series_for(site)
+    new_checksums, damaged = {}, []
+    for path in store_files(series):
+        name = str(path.relative_to(series.folder))
+        progress()
+        if name not in checksums:
+            if is_readable(path, progress):
+                new_checksums[name] = sha256_file(path)
+            else:
+                damaged.append(name)
+        elif deep and sha256_file(path) != checksums[name]:
+            damaged.append(name)
+    return Verification(new_checksums, tuple(damaged))
+
+
+def add_checksums(site: Site, checksums: Mapping[str, str], progress: Progress) -> Verification:
+    """Compute the checksums of files that have none yet."""
+    return verify_checksums(site, checksums, progress, deep=False)
+
+
+def unreadable_files(site: Site, progress: Progress) -> tuple[str, ...]:
+    """Return the epoch and compacted files that cannot be opened; fast, but blind to flipped bits."""
+    series = series_for(site)
+    unreadable = []
+    for path in store_files(series):
+        progress()
+        try:
+            if not is_reference(path):
+                epochs_in_file(path)
+        except StoreError:
+            unreadable.append(str(path.relative_to(series.folder)))
+    return tuple(unreadable)
+
+
+def is_readable(path: Path, progress: Progress) -> bool:
+    """Return True if a file can be read completely; its compressed chunks carry checksums."""
+    try:
+        with h5py.File(path, "r") as file:
+            for name in file:
+                variable = file[name]
+                if not isinstance(variable, h5py.Dataset) or variable.shape is None:
+                    continue
+                indices = range(variable.shape[0]) if variable.ndim == 3 else (...,)
+                for index in indices:
+                    np.asarray(variable[index])
+                progress()
+    except (OSError, RuntimeError, KeyError, ValueError):
+        return False
+    return True
+
+
+def quarantine(series: Series, names: Iterable[str]) -> None:
+    """Rename damaged files so that the series ignores them; nothing is deleted."""
+    for name in names:
+        path = series.folder / name
+        quarantined = path.with_name(path.name + DAMAGED)
+        try:
+            if path.exists():
+                path.rename(quarantined)
+        except OSError as error:
+            raise StoreError(f"{path}: damaged, and cannot be renamed: {error}") from error
+
+
+def missing_epochs(site: Site, epochs: Mapping[str, str], progress: Progress) -> list[str]:
+    """Return the names of scans whose epoch is missing: not stored, not compacted, not superseded.
+
+    `epochs` are the epoch files in the journal by scan name. Raises StoreError if a file of the store cannot
+    be opened.
+    """
+    series = series_for(site)
+    index = index_if_current(series)
+    indexed = set() if index is None else {name.decode("ascii") for name in index.epoch_file.tolist()}
+    if all(Path(epoch).name in indexed for epoch in epochs.values()):
+        return []  # no file has to be opened
+    refs: list[EpochRef] = []
+    for path in _intact_files(series, ()):
+        progress()
+        refs += epochs_in_file(path)
+    return _scans_without_epoch(epochs, refs)
+
+
+def unjournaled_epochs(site: Site, epochs: Mapping[str, str], progress: Progress) -> list[Entry]:
+    """Return reconstructed journal rows for epochs of the series that the journal does not contain.
+
+    Their `size` is -1, so that the inbox treats the file as changed and its SHA-256 is compared.
+    """
+    series = series_for(site)
+    journaled = {Path(epoch).name for epoch in epochs.values()}
+    progress()
+    index = index_if_current(series)
+    if index is None:
+        refs = [ref for ref in list_epochs(series) if ref.epoch_file not in journaled]
+    else:
+        names = index.epoch_file.tolist()
+        refs = [
+            index[position] for position, name in enumerate(names) if name.decode("ascii") not in journaled
+        ]
+    return [_journal_entry(site, stored) for stored in stored_epochs(series, refs)]
+
+
+def check_store(
+    site: Site, entries: list[Entry], checksums: Mapping[str, str], progress: Progress
+) -> list[tuple[str, str, str]]:
+    """Return the findings on all files and epochs of the store: (level, subject, message)."""
+    series = series_for(site)
+    verification = verify_checksums(site, checksums, progress)
+    findings = [
+        ("fault", "file", f"{name}: damaged: station reprocess quarantines it and rebuilds its epochs")
+        for name in verification.damaged
+    ]
+    refs = [ref for path in _intact_files(series, verification.damaged) for ref in epochs_in_file(path)]
+    epochs = {entry.name: entry.epoch for entry in entries if entry.epoch}
+    for name in _scans_without_epoch(epochs, refs):
+        message = f"{epochs[name]}, the epoch of {name}, is in no intact file: station reprocess rebuilds it"
+        findings.append(("fault", "epoch", message))
+    if verification.new_checksums:
+        count = len(verification.new_checksums)
+        message = f"{count} readable files without a checksum: the service adds it when it starts"
+        findings.append(("warning", "file", message))
+    names = {Path(epoch).name for epoch in epochs.values()}
+    starts = {
+        epoch_file.start for epoch in epochs.values() if (epoch_file := parse_epoch_filename(Path(epoch)))
+    }
+    orphans = {ref.epoch_file for ref in refs if ref.epoch_file not in names and ref.start not in starts}
+    for name in sorted(orphans):
+        message = f"{name}: not in the journal: the service imports it when it starts"
+        findings.append(("warning", "epoch", message))
+    findings += [
+        ("warning", "file", f"{path.relative_to(series.folder)}: damaged, quarantined")
+        for path in sorted(series.folder.glob(f"**/*{DAMAGED}"))
+    ]
+    findings += _check_references(series)
+    findings += _check_series(series, refs, is_complete=not verification.damaged)
+    file_count = len(checksums) + len(verification.new_checksums)
+    return [("ok", "store", f"{file_count} files, {len({ref.start for ref in refs})} epochs"), *findings]
+
+
+def _intact_files(series: Series, damaged: Iterable[str]) -> list[Path]:
+    """Return the files that contain epochs, without the damaged ones."""
+    excluded = {series.folder / name for name in damaged}
+    return [path for path in store_files(series) if path not in excluded and not is_reference(path)]
+
+
+def _scans_without_epoch(epochs: Mapping[str, str], refs: Iterable[EpochRef]) -> list[str]:
+    """Return the names of scans whose epoch is in no file, in this or a newer revision."""
+    names: set[str] = set()
+    newest: dict[datetime, int] = {}
+    for ref in refs:
+        names.add(ref.epoch_file)
+        newest[ref.start] = max(newest.get(ref.start, 0), ref.revision)
+    missing = []
+    for name, epoch in epochs.items():
+        epoch_file = parse_epoch_filename(Path(epoch))
+        if (
+            epoch_file
+            and epoch_file.path.name not in names
+            and newest.get(epoch_file.start, 0) <= epoch_file.revision
+        ):
+            missing.append(name)
+    return missing
+
+
+def _check_references(series: Series) -> list[tuple[str, str, str]]:
+    """Return findings on versions of the reference that epochs refer to and that do not exist."""
+    if not series.path.is_file():
+        return []
+    try:
+        with h5py.File(series.path, "r") as file:
+            referenced = set(decode_text(file["reference_version"][:])) - {""}
+    except (OSError, RuntimeError, KeyError):  # reported by `_check_series`
+        return []
+    missing = sorted(version for version in referenced if not version_path(series, version).is_file())
+    message = "is missing: restore it, or station reprocess computes its epochs with another version"
+    return [("fault", "reference", f"reference_{version}.nc {message}") for version in missing]
+
+
+def _check_series(series: Series, refs: list[EpochRef], *, is_complete: bool) -> list[tuple[str, str, str]]:
+    """Return findings if `series.nc` does not contain the stored epochs in order of time."""
+    if not refs:
+        return []
+    if not series.path.is_file():
+        return [("fault", "series", "series.nc is missing: the service rebuilds it when it starts")]
+    try:
+        missing = [path for path in source_files(series.path) if not path.is_file()]
+        with h5py.File(series.path, "r") as file:
+            times = np.asarray(file["time"][:])
+            names = decode_text(file["epoch_file"][:])
+    except (StoreError, OSError, RuntimeError, KeyError) as error:
+        return [("fault", "series", f"series.nc is damaged: the service rebuilds it when it starts: {error}")]
+    remedy = "start the service or run station reprocess to rebuild it"
+    findings = [
+        ("fault", "series", f"series.nc refers to {path}, which is missing: {remedy}") for path in missing
+    ]
+    if not (np.diff(times) > 0).all():
+        findings.append(("fault", "series", f"the time in series.nc does not increase: {remedy}"))
+    if is_complete and names != [ref.epoch_file for ref in list_epochs(series)]:
+        findings.append(("fault", "series", f"series.nc does not list the stored epochs: {remedy}"))
+    return findings
+
+
+def restore_tilt_offsets(site: Site, progress: Progress) -> None:
+    """Restore missing tilt offsets of SOPs from the stored epochs."""
+    if site.inclination is None or site.inclination.mode == "absolute":
+        return
+    for sop_id, tilt_offset in _tilt_offsets(series_for(site)).items():
+        progress()
+        if tilt_offset and read_tilt_offset(site, sop_id) is None:
+            write_tilt_offset(site, sop_id, CyclicError(**json.loads(tilt_offset)))
+
+
+def _tilt_offsets(series: Series) -> dict[str, str]:
+    """Return the tilt offset stored in the first epoch of each SOP, from the series or else the epochs."""
+    try:
+        with h5py.File(series.path, "r") as file:
+            columns = [decode_text(file[name][:]) for name in ("sop_id", "sop_tilt_offset")]
+    except (OSError, RuntimeError, KeyError):
+        provenances = [item.provenance for item in stored_epochs(series)]
+        columns = [[item.sop_id for item in provenances], [item.sop_tilt_offset for item in provenances]]
+    pairs = [(sop_id, tilt_offset) for sop_id, tilt_offset in zip(*columns, strict=True) if tilt_offset]
+    return dict(reversed(pairs))
+
+
+def _journal_entry(site: Site, stored: StoredEpoch) -> Entry:
+    start = stored.ref.start
+    epoch = Path("epochs") / start.strftime("%Y/%m/%d") / stored.ref.epoch_file
+    return Entry(
+        name=_scan_filename(site, stored),
+        size=-1,
+        mtime_ns=-1,
+        state=State.STORED,
+        waiting_reason="",
+        reason=stored.verdict_reason,
+        sha256=stored.provenance.scan_sha256,
+        log_sha256=stored.provenance.log_sha256,
+        outcome=State.STORED,
+        verdict=VERDICTS[stored.verdict],
+        epoch=str(epoch),
+        start_utc_s=stored.provenance.start_s,
+        revision=stored.ref.revision,
+        reference=stored.reference or None,
+        metrics={},
+        attempts=0,
+        next_try_utc_s=None,
+        first_seen_utc_s=stored.provenance.start_s,
+        changed_utc_s=stored.provenance.end_s,
+    )
+
+
+def _scan_filename(site: Site, stored: StoredEpoch) -> str:
+    """Return the file name of the scan of an epoch, which stores only its stem."""
+    for suffix in suffixes():
+        name = stored.provenance.scan_id + suffix
+        if find_scan(site, name, stored.provenance.start_s):
+            return name
+    return stored.provenance.scan_id + ".laz"

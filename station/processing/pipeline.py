@@ -1,0 +1,205 @@
+"""Processing of one scan, from shots to a surface with change and uncertainty."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass
+from functools import cached_property, partial
+
+import numpy as np
+
+from station.quantities import (
+    Bools,
+    Floats,
+    Floats32,
+    Measurement,
+    Quality,
+    Reals,
+    Reference,
+    ScanGeometry,
+    SharedParameters,
+    Shots,
+    TiltSeries,
+)
+from station.science.adjustment import ground_classes, prior
+from station.science.adjustment.joint import Adjustment, adjust_scan, tilt_effect
+from station.science.adjustment.normal_equations import LineInclination
+from station.science.adjustment.patches import CellObservations, aggregate_patches
+from station.science.geometry.pose import ScannerToMap, TimedRotation, timed_rotation
+from station.science.geometry.robust_statistics import nmad
+from station.science.gridding.cell_estimates import CellEstimator, estimate_cells
+from station.science.gridding.gridder import Gridder
+from station.science.gridding.viewing_geometry import CellClass, ViewingGeometry, compute_viewing_geometry
+from station.science.uncertainty import propagation
+from station.science.uncertainty.jacobian import HeightJacobian
+from station.science.uncertainty.parameters import ParameterLayout
+
+MIN_STABLE_CELLS = 20  # fewer cells give no meaningful statistics
+
+
+@dataclass(frozen=True)
+class Pose:
+    """Transformation from scanner to map, and tilt. `frame` is None if points are already on the map."""
+
+    frame: ScannerToMap | None
+    tilt: TiltSeries | None
+
+    @cached_property
+    def rotation(self) -> TimedRotation:
+        """Rotation of shots into the local frame at the scanner: tilt at the time of the shot, then SOP."""
+        return timed_rotation(self.tilt, np.eye(3) if self.frame is None else self.frame.to_local[:3, :3])
+
+
+def reference_viewing_geometry(
+    reference: Reference, scan_geometry: ScanGeometry, stable: Bools
+) -> ViewingGeometry:
+    """Return the viewing geometry of a reference; `stable` (ny, nx) marks ground known to be stable."""
+    return compute_viewing_geometry(
+        reference,
+        stable,
+        scan_geometry.scanner,
+        scan_geometry.position_m,
+        scan_geometry.axis,
+        published=scan_geometry.published_budget,
+    )
+
+
+def new_gridder(scan_geometry: ScanGeometry, viewing: ViewingGeometry | None) -> Gridder:
+    """Return an empty gridder, of residuals to the reference surface if there is one."""
+    surface = viewing.surface() if viewing is not None else None
+    return Gridder(
+        scan_geometry.grid, surface, scan_geometry.position_m[2] if scan_geometry.position_m else 0.0
+    )
+
+
+def grid_scan(gridder: Gridder, blocks: Iterable[Shots], pose: Pose, progress: Callable[[], None]) -> None:
+    """Add all shots of a scan to the grid."""
+    for shots in blocks:
+        add_shots(gridder, to_map(shots, pose), shots.intensity)
+        progress()
+    gridder.finish()
+
+
+def to_map(shots: Shots, pose: Pose) -> Floats:
+    """Easting, northing and height (3, n) of shots [m]: tilt, SOP, then air and map projection."""
+    if pose.frame is None:
+        return shots.xyz_m
+    time_s = np.zeros(len(shots)) if shots.time_s is None else shots.time_s
+    return pose.frame.to_map(pose.rotation.rotate(shots.xyz_m, time_s))
+
+
+def add_shots(gridder: Gridder, points_m: Floats, intensity: Floats | None = None) -> None:
+    """Add map points (3, n) to the grid, as residuals to the reference where it has a height."""
+    inside, column, row = gridder.locate(points_m[0], points_m[1])
+    cell_index = gridder.cell_indices(column, row)
+    residual_m = points_m[2][inside] - gridder.datum_height(cell_index, column, row)
+    gridder.add(cell_index, residual_m, None if intensity is None else intensity[inside])
+
+
+@dataclass(frozen=True)
+class AdjustmentInputs:
+    """Inputs of the adjustment other than residuals: line timing, tilt already applied, log and weather.
+
+    `assumed_rad` (3, lines) is the tilt already applied to the points, about east, north and up. `log` is the
+    inclination log by lines, None without one; `weather_known` is True if the weather was measured.
+    """
+
+    params: ParameterLayout
+    lines: prior.LineTimes
+    assumed_rad: Floats
+    log: LineInclination | None
+    weather_known: bool
+
+
+def adjust_to_reference(
+    gridder: Gridder, scan_geometry: ScanGeometry, inputs: AdjustmentInputs, viewing: ViewingGeometry
+) -> Adjustment:
+    """Return the scanner state estimated from a gridded scan: tilt, heading, position, range, refraction."""
+    components, reference_state = viewing.reference.components, viewing.reference.shared
+    state_prior = prior.state_prior(
+        inputs.params, inputs.lines, components, weather_known=inputs.weather_known
+    )
+    patches = aggregate_patches(inputs.params, _cells(gridder, viewing), scan_geometry.scanner.range_max_m)
+    log = inputs.log
+    if log is not None and reference_state is not None:
+        log = log.relative_to(inputs.params, state_prior.reference_covariance(reference_state))
+    return adjust_scan(patches, inputs.assumed_rad, state_prior.relative_to(reference_state), log)
+
+
+def _cells(gridder: Gridder, viewing: ViewingGeometry) -> Iterator[CellObservations]:
+    """Yield the cells that an adjustment uses, in the order of the head's azimuth."""
+    for first, all_cells in viewing.sectors(sampled=True):
+        sums = gridder.sums(first, first + len(all_cells))
+        observed = np.flatnonzero(sums.count > 0)
+        if not len(observed):
+            continue
+        sector, sums = all_cells.take(observed), sums.take(observed)
+        jacobian = viewing.jacobian(sector)
+        east_m, north_m, _ = viewing.offset_m(sector.cell, sector.height_m)
+        yield CellObservations(
+            jacobian,
+            np.hypot(east_m, north_m),
+            ground_classes.classify(
+                sector.in_class(CellClass.STABLE),
+                sector.in_class(CellClass.HOLDOUT),
+                sector.in_class(CellClass.SMOOTH),
+                ground_classes.brightness_changed(sums.intensity(), viewing.intensity(first + observed)),
+            ),
+            sums.mean_residual(),
+            sector.point_variance_m2 / sums.count + sector.reference_variance_m2,
+            viewing.sampling_step,
+        )
+
+
+def stacking_inputs(
+    gridder: Gridder, viewing: ViewingGeometry, adjustment: tuple[AdjustmentInputs, Adjustment] | None
+) -> tuple[Floats32, Floats32]:
+    """Random variance of a shot [m²] and height correction of the estimated state [m], both (ny, nx).
+
+    Zero in cells without reference; the variance also in cells that the scan did not observe.
+    """
+    variance_m2, correction_m = (np.zeros(viewing.grid.shape, np.float32) for _ in range(2))
+    cell = viewing.cells["cell"][:]
+    variance_m2.reshape(-1)[cell] = viewing.cells["shot_m2"][:] * (gridder.sums(0, len(cell)).count > 0)
+    if adjustment is not None:
+        for _, sector in viewing.sectors():
+            correction_m.reshape(-1)[sector.cell] = _correction(adjustment, viewing.jacobian(sector))
+    return variance_m2, correction_m
+
+
+def _correction(adjustment: tuple[AdjustmentInputs, Adjustment], jacobian: HeightJacobian) -> Reals:
+    """Return the correction to subtract from heights (n,) [m]: effect of estimated minus assumed state."""
+    inputs, estimated = adjustment
+    return np.asarray(estimated.effect(jacobian) - tilt_effect(jacobian, inputs.assumed_rad))
+
+
+def measure(
+    gridder: Gridder,
+    scan_geometry: ScanGeometry,
+    posterior: SharedParameters | None,
+    viewing: ViewingGeometry | None,
+    adjustment: tuple[AdjustmentInputs, Adjustment] | None = None,
+) -> Measurement:
+    """Return surface, change and their uncertainty of a gridded scan; overwrites the gridder's buffers.
+
+    `posterior` are the parameters that all points of the scan share: relative to the reference if
+    `adjustment` is given, which adjusted the scan to it; None if nothing is known of them.
+    """
+    independent = posterior
+    if adjustment is None and posterior is not None and viewing is not None:
+        posterior = propagation.difference_to_reference(posterior, viewing.reference.shared)
+    correction = None if adjustment is None else partial(_correction, adjustment)
+    return estimate_cells(gridder, viewing, CellEstimator(scan_geometry, posterior, independent, correction))
+
+
+def holdout_statistics(measurement: Measurement, viewing: ViewingGeometry) -> dict[str, float]:
+    """Return statistics of a scan on hold-out stable ground: number of cells, median [m], NMAD [m], z [1]."""
+    holdout = viewing.select(CellClass.STABLE, CellClass.HOLDOUT)
+    holdout = holdout[(measurement.quality[holdout] & np.uint8(Quality.STABLE_GROUND)) > 0]
+    change_m, sigma_m = measurement.change_m[holdout], measurement.cells["uncertainty_m"][holdout]
+    statistics = {"stable_count": float(len(change_m))}
+    if len(change_m) >= MIN_STABLE_CELLS:
+        statistics["stable_median"] = float(np.median(change_m))
+        statistics["stable_nmad"] = nmad(change_m)
+        statistics["stable_z_std"] = nmad(change_m / sigma_m)
+    return statistics

@@ -1,0 +1,244 @@
+"""Versions of the reference: when one is due, and the tasks that build it in a worker process."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+
+from station.archive.netcdf_layout import Series, roundtrip_text
+from station.archive.reference_files import (
+    ReferenceProvenance,
+    open_reference,
+    read_reference,
+    read_reference_provenance,
+    versions,
+    write_reference,
+)
+from station.config import Site
+from station.errors import StoreError
+from station.inbox.file_hash import sha256_file
+from station.inbox.inbox import ScanFile
+from station.processing.pipeline import grid_scan, new_gridder, reference_viewing_geometry, stacking_inputs
+from station.processing.provenance import ScanProvenance
+from station.processing.scan_inputs import ScanInputs, load_scan_inputs
+from station.processing.scan_tasks import (
+    Progress,
+    adjust_scan,
+    air_key,
+    air_scalars,
+    exclusion_reason,
+    load_viewing_geometry,
+    open_scan_for,
+    series_for,
+    sha256_log,
+    stable_cells,
+)
+from station.quantities import Reference, ScanGeometry, VarianceComponents
+from station.readers.scan import utc_interval
+from station.science.adjustment.joint import Adjustment
+from station.science.adjustment.variance_components import estimate_variance_components
+from station.science.gridding.reference_surface import build_reference, update_reference
+from station.science.gridding.scan_stack import ScanStack
+from station.science.gridding.viewing_geometry import ViewingGeometry
+
+UPDATE_FACTOR = 4  # each version needs four times the scans of the previous one
+MAX_UPDATE_SCANS = 32  # scans read for one update
+REFERENCE_PASSES = 3  # the third improves the second by 10 %, a fourth has no measurable effect
+
+
+def next_version(series: Series, referenced: Iterable[str | None]) -> str:
+    """Return the next version number, above the existing ones and those that epochs refer to."""
+    known = [*versions(series), *(version for version in referenced if version and version.isdigit())]
+    return str(max((int(version) for version in known), default=0) + 1)
+
+
+def scans_for_version(site: Site, usable: list[str], version_count: int) -> list[str]:
+    """Return the names of the scans for the next version, as far as they are stored yet.
+
+    `usable` are the usable scans in order of time, `version_count` is the number of versions on one base. The
+    first version is built from the first scans. Later versions change it on stable ground only, so that
+    epochs processed with an older version stay valid.
+    """
+    setting = site.reference.scans
+    if isinstance(setting, Path) or (version_count and not site.adjusts):
+        return []
+    if not version_count:
+        return usable[:setting]
+    needed = scans_needed(site, version_count)
+    return usable[:needed][:: max(1, needed // MAX_UPDATE_SCANS)][:MAX_UPDATE_SCANS]
+
+
+def scans_needed(site: Site, version_count: int) -> int:
+    """Return the number of usable scans required for the next version."""
+    setting = site.reference.scans
+    return 0 if isinstance(setting, Path) else setting * UPDATE_FACTOR**version_count
+
+
+def build_reference_version(site: Site, scans: list[ScanFile], version: str, progress: Progress) -> str:
+    """Build the reference surface from jointly adjusted scans and store it; return its version.
+
+    The scans are processed in three passes. The first takes their plain means; the second and third adjust
+    each scan to the surface of the previous pass and average the residuals. Each pass also re-estimates the
+    variance components of the station.
+    """
+    _warm_cache(site, version, _build_and_store(site, scans, version, progress))
+    return version
+
+
+def _build_and_store(site: Site, scans: list[ScanFile], version: str, progress: Progress) -> ScanGeometry:
+    """Build and store the reference; return the geometry of its scans."""
+    surface: Reference | None = None
+    for _ in range(REFERENCE_PASSES):
+        surface, stacked = _reference_pass(site, scans, surface, version, progress)
+        scan_provenance = tuple(scan.provenance.to_attrs() for scan in stacked)
+    assert surface is not None  # noqa: S101 - there is at least one pass
+    write_reference(
+        series_for(site),
+        surface,
+        ReferenceProvenance(version, site.science_hash, scan_provenance=scan_provenance),
+    )
+    return stacked[-1].inputs.geometry
+
+
+def _reference_pass(
+    site: Site, scans: list[ScanFile], surface: Reference | None, version: str, progress: Progress
+) -> tuple[Reference, list[_StackedScan]]:
+    """Return the surface after one pass over the scans, and the scans as stacked in it."""
+    stack, stacked = _stack_scans(site, scans, surface, progress)
+    scan_ids = tuple(scan.provenance.scan_id for scan in stacked)
+    shared = [scan.inputs.log_only_shared for scan in stacked]
+    components = _estimate_components(surface.components if surface else VarianceComponents(), stacked)
+    position_m = stacked[0].inputs.geometry.position_m
+    return build_reference(stack, surface, shared, position_m, version, scan_ids, components), stacked
+
+
+def update_reference_version(
+    site: Site,
+    scans: list[ScanFile],
+    version: str,
+    base_version: str,
+    replaces: tuple[str, ...],
+    progress: Progress,
+) -> str:
+    """Store a version with stable ground and variance components estimated from more scans; return its name.
+
+    It builds on `base_version` and supersedes the versions in `replaces`.
+    """
+    _warm_cache(site, version, _update_and_store(site, scans, version, base_version, replaces, progress))
+    return version
+
+
+def _update_and_store(
+    site: Site,
+    scans: list[ScanFile],
+    version: str,
+    base_version: str,
+    replaces: tuple[str, ...],
+    progress: Progress,
+) -> ScanGeometry:
+    """Compute and store the update; return the geometry of its scans."""
+    series = series_for(site)
+    base = read_reference(series, base_version)
+    if base is None:
+        raise StoreError(f"{series.folder}: no reference to update")
+    stack, stacked = _stack_scans(site, scans, base, progress)
+    components = _estimate_components(base.components, stacked)
+    position_m = stacked[0].inputs.geometry.position_m
+    if position_m is None:
+        raise StoreError(f"{series.folder}: a reference without scanner position cannot be updated")
+    provenance = ReferenceProvenance(
+        base=read_reference_provenance(series, base_version).base,
+        science_hash=site.science_hash,
+        replaces=replaces,
+        scan_provenance=tuple(scan.provenance.to_attrs() for scan in stacked),
+    )
+    write_reference(series, update_reference(base, stack, position_m, version, components), provenance)
+    return stacked[-1].inputs.geometry
+
+
+@dataclass(frozen=True)
+class _StackedScan:
+    """Inputs, adjustment and provenance of a scan that was added to a stack."""
+
+    inputs: ScanInputs
+    adjustment: Adjustment | None
+    provenance: ScanProvenance
+
+
+def _stack_scans(
+    site: Site, scans: list[ScanFile], surface: Reference | None, progress: Progress
+) -> tuple[ScanStack, list[_StackedScan]]:
+    """Return a stack of scans, adjusted to a surface if there is one, and the scans in it."""
+    stack, geometry_cache = ScanStack(site.grid_cells), _GeometryCache(site, surface)
+    return stack, [_add_scan(stack, site, scan, geometry_cache, progress) for scan in scans]
+
+
+def _warm_cache(site: Site, version: str, geometry: ScanGeometry) -> None:
+    """Compute and cache the viewing geometry of the new version before the next scan needs it."""
+    reference = open_reference(series_for(site), version)
+    if reference is not None:
+        load_viewing_geometry(site, geometry, reference)
+
+
+def _estimate_components(components: VarianceComponents, stacked: list[_StackedScan]) -> VarianceComponents:
+    """Return the variance components estimated from the adjusted scans."""
+    adjusted = (
+        (scan.inputs.adjustment_inputs.lines, scan.adjustment.estimate, scan.adjustment.covariance)
+        for scan in stacked
+        if scan.inputs.adjustment_inputs is not None and scan.adjustment is not None
+    )
+    adjustment_inputs = stacked[0].inputs.adjustment_inputs
+    return (
+        components
+        if adjustment_inputs is None
+        else estimate_variance_components(components, adjustment_inputs.params, adjusted)
+    )
+
+
+class _GeometryCache:
+    """Viewing geometry of a surface, recomputed only if the scanner moved."""
+
+    def __init__(self, site: Site, surface: Reference | None) -> None:
+        self._site = site
+        self._surface = surface
+        self._last: tuple[ScanGeometry, ViewingGeometry] | None = None
+
+    def __call__(self, geometry: ScanGeometry) -> ViewingGeometry | None:
+        """Return the viewing geometry for a scan geometry, None if there is no surface yet."""
+        if self._surface is None:
+            return None
+        if self._last is None or self._last[0] != geometry:
+            stable = stable_cells(self._site, self._surface)
+            self._last = geometry, reference_viewing_geometry(self._surface, geometry, stable)
+        return self._last[1]
+
+
+def _add_scan(
+    stack: ScanStack, site: Site, scan: ScanFile, geometry_cache: _GeometryCache, progress: Progress
+) -> _StackedScan:
+    """Add a scan to a stack, adjusted to the surface if there is one; the grid of the scan is released."""
+    with open_scan_for(site, scan.path) as reader:
+        start, end, _ = utc_interval(reader, site.scans.name)
+        inputs = load_scan_inputs(site, reader, scan.log, start, end)
+        viewing = geometry_cache(inputs.geometry)
+        gridder = new_gridder(inputs.geometry, viewing)
+        grid_scan(gridder, reader.blocks(), inputs.pose, progress)
+    adjustment = adjust_scan(site, gridder, inputs, viewing)
+    if viewing is None:
+        stack.add(gridder)
+    else:
+        stack.add(gridder, stacking_inputs(gridder, viewing, adjustment), viewing.reference.roughness_m2)
+    progress()
+    provenance = ScanProvenance(
+        scan_id=scan.path.stem,
+        start_s=start.timestamp(),
+        end_s=end.timestamp(),
+        scan_sha256=sha256_file(scan.path),
+        log_sha256=sha256_log(scan),
+        sop_id=roundtrip_text(inputs.provenance.get("sop_id", ""), "text"),
+        sop_tilt_offset=inputs.provenance.get("sop_tilt_offset", ""),
+        flag=exclusion_reason(site, start.timestamp(), end.timestamp()),
+        air=air_key(air_scalars(inputs)),
+    )
+    return _StackedScan(inputs, adjustment[1] if adjustment else None, provenance)

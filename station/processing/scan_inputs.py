@@ -1,0 +1,410 @@
+"""Inputs of a scan other than its shots: SOP, tilt, air; and warnings about what is missing."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from datetime import datetime, timedelta
+from functools import cached_property, partial
+from pathlib import Path
+
+import numpy as np
+from pyproj import CRS, Transformer
+
+from station.archive.atomic_files import atomic_write
+from station.config import Site
+from station.errors import ConfigError, NotReadyError, ScanError
+from station.processing.pipeline import AdjustmentInputs, Pose
+from station.quantities import (
+    VERTICAL_AXIS,
+    Air,
+    AzimuthTrack,
+    InclinationLog,
+    ScanGeometry,
+    SharedParameters,
+    VarianceComponents,
+)
+from station.readers.inclination import align_gps_week, read_inclination
+from station.readers.scan import ScanReader, open_scan
+from station.readers.sop import read_matrix, valid_sop
+from station.readers.weather import interpolate_air, read_weather
+from station.science.adjustment import prior
+from station.science.geometry import inclination, pose
+from station.science.geometry.air import air_correction, standard_air
+from station.science.geometry.inclination import NO_CYCLIC_ERROR, CyclicError, TiltRecord
+from station.science.uncertainty import parameters
+from station.sections import Origin, SopSection, WeatherSection
+
+MIN_LOG_COVERAGE = 0.97  # of the scan duration that a complete log covers
+MIN_LOG_ROWS = 20  # a shorter log is not filtered
+MAX_SATURATED = 0.1  # of the rows of a log, at the limit of the sensor's range
+MIN_CLOCK_OFFSET_S = 4.0  # clock offset of a log, and its significance, that lead to a warning
+MIN_CLOCK_OFFSET_SIGMAS = 3.0
+
+
+@dataclass(frozen=True)
+class ScanInputs:
+    """Inputs of a scan that are known before its shots are read."""
+
+    geometry: ScanGeometry
+    pose: Pose
+    log_only_covariance: Callable[[], SharedParameters] | None
+    adjustment_inputs: AdjustmentInputs | None
+    tilt_record: TiltRecord | None
+    air: Air | None
+    warnings: tuple[str, ...]
+    provenance: dict[str, str]
+
+    @cached_property
+    def log_only_shared(self) -> SharedParameters | None:
+        """Systematic errors of all points without an adjustment, from SOP and log; computed on first use."""
+        return self.log_only_covariance() if self.log_only_covariance else None
+
+
+def load_scan_inputs(
+    site: Site,
+    reader: ScanReader,
+    log_path: Path | None,
+    start: datetime,
+    end: datetime,
+    *,
+    save_tilt_offset: bool = True,
+    wait_for_weather: bool = False,
+) -> ScanInputs:
+    """Return the inputs of a scan; raise ScanError or ConfigError if it cannot be georeferenced.
+
+    With `save_tilt_offset`, a tilt offset estimated here is saved for later scans. With `wait_for_weather`,
+    NotReadyError is raised if there is no weather yet.
+    """
+    if site.scans.frame == "map":
+        position_m = _map_position(site)
+        geometry, log_only_covariance, adjustment_inputs = scan_geometry(site, position_m), None, None
+        if position_m is not None:  # registered elsewhere, with unknown accuracy
+            params = parameters.parameter_layout(geometry.grid, position_m)
+            lines = prior.line_times(params, np.eye(3), None)
+            adjustment_inputs = AdjustmentInputs(
+                params, lines, np.zeros((3, params.line_groups)), None, weather_known=False
+            )
+            log_only_covariance = partial(
+                prior.log_only_covariance,
+                params,
+                lines,
+                None,
+                NO_CYCLIC_ERROR,
+                VarianceComponents(),
+                weather_known=False,
+            )
+        return ScanInputs(
+            geometry, Pose(None, None), log_only_covariance, adjustment_inputs, None, None, (), {}
+        )
+    sop = valid_sop(site.sop, start)
+    transform, sop_id = scanner_to_map(site, sop), sop_identity(sop)
+    warnings: list[str] = []
+    track = reader.azimuth_track() if site.scans.point_time == "auto" else None
+    if track is None and site.scans.point_time == "auto":
+        warnings.append("no time per point: one mean tilt for the whole scan")
+    log = _load_log(site, log_path, track, warnings)
+    tilt_offset = read_tilt_offset(site, sop_id)
+    if tilt_offset is None:
+        tilt_offset = _find_tilt_offset(site, sop, reader, log, track, warnings)
+        # That of an absolute sensor is zero and need not be saved.
+        if save_tilt_offset and tilt_offset is not None and tilt_offset != NO_CYCLIC_ERROR:
+            write_tilt_offset(site, sop_id, tilt_offset)
+    tilt_record = _tilt_record(site, log, track, tilt_offset, warnings)
+    air, weather_known = _air(site, start + (end - start) / 2, transform.position_m[2], warnings)
+    rotation = transform.to_local[:3, :3]
+    axis = (float(rotation[0, 2]), float(rotation[1, 2]), float(rotation[2, 2]))
+    geometry = scan_geometry(site, transform.position_m, axis)
+    if wait_for_weather and site.weather is not None and not weather_known:
+        raise NotReadyError(warnings[-1])
+    params = parameters.parameter_layout(geometry.grid, transform.position_m, axis)
+    lines = prior.line_times(params, rotation, track)
+    assumed_rad, line_inclination = np.zeros((3, params.line_groups)), None
+    if tilt_record is not None:
+        assumed_rad = prior.tilt_rotation(tilt_record.tilt, rotation, lines.time_s)
+        if track is not None:
+            line_inclination = prior.line_inclination(
+                params, lines, tilt_record, tilt_offset or NO_CYCLIC_ERROR, rotation
+            )
+    if site.air is not None:
+        setting = site.air.scanner_setting
+        assumed_air = air if setting == "weather" else setting.air
+        correction = air_correction(
+            air, assumed_air if site.air.scanner_corrects else None, site.instrument.wavelength_um
+        )
+        transform = transform.with_correction(correction.apply, site.scanner.range_max_m)
+    provenance = {"sop_id": sop_id, "sop_tilt_offset": json.dumps(asdict(tilt_offset)) if tilt_offset else ""}
+    tilt = tilt_record.tilt if tilt_record is not None else None
+    return ScanInputs(
+        geometry,
+        Pose(transform, tilt),
+        partial(
+            prior.log_only_covariance,
+            params,
+            lines,
+            tilt_record,
+            tilt_offset or NO_CYCLIC_ERROR,
+            VarianceComponents(),
+            weather_known=weather_known,
+        ),
+        AdjustmentInputs(params, lines, assumed_rad, line_inclination, weather_known=weather_known),
+        tilt_record,
+        air if weather_known else None,
+        tuple(warnings),
+        provenance,
+    )
+
+
+def scan_geometry(
+    site: Site,
+    position_m: tuple[float, float, float] | None,
+    axis: tuple[float, float, float] = VERTICAL_AXIS,
+) -> ScanGeometry:
+    """Return the geometry and settings that are the same for all scans under one SOP."""
+    return ScanGeometry(
+        scanner=site.instrument,
+        grid=site.grid_cells,
+        position_m=position_m,
+        axis=axis,
+        min_points=site.grid.min_points,
+        published_budget=site.uncertainty.model == "voordendag2023",
+        registration_sigma_m=site.uncertainty.registration_sigma_m,
+        store_terms=site.uncertainty.store_terms,
+    )
+
+
+def sop_identity(sop: SopSection) -> str:
+    """Return an identifier that changes with the content of the SOP file and with `sop.scan`."""
+    content = sop.file.read_bytes() + (f"\n{sop.scan}".encode() if sop.scan else b"")
+    return f"{sop.file.stem}-{hashlib.sha256(content).hexdigest()[:8]}"
+
+
+def scanner_to_map(site: Site, sop: SopSection) -> pose.ScannerToMap:
+    """Return the transformation from scanner to map under an SOP; raise ConfigError if there is none."""
+    matrix = read_matrix(sop.file)
+    radius_m = site.scanner.range_max_m
+    if site.map.crs is None:
+        return pose.scanner_to_local_map(matrix)
+    if site.map.pop is not None:
+        return pose.scanner_to_map_by_pop(matrix, read_matrix(site.map.pop), site.map.crs, radius_m)
+    if site.map.origin is not None:
+        return pose.scanner_to_map_by_origin(matrix, _degrees(site.map.origin), site.map.crs, radius_m)
+    _require_on_map(site.map.crs, matrix[:3, 3].tolist(), sop.file)
+    return pose.scanner_to_map_directly(matrix, site.map.crs, radius_m)
+
+
+def _degrees(origin: Origin) -> tuple[float, float, float]:
+    return origin.latitude_deg, origin.longitude_deg, origin.height_m
+
+
+def _require_on_map(crs: str, position_m: list[float], file: Path) -> None:
+    """Raise ConfigError if an SOP places the scanner off the map: it probably refers to a local frame."""
+    horizontal = pose.horizontal_crs(crs)
+    area = CRS.from_user_input(crs).area_of_use
+    to_degrees = Transformer.from_crs(horizontal, horizontal.geodetic_crs, always_xy=True)
+    longitude, latitude = to_degrees.transform(position_m[0], position_m[1])
+    if area is None:
+        return
+    inside = area.west - 1 <= longitude <= area.east + 1 and area.south - 1 <= latitude <= area.north + 1
+    if not inside:
+        raise ConfigError(
+            f"{file}: places the scanner at easting {position_m[0]:g}, northing {position_m[1]:g}, outside"
+            f" {crs} ({area.name}). If it refers to a local frame, set map.origin or map.pop, or omit"
+            " map.crs"
+        )
+
+
+def _map_position(site: Site) -> tuple[float, float, float] | None:
+    if site.map.origin is None or site.map.crs is None:
+        return None
+    to_map = Transformer.from_crs(pose.GEOGRAPHIC, pose.horizontal_crs(site.map.crs), always_xy=True)
+    latitude, longitude, height_m = _degrees(site.map.origin)
+    east_m, north_m, up_m = to_map.transform(longitude, latitude, height_m)
+    return float(east_m), float(north_m), float(up_m)
+
+
+def _load_log(
+    site: Site, path: Path | None, track: AzimuthTrack | None, warnings: list[str]
+) -> InclinationLog | None:
+    """Return the cleaned inclination log of a scan, or None; append what is wrong with it to `warnings`."""
+    if site.inclination is None:
+        return None
+    if path is None:
+        if site.inclination.required:
+            warnings.append("inclination log missing")
+        return None
+    try:
+        log = _clean_log(site, read_inclination(path), warnings)
+    except ScanError as error:
+        warnings.append(f"inclination log unusable: {error}")
+        return None
+    if log is None or track is None:
+        return log
+    log = align_gps_week(log, float(track.time_s[0]))
+    return log if _overlaps(log, track, warnings) else None
+
+
+def _clean_log(site: Site, raw: InclinationLog, warnings: list[str]) -> InclinationLog | None:
+    """Return the valid rows of a log; None if they are too few or the sensor was saturated."""
+    assert site.inclination is not None  # noqa: S101 - checked by the caller
+    range_rad = site.instrument.inclination_range_rad
+    log, dropped = inclination.clean(raw, range_rad)
+    saturated = inclination.saturated_fraction(raw, range_rad)
+    if saturated > MAX_SATURATED:
+        if site.inclination.required:
+            warnings.append(
+                f"tilt out of the inclination sensor's range of {math.degrees(range_rad):g} degree in"
+                f" {saturated:.0%} of its log, which is not used"
+            )
+        return None
+    rows = len(log.time_s)
+    if rows < MIN_LOG_ROWS:
+        warnings.append(f"inclination log has {rows} valid rows")
+        return None
+    if dropped > 0.1 * (dropped + rows):
+        warnings.append(f"inclination log bad: {dropped} of {dropped + rows} rows rejected")
+    return log
+
+
+def _overlaps(log: InclinationLog, track: AzimuthTrack, warnings: list[str]) -> bool:
+    """Return True if a log overlaps the scan in time; warn if it does not cover the whole scan."""
+    first_s, last_s = track.time_s[0], track.time_s[-1]
+    overlap_s = min(last_s, log.time_s[-1]) - max(first_s, log.time_s[0])
+    if overlap_s <= 0:
+        warnings.append(f"inclination log is of another time: {first_s - log.time_s[0]:+.0f} s off")
+        return False
+    if overlap_s < MIN_LOG_COVERAGE * (last_s - first_s):
+        warnings.append(f"inclination log covers {overlap_s:.0f} of {last_s - first_s:.0f} s")
+    return True
+
+
+def _tilt_record(
+    site: Site,
+    log: InclinationLog | None,
+    track: AzimuthTrack | None,
+    tilt_offset: CyclicError | None,
+    warnings: list[str],
+) -> TiltRecord | None:
+    """Return the tilt to apply, None if it is unknown."""
+    if log is None or tilt_offset is None or site.inclination is None:
+        return None
+    cutoff_hz = None if site.inclination.cutoff_hz == "auto" else site.inclination.cutoff_hz
+    if cutoff_hz is None and site.adjustment.method == "joint":
+        cutoff_hz = inclination.JOINT_CUTOFF_HZ
+    sigma_rad = site.instrument.inclination_sigma_rad
+    filtered = site.inclination.filter == "blackman"
+    tilt_record = inclination.relative_tilt(log, track, tilt_offset, sigma_rad, cutoff_hz, filtered=filtered)
+    if tilt_record.gap_s > 2 * tilt_record.correlation_time_s:
+        warnings.append(f"inclination log has a gap of {tilt_record.gap_s:.0f} s")
+    if abs(tilt_record.offset_s) > max(
+        MIN_CLOCK_OFFSET_S, MIN_CLOCK_OFFSET_SIGMAS * tilt_record.offset_sigma_s
+    ):
+        warnings.append(
+            f"clock of the inclination log {tilt_record.offset_s:+.1f} s off,"
+            f" sigma {tilt_record.offset_sigma_s:.1f} s"
+        )
+    if track is None:
+        return inclination.mean_tilt(tilt_record)
+    return tilt_record
+
+
+def _tilt_offset_file(site: Site, sop_id: str) -> Path:
+    return site.station.data / "sop_tilt_offset" / f"{sop_id}.json"
+
+
+def read_tilt_offset(site: Site, sop_id: str) -> CyclicError | None:
+    """Return the saved tilt offset of an SOP, None if there is none yet."""
+    if site.inclination is None or site.inclination.mode == "absolute":
+        return None
+    path = _tilt_offset_file(site, sop_id)
+    if not path.is_file():
+        return None
+    content = json.loads(path.read_text())
+    return CyclicError(tuple(content["roll_rad"]), tuple(content["pitch_rad"]))
+
+
+def write_tilt_offset(site: Site, sop_id: str, tilt_offset: CyclicError) -> None:
+    """Save the tilt offset of an SOP."""
+    path = _tilt_offset_file(site, sop_id)
+    with atomic_write(path) as tmp_path:
+        tmp_path.write_text(json.dumps(asdict(tilt_offset)))
+
+
+def _find_tilt_offset(
+    site: Site,
+    sop: SopSection,
+    reader: ScanReader,
+    log: InclinationLog | None,
+    track: AzimuthTrack | None,
+    warnings: list[str],
+) -> CyclicError | None:
+    """Return the tilt offset contained in an SOP: the tilt of the scan from which the SOP was determined.
+
+    Without `sop.scan`, that is the scan at hand, the first one processed under the SOP.
+    """
+    if site.inclination is None:
+        return None
+    if site.inclination.mode == "absolute":
+        return NO_CYCLIC_ERROR
+    if sop.scan is not None and sop.scan != reader.path.stem:
+        log, track = _load_earlier_log(site, sop.scan)
+        if log is None:
+            warnings.append(f"log of {sop.scan}, the scan of the SOP, not found: tilt not corrected")
+    if log is None:
+        return None
+    return _fit_tilt_offset(log, track, site.instrument.inclination_sigma_rad)
+
+
+def _load_earlier_log(site: Site, stem: str) -> tuple[InclinationLog | None, AzimuthTrack | None]:
+    """Return log and azimuth track of an earlier scan in the inbox, (None, None) if they are missing."""
+    assert site.inclination is not None  # noqa: S101 - checked by the caller
+    log_path = site.scans.inbox / f"{stem}{site.inclination.suffix}"
+    scans = [path for path in site.scans.inbox.glob(f"{stem}.*") if path != log_path]
+    if not log_path.is_file() or not scans:
+        return None, None
+    with open_scan(scans[0], range_max_m=site.scanner.range_max_m) as reader:
+        track = reader.azimuth_track()
+    log, _ = inclination.clean(read_inclination(log_path), site.instrument.inclination_range_rad)
+    return log, track
+
+
+def _fit_tilt_offset(log: InclinationLog, track: AzimuthTrack | None, sigma_rad: float) -> CyclicError:
+    if track is not None:
+        return inclination.fit_cyclic_error(log, track, sigma_rad)
+    return CyclicError((float(log.roll_rad.mean()), 0.0, 0.0), (float(log.pitch_rad.mean()), 0.0, 0.0))
+
+
+def air_from_log(section: WeatherSection, time_utc_s: float) -> Air | None:
+    """Return the air at a time, interpolated in the weather log; None if the log has a gap.
+
+    Raises ScanError or NotReadyError if the log cannot be used.
+    """
+    log = read_weather(
+        section.file,
+        format=section.format,
+        columns=section.columns,
+        utc_offset_h=section.utc_offset_h,
+        window_utc_s=(time_utc_s - section.max_age_s, time_utc_s + section.max_age_s),
+    )
+    return interpolate_air(log, time_utc_s, section.max_age_s)
+
+
+def _air(site: Site, mid_scan: datetime, height_m: float, warnings: list[str]) -> tuple[Air, bool]:
+    """Return the air of the scan, and whether it was measured."""
+    if site.weather is not None:
+        section = site.weather
+        try:
+            air = air_from_log(section, mid_scan.timestamp())
+        except (ScanError, NotReadyError) as error:  # a scan does not wait for its weather indefinitely
+            warnings.append(f"weather unusable: {error}")
+            air = None
+        if air is not None:
+            return air, True
+        age = timedelta(seconds=section.max_age_s)
+        warnings.append(f"weather missing within {age} of {mid_scan:%Y-%m-%d %H:%M} UTC")
+    if site.air is None or site.air.scanner_setting == "weather":
+        return standard_air(height_m), False
+    return site.air.scanner_setting.air, False

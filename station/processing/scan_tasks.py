@@ -1,0 +1,473 @@
+"""Processing of one scan, from the inbox into the archive; the tasks run in a worker process.
+
+The last argument of a task is `progress()`, which reports to the parent process that the worker is alive.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from datetime import UTC, datetime
+from pathlib import Path
+
+import numpy as np
+
+from station._version import __version__
+from station.archive import epochs
+from station.archive.geometry_cache import cached_viewing_geometry
+from station.archive.netcdf_layout import Series, roundtrip_text
+from station.archive.reference_files import open_reference, valid_versions, write_reference
+from station.config import Site
+from station.errors import ScanError
+from station.inbox.file_hash import hash_if_unchanged, sha256_file
+from station.inbox.inbox import ScanFile
+from station.processing.isolation import trim_heap
+from station.processing.pipeline import (
+    AdjustmentInputs,
+    adjust_to_reference,
+    grid_scan,
+    holdout_statistics,
+    measure,
+    new_gridder,
+    reference_viewing_geometry,
+)
+from station.processing.previews import PreviewRecorder
+from station.processing.scan_inputs import ScanInputs, load_scan_inputs
+from station.products.overview import Overview
+from station.quantities import Bools, Measurement, Quality, Reference, ScanGeometry
+from station.queries.aggregates import LEVERAGE_VARIABLES
+from station.readers.flags import read_flags, reasons_for
+from station.readers.polygons import cells_inside, read_polygons
+from station.readers.raster import read_geotiff
+from station.readers.scan import ScanReader, open_scan, reject_future, utc_interval
+from station.science.adjustment import ground_classes
+from station.science.adjustment.joint import Adjustment
+from station.science.analysis import inclination_check, verdict
+from station.science.geometry.terrain import nodes_from_means
+from station.science.gridding.gridder import Gridder
+from station.science.gridding.viewing_geometry import ViewingGeometry
+
+Progress = Callable[[], None]
+MAX_METRIC_CELLS = 100_000  # the metrics of larger scans are computed from a sample
+UNUSABLE_REJECTED_SHARE = 0.6  # of the stable ground; above it the filtered log alone is safer
+
+
+@dataclass(frozen=True)
+class StoredResult:
+    """Result of a scan that was stored."""
+
+    start_utc_s: float
+    sha256: str
+    epoch: str  # relative to the data folder
+    revision: int
+    verdict: str
+    reason: str
+    reference: str | None
+    metrics: dict[str, float | str]
+    log_sha256: str
+    epoch_sha256: str  # of the epoch file
+    overview: Overview | None = None  # for the page; if None, the page reads it from the store
+
+
+@dataclass(frozen=True)
+class ScanHistory:
+    """What the journal knows about a scan from earlier processing."""
+
+    reference: str | None = None  # version the scan was processed with
+    revision: int = 0
+    last_content: tuple[str, str] | None = None  # SHA-256 of scan and log last assessed under its name
+    stored_scans: Mapping[str, str] = field(default_factory=dict)  # names of other stored scans by SHA-256
+    wait_for_weather: bool = False  # if the weather log is not up to date yet
+
+
+@dataclass(frozen=True)
+class Duplicate:
+    """A scan whose content was already assessed under `name`."""
+
+    name: str
+    sha256: str
+
+
+@dataclass(frozen=True)
+class Rejected:
+    """A scan that cannot be used."""
+
+    reason: str
+    sha256: str
+    log_sha256: str
+
+
+def series_for(site: Site) -> Series:
+    """Return the series of a site."""
+    return Series(
+        folder=site.station.data,
+        station_id=site.station.id,
+        grid=site.grid_cells,
+        crs=site.map.crs,
+        vertical_datum=site.map.vertical_datum,
+        name=site.station.name,
+        institution=site.station.institution,
+    )
+
+
+def process_new(
+    site: Site, scan: ScanFile, history: ScanHistory, progress: Progress
+) -> StoredResult | Duplicate | Rejected:
+    """Process a new scan unless its content was already assessed; raises as `process`."""
+    sha256 = sha256_file(scan.path) if history.last_content or history.stored_scans else ""
+    if history.last_content == (sha256, sha256_log(scan)):
+        return Duplicate(scan.name, sha256)
+    if sha256 in history.stored_scans:
+        return Duplicate(history.stored_scans[sha256], sha256)
+    progress()
+    return reprocess_scan(site, scan, history, progress, with_preview=site.products.page)
+
+
+def reprocess_scan(
+    site: Site, scan: ScanFile, history: ScanHistory, progress: Progress, *, with_preview: bool = False
+) -> StoredResult | Rejected:
+    """Process a scan even if its content is known, with the reference version used before."""
+    try:
+        return process(
+            site,
+            scan,
+            progress,
+            wait_for_weather=history.wait_for_weather,
+            history=history,
+            with_preview=with_preview,
+        )
+    except ScanError as error:
+        is_file = scan.path.is_file() and not scan.path.is_symlink()
+        return Rejected(
+            str(error), sha256_file(scan.path) if is_file else "", sha256_log(scan) if is_file else ""
+        )
+
+
+def process(
+    site: Site,
+    scan: ScanFile,
+    progress: Progress,
+    *,
+    wait_for_weather: bool = False,
+    history: ScanHistory = ScanHistory(),
+    with_preview: bool = False,
+) -> StoredResult:
+    """Process a scan and store its epoch, unless an identical one is stored; record a preview if asked to.
+
+    Raises ScanError if the scan cannot be used. Raises NotReadyError if it changes meanwhile, begins in the
+    future, or, with `wait_for_weather`, arrived recently and has no weather yet.
+    """
+    began_s = time.monotonic()
+    series = series_for(site)
+    with hash_if_unchanged(scan.path) as scan_sha256:
+        progress()
+        wait_s = site.weather.wait_s if wait_for_weather and site.weather else 0.0
+        is_recent = time.time() - scan.mtime_ns * 1e-9 < wait_s
+        reference = load_reference(site, history.reference)
+        epoch = _compute_epoch(
+            site, scan, scan_sha256, reference, progress, is_dry_run=False, wait_for_weather=is_recent
+        )
+    version, epoch_file = epoch.provenance["reference_version"], _identical_epoch(series, epoch)
+    preview = PreviewRecorder(site, series, version if with_preview and epoch_file is None else "")
+    epoch_file = epoch_file or epochs.write_epoch(series, epoch, history.revision, preview.add)
+    return StoredResult(
+        start_utc_s=epoch.start_s,
+        sha256=scan_sha256,
+        epoch=str(epoch_file.path.relative_to(series.folder)),
+        revision=epoch_file.revision,
+        verdict=epoch.verdict,
+        reason=epoch.verdict_reason,
+        reference=version or None,
+        metrics=_log_metrics(epoch, time.monotonic() - began_s),
+        log_sha256=epoch.provenance["log_sha256"],
+        epoch_sha256=sha256_file(epoch_file.path),
+        overview=preview.overview,
+    )
+
+
+def check_header(site: Site, scan: ScanFile, progress: Progress) -> None:
+    """Raise ScanError if the headers of a scan show that it cannot be used."""
+    progress()
+    with open_scan_for(site, scan.path) as reader:
+        utc_interval(reader, site.scans.name)
+
+
+def dry_run(site: Site, scan: ScanFile, progress: Progress) -> tuple[str, str, dict[str, float | str]]:
+    """Return verdict, reason and metrics of a scan; nothing is stored."""
+    began_s = time.monotonic()
+    reference = None if isinstance(site.reference.scans, Path) else load_reference(site)
+    epoch = _compute_epoch(site, scan, "", reference, progress, is_dry_run=True, wait_for_weather=False)
+    return epoch.verdict, epoch.verdict_reason, _log_metrics(epoch, time.monotonic() - began_s)
+
+
+def _compute_epoch(
+    site: Site,
+    scan: ScanFile,
+    scan_sha256: str,
+    reference: Reference | None,
+    progress: Progress,
+    *,
+    is_dry_run: bool,
+    wait_for_weather: bool,
+) -> epochs.Epoch:
+    with open_scan_for(site, scan.path) as reader:
+        start, end, _ = utc_interval(reader, site.scans.name)
+        reject_future(start, time.time())
+        inputs = load_scan_inputs(
+            site,
+            reader,
+            scan.log,
+            start,
+            end,
+            save_tilt_offset=not is_dry_run,
+            wait_for_weather=wait_for_weather,
+        )
+        viewing = load_viewing_geometry(site, inputs.geometry, reference) if reference else None
+        progress()
+        blocks = reader.blocks(with_intensity=site.adjusts)  # decoding starts here
+        gridder = new_gridder(inputs.geometry, viewing)
+        grid_scan(gridder, blocks, inputs.pose, progress)
+    if gridder.is_empty():
+        raise ScanError("no point falls on the grid: wrong scans.frame, SOP, CRS or units?")
+    progress()
+    adjustment = adjust_scan(site, gridder, inputs, viewing)
+    flag = exclusion_reason(site, start.timestamp(), end.timestamp())
+    attempt = adjustment[1] if adjustment else None
+    if adjustment is not None and adjustment[1].rejected_share > UNUSABLE_REJECTED_SHARE:
+        adjustment = None
+    shared = adjustment[1].to_shared_parameters() if adjustment is not None else inputs.log_only_shared
+    log_warnings, clock_scalars = _check_log(adjustment, reference)
+    measurement = measure(gridder, inputs.geometry, shared, viewing, adjustment)
+    progress()
+    scalars = _scalar_variables(measurement, inputs, reader.header.point_count)
+    if adjustment is not None and viewing is not None:
+        scalars |= holdout_statistics(measurement, viewing) | {"change_step": adjustment[1].change_step_m}
+        scalars |= dict(zip(LEVERAGE_VARIABLES, adjustment[1].leverage_m2, strict=True))
+    verdict_name, reason = verdict.assess(
+        flag,
+        [*inputs.warnings, *log_warnings],
+        measurement,
+        viewing,
+        attempt,
+        scalars.get("stable_z_std", 0.0) if adjustment else None,
+    )
+    return epochs.Epoch(
+        start_s=start.timestamp(),
+        end_s=end.timestamp(),
+        scan_id=scan.path.stem,
+        measurement=measurement,
+        shared=shared,
+        verdict=verdict_name,
+        verdict_reason=reason,
+        scalars=scalars | clock_scalars,
+        provenance={
+            "scan_sha256": scan_sha256,
+            "log_sha256": sha256_log(scan),
+            "flag": flag,
+            "science_hash": site.science_hash,
+            "reference_version": reference.version if reference else "",
+            "adjustment": "joint" if adjustment else "none",
+            "software_version": __version__,
+            **inputs.provenance,
+        },
+    )
+
+
+def load_viewing_geometry(site: Site, geometry: ScanGeometry, reference: Reference) -> ViewingGeometry:
+    """Return the viewing geometry of a stored reference version, cached for one scan geometry."""
+    setting = site.adjustment.stable
+    polygon_hash = sha256_file(setting) if isinstance(setting, Path) and setting.is_file() else ""
+    return cached_viewing_geometry(
+        series_for(site),
+        reference,
+        (geometry.position_m, geometry.axis),
+        repr((geometry.grid, geometry.scanner, geometry.published_budget, site.map.crs, polygon_hash)),
+        lambda: reference_viewing_geometry(reference, geometry, stable_cells(site, reference)),
+    )
+
+
+def adjust_scan(
+    site: Site, gridder: Gridder, inputs: ScanInputs, viewing: ViewingGeometry | None
+) -> tuple[AdjustmentInputs, Adjustment] | None:
+    """Return the adjustment of a scan to the reference; None if it is disabled or there is no reference."""
+    if not site.adjusts or inputs.adjustment_inputs is None or viewing is None:
+        return None
+    adjustment = adjust_to_reference(gridder, inputs.geometry, inputs.adjustment_inputs, viewing)
+    trim_heap()
+    return inputs.adjustment_inputs, adjustment
+
+
+def _check_log(
+    adjustment: tuple[AdjustmentInputs, Adjustment] | None, reference: Reference | None
+) -> tuple[list[str], dict[str, float]]:
+    """Return warnings about a scan's inclination log checked against the ground, and its clock offset [s]."""
+    if adjustment is None or reference is None:
+        return [], {}
+    prediction = inclination_check.leave_log_out(adjustment[0].lines, adjustment[1])
+    if prediction is None:
+        return [], {}
+    warnings = inclination_check.sensor_warnings(prediction)
+    clock_offset = inclination_check.estimate_clock_offset(
+        prediction, reference.components, len(reference.scan_ids)
+    )
+    trim_heap()
+    if clock_offset is None:
+        return warnings, {}
+    return warnings + clock_offset.warnings(), {
+        "log_clock_offset": clock_offset.offset_s,
+        "log_clock_offset_uncertainty": clock_offset.sigma_s,
+    }
+
+
+def stable_cells(site: Site, reference: Reference) -> Bools:
+    """Return the stable cells (ny, nx): those in the polygons of the site, else those of the reference."""
+    setting = site.adjustment.stable
+    return polygon_cells(setting, site) if isinstance(setting, Path) else reference.stable
+
+
+def polygon_cells(file: Path, site: Site) -> Bools:
+    """Return the cells (ny, nx) inside any of the polygons of a file."""
+    inside = np.zeros(site.grid_cells.shape, bool)
+    for polygon in read_polygons(file, site.map.crs).values():
+        inside |= cells_inside(polygon, site.grid_cells)
+    return inside
+
+
+def _identical_epoch(series: Series, epoch: epochs.Epoch) -> epochs.EpochFile | None:
+    """Return the stored epoch of this start if it has the same inputs and settings, else None.
+
+    A scan whose epoch was written just before a power cut is therefore not stored twice.
+    """
+    revisions = epochs.revisions(series, datetime.fromtimestamp(epoch.start_s, UTC))
+    if not revisions:
+        return None
+    provenance = epochs.read_provenance(revisions[-1].path)
+    expected = {
+        **epoch.provenance,
+        "scan_id": epoch.scan_id,
+        "verdict": epoch.verdict,
+        "verdict_reason": roundtrip_text(epoch.verdict_reason, "sentence"),
+    }
+    is_same = all(provenance.get(key) == value for key, value in expected.items() if key in provenance)
+    return (
+        revisions[-1] if is_same and epochs.read_air(revisions[-1].path) == air_key(epoch.scalars) else None
+    )
+
+
+def air_key(scalars: Mapping[str, float]) -> tuple[float, ...]:
+    """Return temperature, pressure and humidity of an epoch [°C, hPa, %]; () if they are unknown."""
+    air = tuple(scalars[name] for name in epochs.AIR_VARIABLES if name in scalars)
+    return air if len(air) == len(epochs.AIR_VARIABLES) else ()
+
+
+def exclusion_reason(site: Site, start_utc_s: float, end_utc_s: float) -> str:
+    """Return the reasons in the flag file for excluding a scan, as stored; '' if there are none."""
+    reason = reasons_for(read_flags(site.flags.file), start_utc_s, end_utc_s) if site.flags else ""
+    return roundtrip_text(reason, "sentence")
+
+
+def load_reference(site: Site, version: str | None = None) -> Reference | None:
+    """Return the reference surface: `version` if it is still valid, else the newest.
+
+    A reference given as a file is imported into the store on first use.
+    """
+    series = series_for(site)
+    setting = site.reference.scans
+    if not isinstance(setting, Path):
+        versions = valid_versions(series)
+        newest = list(versions)[-1] if versions else None
+        return open_reference(series, version if version in versions else newest)
+    reference = open_reference(series)
+    version = file_version(setting)
+    if reference is None or reference.version != version:
+        elevation_m = nodes_from_means(read_geotiff(setting, series.grid, series.crs))
+        snow_free = ground_classes.holds_no_snow(elevation_m, series.grid.cell_m)
+        write_reference(series, Reference.from_elevation(series.grid, version, elevation_m, snow_free))
+        reference = open_reference(series)
+    return reference
+
+
+def file_version(file: Path) -> str:
+    """Return the version name of a reference surface given as a file."""
+    return f"{file.stem}-{sha256_file(file)[:8]}"
+
+
+def load_areas(site: Site) -> dict[str, Bools]:
+    """Return the cells (ny, nx) of the areas of a site by name."""
+    if site.areas is None:
+        return {}
+    polygons = read_polygons(site.areas.file, site.map.crs)
+    return {name: cells_inside(polygon, site.grid_cells) for name, polygon in polygons.items()}
+
+
+@contextmanager
+def open_scan_for(site: Site, path: Path) -> Iterator[ScanReader]:
+    """Yield a reader of a scan with the settings of the site; raises ScanError or NotReadyError."""
+    range_max_m = site.scanner.range_max_m if site.scans.frame == "scanner" else None
+    with open_scan(path, range_max_m=range_max_m) as reader:
+        yield reader
+
+
+def sha256_log(scan: ScanFile) -> str:
+    """Return the SHA-256 of a scan's inclination log, '' if there is none."""
+    return sha256_file(scan.log) if scan.log else ""
+
+
+def _scalar_variables(measurement: Measurement, inputs: ScanInputs, point_total: int) -> dict[str, float]:
+    """Return the scalar variables of an epoch by their name in the store."""
+    tilt_record, geometry = inputs.tilt_record, inputs.geometry
+    scalars = {
+        "point_total": float(point_total),
+        "coverage": float(np.count_nonzero(measurement.count) / measurement.cell_index.size),
+    }
+    if geometry.position_m is not None:
+        scalars |= dict(
+            zip(("scanner_east", "scanner_north", "scanner_height"), geometry.position_m, strict=True)
+        )
+        scalars |= {"scanner_axis_east": geometry.axis[0], "scanner_axis_north": geometry.axis[1]}
+    if tilt_record is not None:
+        scalars["platform_roll"] = math.degrees(tilt_record.mean_roll_rad)
+        scalars["platform_pitch"] = math.degrees(tilt_record.mean_pitch_rad)
+        scalars["tilt_residual"] = math.degrees(tilt_record.noise_rad)
+        scalars["log_offset"] = tilt_record.offset_s
+    return scalars | air_scalars(inputs)
+
+
+def air_scalars(inputs: ScanInputs) -> dict[str, float]:
+    """Return the air of a scan by variable name [°C, hPa, %]; empty if it is unknown."""
+    air = inputs.air
+    if air is None:
+        return {}
+    return dict(
+        zip(epochs.AIR_VARIABLES, (air.temperature_c, air.pressure_hpa, air.humidity_pct), strict=True)
+    )
+
+
+def _log_metrics(epoch: epochs.Epoch, seconds: float) -> dict[str, float | str]:
+    """Return the metrics of a scan for the log line and the status."""
+    measurement = epoch.measurement
+    metrics: dict[str, float | str] = {
+        "points": int(epoch.scalars["point_total"]),
+        "cells": round(epoch.scalars["coverage"] * measurement.cell_index.size),
+    }
+    sample = slice(None, None, 1 + len(measurement.cells) // MAX_METRIC_CELLS)
+    change_m, sigma_m = measurement.change_m[sample], measurement.cells["uncertainty_m"][sample]
+    valid = np.isfinite(sigma_m)
+    if valid.any():
+        metrics["sigma_median_m"] = round(float(np.median(sigma_m[valid])), 4)
+    valid = np.isfinite(change_m)
+    if valid.any():
+        metrics["change_median_m"] = round(float(np.median(change_m[valid])), 4)
+        significant = measurement.quality[sample][valid] & np.uint8(Quality.CHANGE_SIGNIFICANT)
+        metrics["significant_pct"] = round(100 * float(np.mean(significant > 0)), 1)
+    for variable in ("stable_nmad", "stable_z_std"):
+        if np.isfinite(epoch.scalars.get(variable, np.nan)):
+            metrics[variable] = round(epoch.scalars[variable], 3)
+    for variable, name in (("platform_roll", "roll_deg"), ("platform_pitch", "pitch_deg")):
+        if variable in epoch.scalars:
+            metrics[name] = round(epoch.scalars[variable], 4)
+    metrics["seconds"] = round(seconds, 2)
+    return metrics

@@ -1,0 +1,91 @@
+"""Tasks on the store as a whole; they run in a worker process, as those of `scan_tasks`."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping
+from contextlib import suppress
+from datetime import UTC, datetime
+from pathlib import Path
+
+from station.archive import compaction, epochs
+from station.archive.areas import update_areas
+from station.archive.reference_files import repair_reference_link
+from station.archive.series import index
+from station.archive.series.virtual import build_series
+from station.config import Site
+from station.errors import StoreError
+from station.inbox.file_hash import sha256_file
+from station.processing.scan_tasks import Progress, load_areas, series_for
+from station.queries.aggregates import Aggregates
+
+Checksums = dict[str, str]  # SHA-256 by file, relative to the data folder
+
+# Source files of the series: beyond the limit of open files some readers return wrong data.
+MAX_SOURCES = 250
+LOWEST_PRIORITY = 19  # nice value
+MAX_UNCOMPACTED = 48  # of closed days, before they are compacted during a backlog
+
+
+def update_series(site: Site, progress: Progress) -> int:
+    """Update `series.nc` to the stored epochs, then `areas.nc`; return the number of compactable epochs.
+
+    If there are too many source files, epochs are compacted first.
+    """
+    series = series_for(site)
+    repair_reference_link(series)
+    if len(index.source_files(series.path)) > MAX_SOURCES:
+        compaction.compact(series, compaction.latest_start(series), progress)
+    build_series(series)
+    progress()
+    try:
+        update_areas(series, load_areas(site), Aggregates(series), progress)
+    except (OSError, RuntimeError) as error:
+        raise StoreError(f"{series.folder}: an epoch is damaged: {error}") from error
+    return compaction.count_compactable(series)
+
+
+def compact_epochs(
+    site: Site, checksums: Mapping[str, str], progress: Progress, *, in_backlog: bool = False
+) -> Checksums:
+    """Compact closed days and months; return the checksums of the files written.
+
+    `checksums` are those of the files of the store. With `in_backlog`, the newest epoch decides which days
+    and months are closed, not the clock. Raises StoreError if a file to be compacted fails its checksum.
+    """
+    series = series_for(site)
+
+    def verify(path: Path) -> None:
+        progress()
+        name = str(path.relative_to(series.folder))
+        if name in checksums and sha256_file(path) != checksums[name]:
+            raise StoreError(f"{path}: damaged: its checksum does not match")
+
+    now = compaction.latest_start(series) if in_backlog else datetime.now(UTC)
+    written = compaction.compact(series, now, progress, verify) if epochs.list_files(series) else []
+    new_checksums = {}
+    for path in written:
+        progress()
+        new_checksums[str(path.relative_to(series.folder))] = sha256_file(path)
+    return new_checksums
+
+
+def compact_low_priority(
+    site: Site,
+    checksums: Mapping[str, str],
+    in_backlog: bool,  # noqa: FBT001 - a task has no keywords
+    progress: Progress,
+) -> Checksums:
+    """Do as `compact_epochs` at low priority, so that scans processed meanwhile come first."""
+    with suppress(OSError):  # without permission it runs at normal priority
+        os.nice(LOWEST_PRIORITY)
+    return compact_epochs(site, checksums, progress, in_backlog=in_backlog)
+
+
+def delete_expired(site: Site, progress: Progress) -> list[str]:
+    """Delete files unused by the series for two days; return them, relative to the data folder."""
+    progress()
+    series = series_for(site)
+    return [
+        str(path.relative_to(series.folder)) for path in compaction.delete_expired(series, datetime.now(UTC))
+    ]

@@ -1,0 +1,91 @@
+"""The epochs of the series, and the series of areas, as tables of plain columns."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import h5py
+import numpy as np
+from isal.igzip_lib import IsalError
+
+from station.archive.areas import AREA_VARIABLES
+from station.archive.chunk_codec import read_column
+from station.archive.netcdf_layout import Series, decode_text
+from station.archive.schema import FILL, VERDICTS
+from station.errors import StoreError
+from station.quantities import Floats
+
+SCALAR_VARIABLES = (
+    "platform_roll", "platform_pitch", "air_temperature", "air_pressure", "point_total", "coverage",
+    "stable_median", "stable_nmad", "stable_z_std",
+)  # fmt: skip
+TEXT_VARIABLES = ("scan_id", "epoch_file", "verdict_reason", "reference_version")
+
+
+@dataclass(frozen=True)
+class EpochTable:
+    """Values of all epochs, in time order."""
+
+    start_s: Floats  # (t,) seconds since 1970, start of the scan
+    verdict: list[str]
+    scalars: dict[str, Floats]  # (t,) NaN where missing
+    texts: dict[str, list[str]]
+
+    def __len__(self) -> int:
+        """Return the number of epochs."""
+        return len(self.start_s)
+
+
+@dataclass(frozen=True)
+class AreaSeries:
+    """One area over time; all (t,)."""
+
+    name: str
+    size_m2: float
+    start_s: Floats
+    columns: dict[str, Floats]
+
+
+def read_epoch_table(series: Series) -> EpochTable:
+    """Return the epoch table of `series.nc`; raise StoreError if it cannot be read."""
+    try:
+        with h5py.File(series.path, "r") as file:
+            return EpochTable(
+                start_s=np.asarray(file["time_bnds"][:, 0], dtype=np.float64),
+                verdict=[VERDICTS[code] for code in file["verdict"][:].tolist()],
+                scalars={name: _nan_where_missing(file[name][:]) for name in SCALAR_VARIABLES},
+                texts={name: decode_text(read_column(file[name])) for name in TEXT_VARIABLES},
+            )
+    except (OSError, RuntimeError, KeyError, IndexError, ValueError, IsalError) as error:  # type: ignore[misc] # the stub has no class
+        raise StoreError(f"{series.path}: cannot be read: {error}") from error
+
+
+def read_area_series(series: Series) -> list[AreaSeries]:
+    """Return the series of all areas of `areas.nc`; none if the file is missing or of an older version."""
+    path = series.folder / "areas.nc"
+    if not path.is_file():
+        return []
+    try:
+        with h5py.File(path, "r") as file:
+            over_time = [variable.name for variable in AREA_VARIABLES if variable.dims == ("time", "area")]
+            if not set(over_time) <= set(file):
+                return []
+            start_s = np.asarray(file["time_bnds"][:, 0], dtype=np.float64)
+            names = [name.tobytes().rstrip(b"\0").decode() for name in file["area_name"][:]]
+            size_m2 = file["area_size"][:]
+            columns = {name: _nan_where_missing(read_column(file[name])) for name in over_time}
+    except (OSError, RuntimeError, KeyError, IndexError, ValueError, IsalError) as error:  # type: ignore[misc] # the stub has no class
+        raise StoreError(f"{path}: cannot be read: {error}") from error
+    return [
+        AreaSeries(
+            name, float(size_m2[index]), start_s, {key: values[:, index] for key, values in columns.items()}
+        )
+        for index, name in enumerate(names)
+    ]
+
+
+def _nan_where_missing(values: np.ndarray[Any, Any]) -> Floats:
+    """Return values with NaN where they are missing."""
+    numbers = values.astype(np.float64)
+    return np.where(numbers < FILL / 2, numbers, np.nan)

@@ -1,0 +1,137 @@
+"""Volumes between epochs with the sources of their uncertainty; covariance of single points."""
+
+from __future__ import annotations
+
+import netCDF4
+import numpy as np
+import numpy.typing as npt
+import shapely
+import xarray as xr
+
+from station.archive.epochs import EpochRef
+from station.errors import StoreError
+from station.quantities import Bools, Floats, Grid, Scanner
+from station.queries.aggregates import (
+    CHANGE,
+    Aggregates,
+    EpochCells,
+    common_error_covariance,
+    observed_in_all,
+    read_cells_of,
+)
+from station.science.analysis.voids import area_weights
+from station.science.analysis.volume import common_contributions, shared_contributions
+from station.science.uncertainty.parameters import parameter_layout
+from station.science.uncertainty.point_covariance import shared_covariance, shot_covariance
+from station.science.uncertainty.propagation import difference_to_reference
+
+
+def area_mask(area: npt.ArrayLike | shapely.Geometry, grid: Grid) -> Bools:
+    """Return the mask (ny, nx) of an area given as a mask, or as a polygon that contains the cell centres."""
+    if isinstance(area, shapely.Geometry):
+        shapely.prepare(area)
+        return np.asarray(shapely.contains_xy(area, grid.x_m[None, :], grid.y_m[:, None]))
+    mask = np.asarray(area, np.bool_)
+    if mask.shape != grid.shape:
+        raise ValueError(f"the mask has shape {mask.shape}, the grid {grid.shape}")
+    return mask
+
+
+class Volumes(Aggregates):
+    """Volumes of the epochs of a store, and the covariance of their points."""
+
+    def volume_change(self, cells: Bools, epoch: EpochRef, other: EpochRef | None = None) -> xr.Dataset:
+        """Return the volume change over cells (ny, nx) in an epoch, or from a second epoch to it [m³].
+
+        As in `areas.nc`, cells without a change are interpolated; `coverage` is the share of the others.
+        Three sigmas [m³]: total; random part only; and as published, with the total errors of all cells
+        independent. The maps contain the share of each cell in the variance of the observed part, and in the
+        published variance; each sums to 1. Raises StoreError if no cell was observed.
+        """
+        epochs = self._read_epochs(cells, epoch, other)
+        common_cells = observed_in_all(epochs, cells)
+        if not common_cells.any():
+            raise StoreError(f"{epoch.path}: none of the {np.count_nonzero(cells)} cells has a change")
+        size_m2 = self._series.grid.cell_m**2 * np.count_nonzero(cells)
+        weights_m2 = size_m2 * area_weights(cells, common_cells)[0][common_cells]
+        random_part, shared_part = self._variance_contributions(
+            epochs,
+            common_cells,
+            weights_m2,
+            self._random_variances(epochs, common_cells, common_cells[cells]),
+        )
+        sigmas_m = [
+            self._sigma(epoch_ref, common_cells)
+            for epoch_ref in ([epoch] if other is None else [epoch, other])
+        ]
+        published = weights_m2**2 * sum(sigma_m**2 for sigma_m in sigmas_m)
+        area_change = self.area(cells, epoch, other)
+
+        def volume_variable(value_m3: float) -> tuple[tuple[()], float, dict[str, str]]:
+            return (), value_m3, {"units": "m3"}
+
+        def share_map(values: Floats) -> tuple[tuple[str, str], Floats, dict[str, str]]:
+            share = np.full(cells.shape, np.nan)
+            share[common_cells] = values / values.sum()
+            return ("y", "x"), share, {"units": "1"}
+
+        return xr.Dataset(
+            {
+                "volume_change": volume_variable(area_change.mean_m * size_m2),
+                "volume_change_uncertainty": volume_variable(area_change.mean_sigma_m * size_m2),
+                "volume_change_random_uncertainty": volume_variable(float(np.sqrt(random_part.sum()))),
+                "volume_change_uncertainty_hartzell2015": volume_variable(float(np.sqrt(published.sum()))),
+                "area_size": ((), size_m2, {"units": "m2"}),
+                "coverage": ((), area_change.coverage, {"units": "1"}),
+                "variance_share": share_map(random_part + shared_part),
+                "variance_share_hartzell2015": share_map(published),
+            },
+            {"y": self._series.grid.y_m, "x": self._series.grid.x_m},
+        )
+
+    def _sigma(self, epoch: EpochRef, common_cells: Bools) -> Floats:
+        """Return one sigma (n,) of the selected cells in an epoch, random and shared errors [m]."""
+        with netCDF4.Dataset(epoch.path) as file:
+            return read_cells_of(file[f"{CHANGE}_uncertainty"], epoch.index, common_cells)
+
+    def _variance_contributions(
+        self, epochs: list[EpochCells], common_cells: Bools, weights: Floats, random_m2: list[Floats]
+    ) -> tuple[Floats, Floats]:
+        """Return the random and the shared contribution of each cell (n,) to a weighted sum's variance."""
+        random_part, shared_part, jacobians = np.zeros(len(weights)), np.zeros(len(weights)), []
+        for epoch_cells, independent_m2 in zip(epochs, random_m2, strict=True):
+            random_part += weights**2 * independent_m2
+            shared_params = epoch_cells.shared
+            if shared_params is None:
+                continue
+            if len(epochs) == 1 and not epoch_cells.adjusted:
+                shared_params = difference_to_reference(shared_params, epoch_cells.reference.shared)
+            jacobian = self.jacobian(epoch_cells, common_cells)
+            noise_leverage = (
+                self.leverage(epoch_cells, common_cells, jacobian, independent_m2)
+                if len(epochs) > 1
+                else None
+            )
+            jacobians.append(jacobian)
+            shared_part += shared_contributions(weights, jacobian, shared_params, noise_leverage)
+        common_covariance = common_error_covariance(epochs)
+        if common_covariance is not None:
+            shared_part -= common_contributions(weights, (jacobians[0], jacobians[1]), common_covariance)
+        return random_part, shared_part
+
+    def point_covariance(self, points_m: Floats, epoch: EpochRef, scanner: Scanner) -> Floats:
+        """Return the covariance (n, 3, 3) of map points (n, 3) in an epoch [m²]: shot, pose, tilt, air.
+
+        Raises StoreError if the epoch has no shared parameters.
+        """
+        epoch_cells = self.read_cells(epoch, np.zeros(self._series.grid.shape, np.bool_))
+        if epoch_cells.shared is None:
+            raise StoreError(
+                f"{epoch.path}: no scanner pose is stored, because the scan is in map coordinates"
+            )
+        position_m, (east, north) = epoch_cells.scanner[:3], epoch_cells.scanner[3:]
+        axis = east, north, float(np.sqrt(max(1 - east**2 - north**2, 0.0)))
+        offset_m = points_m - np.array(position_m)
+        params = parameter_layout(self._series.grid, (position_m[0], position_m[1], position_m[2]), axis)
+        shot_m2 = shot_covariance(offset_m, np.array(axis), scanner)
+        return shot_m2 + shared_covariance(params, offset_m, epoch_cells.shared)

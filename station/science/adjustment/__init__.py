@@ -1,0 +1,1 @@
+"""Adjustment of one scan: observations, prior, normal equations, joint solution, variance components."""

@@ -1,0 +1,71 @@
+"""Variance components of a station, re-estimated from the adjustments of its scans."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from dataclasses import replace
+
+import numpy as np
+
+from station.quantities import Floats, VarianceComponents
+from station.science.adjustment.prior import LineTimes, tilt_correlations, tilt_covariance
+from station.science.uncertainty.parameters import GLOBAL, ParameterLayout
+
+PRIOR_SCANS = 8  # weight of the start values, in scans
+EM_STEPS = 10
+TILT_COMPONENTS = ("tilt_drift_rad", "tilt_jitter_rad", "line_jitter_rad")
+COMPONENT_SLICES = {  # variance components by the global parameters they describe
+    "tilt_rad": slice(2),
+    "heading_rad": slice(2, 3),
+    "translation_m": slice(3, 6),
+    "range_bias_m": slice(6, 7),
+    "range_scale_ppm": slice(7, 8),
+    "refraction": slice(8, 9),
+}
+
+
+def estimate_variance_components(
+    start: VarianceComponents, params: ParameterLayout, scans: Iterable[tuple[LineTimes, Floats, Floats]]
+) -> VarianceComponents:
+    """Return the variance components shown by estimates (u,) and covariances (u, u) of several scans.
+
+    Each variance is the mean of estimate squared plus posterior variance, shrunk towards its start value as
+    if that came from `PRIOR_SCANS` scans. The tilt components differ in their correlation in time and are
+    separated by expectation-maximisation. With fewer than two scans the start values are returned.
+    """
+    first, last = len(GLOBAL), len(GLOBAL) + params.line_groups
+    tilt_slice = slice(first, last)
+    second_moment, tilt_moment = (
+        np.zeros(last + 2 * params.refraction_knots),
+        np.zeros((params.line_groups,) * 2),
+    )
+    scan_lines: list[LineTimes] = []
+    for lines, estimate, covariance in scans:  # one at a time: covariances are large
+        scan_lines.append(lines)
+        second_moment += estimate**2 + np.diag(covariance)
+        tilt_moment += (
+            np.outer(estimate[tilt_slice], estimate[tilt_slice]) + covariance[tilt_slice, tilt_slice]
+        )
+    count = len(scan_lines)
+    if count < 2:
+        return start
+    second_moment, tilt_moment = second_moment / (count - 1), tilt_moment / count
+
+    def shrunk_sigma(name: str, variance: float) -> float:
+        scan_count = count + PRIOR_SCANS
+        return math.sqrt((variance * count + getattr(start, name) ** 2 * PRIOR_SCANS) / scan_count)
+
+    variances = {name: float(second_moment[columns].mean()) for name, columns in COMPONENT_SLICES.items()}
+    variances["refraction_by_azimuth"] = float(second_moment[last : last + params.refraction_knots].mean())
+    kernels = tilt_correlations(scan_lines[0])
+    components = start
+    for _ in range(EM_STEPS):
+        precision = np.linalg.inv(tilt_covariance(components, scan_lines[0]))
+        weighted_moment = precision @ tilt_moment @ precision
+        for name, kernel in zip(TILT_COMPONENTS, kernels, strict=True):
+            variances[name] = getattr(components, name) ** 2 * float(
+                np.sum(weighted_moment * kernel) / np.sum(precision * kernel)
+            )
+        components = replace(components, **{name: math.sqrt(variances[name]) for name in TILT_COMPONENTS})
+    return replace(start, **{name: shrunk_sigma(name, variance) for name, variance in variances.items()})

@@ -1,0 +1,1 @@
+"""Analysis of adjusted scans: verdicts, calibration, change, volumes, sensitivity and precision."""

@@ -1,0 +1,282 @@
+"""Tilt of every shot from the inclination log: cleaning, cyclic error, clock offset and low-pass filter."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy import ndimage
+
+from station.quantities import AzimuthTrack, Floats, InclinationLog, TiltSeries
+from station.science.geometry.robust_statistics import NORMAL_MAD
+
+SENSOR_STEP_RAD = math.radians(0.001)  # resolution of the log
+HAMPEL_HALF_WIDTH = 7  # samples
+HAMPEL_SIGMAS = 5.0
+WINDOW_SAMPLES = (5, 301)  # shortest that smooths; longest that still follows changes within five minutes
+# A one-minute window for a scan that is adjusted: the adjustment estimates faster tilt from the raw log
+# and the ground, but it cannot remove noise passed by a short window, which differs from shot to shot.
+JOINT_CUTOFF_HZ = 0.82 / 61
+BLACKMAN_CUTOFF = 0.82  # -3 dB frequency of an N-sample Blackman window times N, equations.md, 2.8
+CYCLIC_ERROR_PRIOR_RAD = math.radians(0.05)  # largest cyclic error seen at Helheim, equations.md, 2.7
+OFFSET_PRIOR_S = 2.5  # clocks differ by up to 5 s, taken as two sigma: Voordendag et al. (2023), section 3.1
+OFFSET_LARGEST_S = 600.0  # one sigma of a clock that is never set
+OFFSET_SIGMAS = 5.0  # deviation from the clock prior beyond which the log overrules it
+OFFSET_ROUNDS = 4
+OFFSET_STEP_S = 10.0
+# Tilt drift of the mount during this scan and that of the cyclic error: equations.md, 6.3 and 6.4.
+MOTION_RAD, MOTION_S = math.radians(0.003), 300.0
+
+
+def clean(log: InclinationLog, range_rad: float) -> tuple[InclinationLog, int]:
+    """Return the log without invalid rows, and the number of rows removed.
+
+    Removed are values that are not finite or at the end of the sensor's range or beyond, times that do not
+    increase, and spikes (Hampel: five robust sigmas from the median of fifteen neighbours).
+    """
+    columns = np.stack([log.time_s, log.roll_rad, log.pitch_rad])
+    columns = columns[:, np.all(np.isfinite(columns), axis=0)]
+    columns = columns[:, np.all(np.abs(columns[1:]) < range_rad - SENSOR_STEP_RAD / 2, axis=0)]
+    if columns.shape[1]:
+        columns = columns[:, np.diff(np.maximum.accumulate(columns[0]), prepend=-np.inf) > 0]
+    if columns.shape[1] > 2 * HAMPEL_HALF_WIDTH:
+        width = (1, 2 * HAMPEL_HALF_WIDTH + 1)
+        deviation = np.abs(columns[1:] - ndimage.median_filter(columns[1:], width, mode="nearest"))
+        sigma = NORMAL_MAD * ndimage.median_filter(deviation, width, mode="nearest")
+        spike = deviation > HAMPEL_SIGMAS * np.maximum(sigma, SENSOR_STEP_RAD)
+        columns = columns[:, ~np.any(spike, axis=0)]
+    cleaned = InclinationLog(columns[0], columns[1], columns[2])
+    return cleaned, len(log.time_s) - len(cleaned.time_s)
+
+
+def saturated_fraction(log: InclinationLog, range_rad: float) -> float:
+    """Fraction of the rows of an uncleaned log that are at the end of the sensor's range or beyond [1]."""
+    tilt_rad = np.maximum(np.abs(log.roll_rad), np.abs(log.pitch_rad))
+    return float(np.mean(tilt_rad >= range_rad - SENSOR_STEP_RAD / 2)) if len(tilt_rad) else 0.0
+
+
+@dataclass(frozen=True)
+class CyclicError:
+    """Cyclic error of the tilt over one turn of the head [rad]: b0 + b1 cos θ + b2 sin θ.
+
+    Source: equations.md, 2.7, the sinusoid of Voordendag et al. (2023), Fig. 3.
+    """
+
+    roll_rad: tuple[float, float, float]
+    pitch_rad: tuple[float, float, float]
+
+    def at(self, azimuth_rad: Floats) -> tuple[Floats, Floats]:
+        """Roll and pitch at head azimuths (n,) [rad]."""
+        wave = _waves(azimuth_rad)
+        return np.asarray(wave @ self.roll_rad), np.asarray(wave @ self.pitch_rad)
+
+
+NO_CYCLIC_ERROR = CyclicError((0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
+
+
+def _waves(azimuth_rad: Floats) -> Floats:
+    return np.stack([np.ones_like(azimuth_rad), np.cos(azimuth_rad), np.sin(azimuth_rad)], axis=-1)
+
+
+def head_azimuth(track: AzimuthTrack, time_s: Floats) -> Floats:
+    """Azimuth of the scan head at times (n,) [rad]; constant before and after the scan."""
+    return np.interp(time_s, track.time_s, track.azimuth_rad)
+
+
+def fit_cyclic_error(log: InclinationLog, track: AzimuthTrack, sigma_rad: float) -> CyclicError:
+    """Return the cyclic error fitted to the part of a clean log that lies within the scan.
+
+    A sector of a turn cannot separate the wave from its mean: a prior of 0.05° on the wave resolves this.
+    Source: equations.md, 2.7.
+    """
+    inside = (log.time_s >= track.time_s[0]) & (log.time_s <= track.time_s[-1])
+    design = _waves(head_azimuth(track, log.time_s[inside]))
+    normal = design.T @ design + np.diag([0.0, 1.0, 1.0]) * (sigma_rad / CYCLIC_ERROR_PRIOR_RAD) ** 2
+    roll, pitch = (
+        np.linalg.lstsq(normal, design.T @ tilt_rad[inside], rcond=None)[0]
+        for tilt_rad in (log.roll_rad, log.pitch_rad)
+    )
+    return CyclicError((roll[0], roll[1], roll[2]), (pitch[0], pitch[1], pitch[2]))
+
+
+def clock_offset(
+    log: InclinationLog, track: AzimuthTrack, zero: CyclicError, sigma_rad: float
+) -> tuple[float, float]:
+    """Delay of the log's clock against the scan's, and its uncertainty [s].
+
+    The known cyclic error is fitted to the log with free mean, amplitude and phase; phase over head speed is
+    time. Real motion of the mount looks like phase too, and is part of the uncertainty. The prior that clocks
+    agree to 5 s (two sigma) shrinks the delay where the wave is too small to determine it, unless the log
+    contradicts that prior.
+    Source: equations.md, 2.10.
+    """
+    delay_s, sigma_s = 0.0, OFFSET_LARGEST_S
+    for _ in range(OFFSET_ROUNDS):
+        time_s = log.time_s - delay_s
+        inside = (time_s >= track.time_s[0]) & (time_s <= track.time_s[-1])
+        if np.count_nonzero(inside) < 60:
+            return 0.0, OFFSET_PRIOR_S
+        step_s, sigma_s = _phase_delay(
+            time_s[inside], log.roll_rad[inside], log.pitch_rad[inside], track, zero, sigma_rad
+        )
+        delay_s += step_s
+    if abs(delay_s) > OFFSET_SIGMAS * math.hypot(sigma_s, OFFSET_PRIOR_S):
+        return delay_s, sigma_s
+    shrinkage = OFFSET_PRIOR_S**2 / (OFFSET_PRIOR_S**2 + sigma_s**2)
+    return delay_s * shrinkage, sigma_s * math.sqrt(shrinkage)
+
+
+def _phase_delay(
+    time_s: Floats,
+    roll_rad: Floats,
+    pitch_rad: Floats,
+    track: AzimuthTrack,
+    zero: CyclicError,
+    sigma_rad: float,
+) -> tuple[float, float]:
+    """Return the delay of a log by the phase of its cyclic error, and its uncertainty [s]."""
+    bin_index = ((time_s - time_s[0]) / OFFSET_STEP_S).astype(np.int64)
+    _, bin_index = np.unique(bin_index, return_inverse=True)
+    count = np.bincount(bin_index)
+    azimuth_rad = head_azimuth(track, time_s)
+    speed_rad_s = np.gradient(azimuth_rad, time_s)
+    cos, sin = np.cos(azimuth_rad), np.sin(azimuth_rad)
+    middle_s = np.bincount(bin_index, time_s) / count
+    drift_rad2 = MOTION_RAD**2 * np.exp(-np.abs(np.subtract.outer(middle_s, middle_s)) / MOTION_S)
+    cholesky = np.linalg.cholesky(drift_rad2 + np.diag(sigma_rad**2 / count))
+    # Amplitude changes by ±20 % between scans, equations.md, 2.7.
+    normal = np.diag([1 / OFFSET_LARGEST_S**2, 1 / 0.2**2, 0.0, 0.0])
+    rhs = np.zeros(4)
+    for axis, (tilt_rad, wave) in enumerate(((roll_rad, zero.roll_rad), (pitch_rad, zero.pitch_rad))):
+        expected = wave[1] * cos + wave[2] * sin
+        per_second = (wave[1] * sin - wave[2] * cos) * speed_rad_s
+        mean = [np.full_like(time_s, axis == other) for other in (0, 1)]
+        columns = [per_second, expected, *mean, tilt_rad - wave[0] - expected]
+        means = np.stack([np.bincount(bin_index, column) / count for column in columns], axis=-1)
+        whitened = np.linalg.solve(cholesky, means)
+        normal += whitened[:, :4].T @ whitened[:, :4]
+        rhs += whitened[:, :4].T @ whitened[:, 4]
+    covariance = np.linalg.inv(normal)
+    return float((covariance @ rhs)[0]), float(math.sqrt(covariance[0, 0]))
+
+
+def blackman(samples: int) -> Floats:
+    """Weights (N,) of a Blackman window, normalised to a sum of one [1].
+
+    Source: equations.md, 2.8, Voordendag et al. (2023), section 3.1.
+    """
+    window = np.blackman(samples)
+    return np.asarray(window / window.sum())
+
+
+def low_pass(values: Floats, weights: Floats) -> Floats:
+    """Values (n,) convolved with symmetric weights, with odd reflection beyond both ends.
+
+    The values are reflected about the mean of the first and of the last ten. Source: equations.md, 2.8.
+    """
+    half = len(weights) // 2
+    ends = min(10, len(values))
+    mirrored_start = 2 * values[:ends].mean() - values[half:0:-1]
+    mirrored_end = 2 * values[-ends:].mean() - values[-2 : -half - 2 : -1]
+    return np.convolve(np.concatenate([mirrored_start, values, mirrored_end]), weights, mode="valid")
+
+
+def window_length(values: Floats, rate_hz: float, cutoff_hz: float | None) -> int:
+    """Odd window length [samples] for a cut-off; without one, for where the spectrum falls to the noise.
+
+    The noise is the median of the spectrum's upper half; the cut-off is where the spectrum, smoothed over
+    five bins, first falls below twice that. Source: equations.md, 2.8.
+    """
+    if cutoff_hz is None:
+        from scipy import signal  # noqa: PLC0415 - takes 0.8 s of CPU time, and few scans need it
+
+        frequency_hz, power = signal.welch(signal.detrend(values), rate_hz, nperseg=min(256, len(values)))
+        smooth = ndimage.uniform_filter1d(power, 5, mode="nearest")
+        noise = np.median(power[frequency_hz > frequency_hz[-1] / 2])
+        quiet = np.flatnonzero(smooth[1:] < 2 * noise)
+        cutoff_hz = float(frequency_hz[1:][quiet[0]] if len(quiet) else frequency_hz[-1] / 2)
+    shortest, longest = WINDOW_SAMPLES
+    longest = max(shortest, min(longest, len(values) // 3))
+    samples = int(np.clip(round(BLACKMAN_CUTOFF * rate_hz / cutoff_hz), shortest, longest))
+    return samples | 1
+
+
+@dataclass(frozen=True)
+class TiltRecord:
+    """Tilt to apply to a scan, from the log, and its uncertainty.
+
+    `unfiltered` is the tilt before the low-pass filter. `noise_rad` is the noise of one unfiltered sample,
+    `filtered_noise_rad` that of the filtered tilt, whose errors are correlated over `correlation_time_s`.
+    `gap_s` is the longest interval without a sample.
+    """
+
+    tilt: TiltSeries
+    unfiltered: TiltSeries
+    mean_roll_rad: float
+    mean_pitch_rad: float
+    noise_rad: float
+    filtered_noise_rad: float
+    correlation_time_s: float
+    cutoff_hz: float
+    offset_s: float
+    offset_sigma_s: float
+    gap_s: float
+
+
+def mean_tilt(record: TiltRecord) -> TiltRecord:
+    """Return the record with its mean tilt only, for a scan whose points carry no time."""
+    roll_rad, pitch_rad = record.tilt.roll_rad.mean(), record.tilt.pitch_rad.mean()
+    constant = TiltSeries(np.zeros(1), np.array([roll_rad]), np.array([pitch_rad]))
+    return replace(record, tilt=constant)
+
+
+def relative_tilt(
+    log: InclinationLog,
+    track: AzimuthTrack | None,
+    zero: CyclicError,
+    sigma_rad: float,
+    cutoff_hz: float | None = None,
+    *,
+    filtered: bool = True,
+) -> TiltRecord:
+    """Return the filtered tilt relative to that contained in the SOP, from a clean log of a scan.
+
+    `zero` is the cyclic error of the scan that the SOP was solved from, `NO_CYCLIC_ERROR` if the SOP contains
+    no tilt. It is subtracted before filtering, which leaves little signal for the filter's ends to distort.
+    Source: equations.md, 2.5 and 2.8-2.10; absolute tilt and SOP together would apply it twice.
+    """
+    offset_s, offset_sigma_s = 0.0, OFFSET_PRIOR_S
+    azimuth_rad = np.zeros_like(log.time_s)
+    time_s = log.time_s
+    if track is not None:
+        offset_s, offset_sigma_s = clock_offset(log, track, zero, sigma_rad)
+        time_s = log.time_s - offset_s
+        azimuth_rad = head_azimuth(track, time_s)
+    zero_roll, zero_pitch = zero.at(azimuth_rad)
+    step_s = float(np.median(np.diff(time_s)))
+    even_s = np.arange(time_s[0], time_s[-1] + step_s / 2, step_s)
+    roll, pitch = (
+        np.interp(even_s, time_s, v) for v in (log.roll_rad - zero_roll, log.pitch_rad - zero_pitch)
+    )
+    weights = np.ones(1)
+    if filtered:
+        samples = max(window_length(values, 1 / step_s, cutoff_hz) for values in (roll, pitch))
+        weights = blackman(samples)
+    smooth_roll, smooth_pitch = low_pass(roll, weights), low_pass(pitch, weights)
+    noise_rad = sigma_rad
+    if filtered:
+        noise_rad = float(np.sqrt(np.mean([np.var(roll - smooth_roll), np.var(pitch - smooth_pitch)])))
+    return TiltRecord(
+        tilt=TiltSeries(even_s, smooth_roll, smooth_pitch),
+        unfiltered=TiltSeries(even_s, roll, pitch),
+        mean_roll_rad=float(log.roll_rad.mean()),
+        mean_pitch_rad=float(log.pitch_rad.mean()),
+        noise_rad=noise_rad,
+        filtered_noise_rad=noise_rad * float(np.sqrt(np.sum(weights**2))),
+        correlation_time_s=step_s / float(np.sum(weights**2)),
+        cutoff_hz=BLACKMAN_CUTOFF / (len(weights) * step_s),
+        offset_s=offset_s,
+        offset_sigma_s=offset_sigma_s,
+        gap_s=float(np.max(np.diff(time_s))),
+    )

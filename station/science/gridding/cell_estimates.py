@@ -1,0 +1,362 @@
+"""Estimates for the cells of a scan: height, change, standard deviation and quality flags."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, fields
+
+import numpy as np
+from numpy.typing import NDArray
+
+from station.quantities import (
+    CELL_DTYPE,
+    Floats,
+    Floats32,
+    Grid,
+    Ints,
+    Ints32,
+    Measurement,
+    Quality,
+    Reals,
+    ScanGeometry,
+    SharedParameters,
+)
+from station.science.adjustment import ground_classes
+from station.science.geometry.observation import Observation
+from station.science.geometry.terrain import HALO_ROWS, gradient_at
+from station.science.gridding import significance
+from station.science.gridding.gridder import CellSums, Gridder, slope_sampling_variance
+from station.science.gridding.viewing_geometry import (
+    HIGH_INCIDENCE_COS,
+    AzimuthSector,
+    CellClass,
+    ViewingGeometry,
+)
+from station.science.uncertainty import budget, parameters, shot_noise
+from station.science.uncertainty.jacobian import HeightJacobian, height_jacobian
+
+BAND_ROWS = 64  # rows whose cells outside the reference are read at once
+BLOCK_CELLS = 50_000  # cells outside the reference that are estimated at once
+FEW_POINTS = 3
+ELEVATION_QUANTUM_M = 2.0**-10  # resolution of elevations as stored, exact in float32 up to 16 km
+
+
+def estimate_cells(
+    gridder: Gridder, viewing: ViewingGeometry | None, estimator: CellEstimator
+) -> Measurement:
+    """Return height, change, σ and flags of all cells of a scan; overwrites the gridder's buffers."""
+    scan_geometry = estimator.scan_geometry
+    names = budget.TERMS if scan_geometry.published_budget else (*budget.TERMS, *budget.PUBLISHED)
+    in_place, columns = gridder.release_buffers()
+    builder = _MeasurementBuilder(
+        in_place.view(CELL_DTYPE),
+        columns.view(np.float32),
+        np.zeros(gridder.used, np.uint8),
+        {
+            name: np.full(gridder.used, np.nan, np.float32)
+            for name in names
+            if scan_geometry.store_terms and scan_geometry.position_m is not None
+        },
+        scan_geometry.min_points,
+    )
+    if viewing is not None:
+        for first, whole in viewing.sectors():
+            sums = gridder.sums(first, first + len(whole))
+            builder.write_empty(first + np.flatnonzero(sums.count == 0))
+            observed = np.flatnonzero(sums.count > 0)  # indices are four times as fast as a mask
+            if not len(observed):
+                continue
+            sector, sums, cell_index = whole.take(observed), sums.take(observed), first + observed
+            builder.write(cell_index, sums, estimator.in_reference(cell_index, sector, sums, viewing))
+    for outside in _iter_cells_outside(gridder, scan_geometry, viewing):
+        sums = gridder.take(outside.cell_index)
+        builder.write(outside.cell_index, sums, estimator.outside_reference(outside, sums, gridder.datum_m))
+    return Measurement(
+        scan_geometry.grid,
+        gridder.cell_index,
+        gridder.count,
+        builder.cells,
+        builder.change_m,
+        builder.quality,
+        builder.terms,
+    )
+
+
+@dataclass(frozen=True)
+class _CellsOutside:
+    """Cells (n,) outside the reference, with terrain gradients from the scan itself."""
+
+    cell_index: Ints32
+    cell: Ints32  # in the flattened grid
+    east_gradient: Floats
+    north_gradient: Floats
+
+    @classmethod
+    def concatenate(cls, parts: list[_CellsOutside]) -> _CellsOutside:
+        """Return the parts concatenated."""
+        return cls(
+            *(np.concatenate([getattr(part, column.name) for part in parts]) for column in fields(cls))
+        )
+
+    def split(self) -> Iterator[_CellsOutside]:
+        """Yield blocks of cells that are estimated at once."""
+        for first in range(0, len(self.cell), BLOCK_CELLS):
+            yield _CellsOutside(
+                *(getattr(self, column.name)[first : first + BLOCK_CELLS] for column in fields(self))
+            )
+
+
+def _iter_cells_outside(
+    gridder: Gridder, scan_geometry: ScanGeometry, viewing: ViewingGeometry | None
+) -> Iterator[_CellsOutside]:
+    """Yield the cells outside the reference, in blocks whose intermediate results stay in the cache."""
+    new_cells = gridder.new_cells()
+    heights = _HeightWindow(gridder, viewing, new_cells, scan_geometry.min_points)
+    parts: list[_CellsOutside] = []
+    for top in range(0, scan_geometry.grid.ny, BAND_ROWS):
+        rows = slice(top, min(top + BAND_ROWS, scan_geometry.grid.ny))
+        parts.append(
+            _cells_outside(
+                gridder, scan_geometry, heights, rows, _rows_slice(new_cells, rows, scan_geometry.grid)
+            )
+        )
+        if sum(len(part.cell) for part in parts) > BLOCK_CELLS or rows.stop == scan_geometry.grid.ny:
+            yield from _CellsOutside.concatenate(parts).split()
+            parts = []
+
+
+def _rows_slice(cell: Ints32, rows: slice, grid: Grid) -> Ints32:
+    """Return those of the ascending flattened cells (n,) that lie in the given rows."""
+    # In the dtype of the cells: otherwise numpy would convert all of them.
+    edges = np.array([rows.start * grid.nx, rows.stop * grid.nx], cell.dtype)
+    first, last = np.searchsorted(cell, edges)
+    return cell[first:last]
+
+
+def _cells_outside(
+    gridder: Gridder, scan_geometry: ScanGeometry, heights: _HeightWindow, rows: slice, cell: Ints32
+) -> _CellsOutside:
+    """Return the cells (n,) of some rows outside the reference, with their gradients."""
+    east, north = np.zeros((2, len(cell)))
+    if scan_geometry.position_m is not None:
+        window_m, inner = heights.window(rows)
+        if len(cell):
+            row, column = scan_geometry.grid.row_and_column(cell)
+            row += inner.start - rows.start
+            gradient = gradient_at(window_m, scan_geometry.grid.cell_m, row, column)
+            east, north = (np.nan_to_num(component.astype(np.float64)) for component in gradient)
+    return _CellsOutside(gridder.cell_index.reshape(-1).take(cell), cell, east, north)
+
+
+class _HeightWindow:
+    """Heights above one datum, row by row, read from the sums of cells before these are overwritten."""
+
+    def __init__(
+        self, gridder: Gridder, viewing: ViewingGeometry | None, new_cells: Ints32, min_points: int
+    ) -> None:
+        """Start north of the grid; `new_cells` (n,) are the cells outside the reference, ascending."""
+        self._gridder, self._viewing = gridder, viewing
+        self._new_cells, self._min_points = new_cells, min_points
+        self._datum_offset_m = 0.0 if viewing is None else gridder.datum_m - viewing.datum_m
+        self._rows = slice(0, 0)
+        self._height_m = np.empty((0, gridder.grid.nx), np.float32)
+
+    def window(self, rows: slice) -> tuple[Floats32, slice]:
+        """Return heights (r, nx) of some rows and adjacent ones, NaN where empty, and the slice of the rows.
+
+        Calls must proceed southward: sums that were read once are not read again.
+        """
+        window_rows = slice(max(rows.start - HALO_ROWS, 0), min(rows.stop + HALO_ROWS, self._gridder.grid.ny))
+        kept_m = self._height_m[window_rows.start - self._rows.start :]
+        self._height_m = np.concatenate([kept_m, self._read(slice(self._rows.stop, window_rows.stop))])
+        self._rows = window_rows
+        return self._height_m, slice(rows.start - window_rows.start, rows.stop - window_rows.start)
+
+    def _read(self, rows: slice) -> Floats32:
+        """Return heights (r, nx) of some rows: of the reference if known, otherwise means of the scan."""
+        gridder, grid = self._gridder, self._gridder.grid
+        cell_index = gridder.cell_index[rows]
+        if self._viewing is None:
+            height_m = np.full(cell_index.shape, np.nan, np.float32)
+        else:
+            # The reference's own heights are better where known. Cells outside get all bits set: NaN.
+            outside = cell_index.view(np.uint32) >= np.uint32(gridder.reference_cells)
+            bits = np.negative(outside.view(np.int8), dtype=np.int32)
+            bits |= self._viewing.height_above_datum_m[rows].view(np.int32)
+            height_m = bits.view(np.float32)
+        cell = _rows_slice(self._new_cells, rows, grid) - rows.start * grid.nx
+        sums = gridder.take(cell_index.reshape(-1).take(cell))
+        enough = sums.count >= self._min_points
+        height_m.reshape(-1)[cell] = np.where(enough, sums.mean_residual() + self._datum_offset_m, np.nan)
+        return height_m
+
+
+@dataclass(frozen=True)
+class _CellEstimates:
+    """Estimates for cells of a scan, (n,) each."""
+
+    elevation_m: Reals
+    change_m: Reals
+    sigma_m: Reals
+    random_m: Reals
+    flags: NDArray[np.uint8]
+    terms: dict[str, Floats]
+
+
+def _as_opaque_items(cells: NDArray[np.void]) -> NDArray[np.void]:
+    """Return a view with each cell as one opaque item, which copies twice as fast as its fields."""
+    return cells.view(f"V{CELL_DTYPE.itemsize}")
+
+
+@dataclass(frozen=True)
+class _MeasurementBuilder:
+    """Columns of a measurement under construction; `cells` and `change_m` reuse the memory of its sums."""
+
+    cells: NDArray[np.void]
+    change_m: Floats32
+    quality: NDArray[np.uint8]
+    terms: dict[str, Floats32]
+    min_points: int
+
+    def write_empty(self, cell_index: Ints) -> None:
+        """Mark cells (m,) as empty."""
+        empty = np.array((np.nan,) * 4, CELL_DTYPE)
+        _as_opaque_items(self.cells)[cell_index] = _as_opaque_items(empty)
+        self.change_m[cell_index] = np.nan
+
+    def write(self, cell_index: Ints | Ints32, sums: CellSums, estimates: _CellEstimates) -> None:
+        """Write the estimates of cells (m,); for cells with too few points only the spread."""
+        enough = sums.count >= self.min_points
+        few = np.flatnonzero(~enough)
+        cells = np.empty(len(cell_index), CELL_DTYPE)
+        quantised_m = np.rint(estimates.elevation_m * (1 / ELEVATION_QUANTUM_M)).astype(np.float32)
+        quantised_m *= ELEVATION_QUANTUM_M
+        for name, values in (
+            ("elevation_m", quantised_m),
+            ("uncertainty_m", estimates.sigma_m),
+            ("random_uncertainty_m", estimates.random_m),
+        ):
+            cells[name] = values
+            cells[name][few] = np.nan
+        cells["spread_m"] = sums.standard_deviation()
+        _as_opaque_items(self.cells)[cell_index] = _as_opaque_items(cells)
+        self.change_m[cell_index] = np.where(enough, estimates.change_m, np.nan)
+        self.quality[cell_index] = np.where(enough, estimates.flags, 0)
+        for name, values in estimates.terms.items():
+            self.terms[name][cell_index[enough]] = values[enough]
+
+
+@dataclass(frozen=True)
+class CellEstimator:
+    """Corrects the cells of a scan for the adjustment and estimates their uncertainty.
+
+    `posterior` are the shared parameters of the difference from the reference, `independent` those of the
+    scan alone, None if unknown; `correction` returns what to subtract from heights [m], None without an
+    adjustment.
+    """
+
+    scan_geometry: ScanGeometry
+    posterior: SharedParameters | None
+    independent: SharedParameters | None
+    correction: Callable[[HeightJacobian], Reals] | None
+
+    def in_reference(
+        self, cell_index: Ints, sector: AzimuthSector, sums: CellSums, viewing: ViewingGeometry
+    ) -> _CellEstimates:
+        """Return estimates for cells (n,) of a sector of the reference."""
+        count = sums.count.astype(np.float32)
+        random_m2 = sector.point_variance_m2 / count + sector.reference_variance_m2
+        shared_m2, correction_m, terms = np.zeros_like(count), np.zeros_like(count), dict[str, Floats]()
+        if viewing.params is not None:
+            jacobian = viewing.jacobian(sector)
+            shared_m2, correction_m = self._systematic(jacobian)
+            if self.scan_geometry.store_terms:
+                observation = viewing.observation(sector)
+                terms = self._terms(
+                    jacobian, observation, sums.count.astype(np.float64), np.zeros(len(sector))
+                )
+        sigma_m = self._sigma(random_m2 + shared_m2)
+        change_m = sums.mean_residual().astype(np.float32) - correction_m
+        flags = Quality.FEW_POINTS * (sums.count < FEW_POINTS).view(np.uint8)
+        flags |= Quality.HIGH_INCIDENCE * sector.in_class(CellClass.GRAZING).view(np.uint8)
+        flags |= Quality.CHANGE_SIGNIFICANT * significance.significant(change_m, sigma_m).view(np.uint8)
+        if self.correction is not None:
+            brightness_differs = ground_classes.brightness_changed(
+                sums.intensity(), viewing.intensity(cell_index)
+            )
+            flags |= Quality.STABLE_GROUND * (sector.in_class(CellClass.STABLE) & ~brightness_differs).view(
+                np.uint8
+            )
+        elevation_m = viewing.datum_m + (sector.height_m.astype(np.float64) + change_m)
+        return _CellEstimates(elevation_m, change_m, sigma_m, np.sqrt(random_m2), flags, terms)
+
+    def outside_reference(self, outside: _CellsOutside, sums: CellSums, datum_m: float) -> _CellEstimates:
+        """Return estimates for cells (n,) outside the reference, whose sums are above a datum."""
+        scan_geometry = self.scan_geometry
+        count, height_m = sums.count.astype(np.float64), sums.mean_residual() + datum_m
+        flags = Quality.FEW_POINTS * (sums.count < FEW_POINTS).view(np.uint8)
+        flags |= np.uint8(Quality.OUTSIDE_REFERENCE)
+        no_change_m = np.full(len(count), np.nan)
+        if scan_geometry.position_m is None:
+            spread_m2 = np.nan_to_num(sums.standard_deviation().astype(np.float64)) ** 2
+            random_m2 = np.maximum(spread_m2, scan_geometry.scanner.range_sigma_m**2) / count
+            sigma_m = self._sigma(random_m2)
+            return _CellEstimates(height_m, no_change_m, sigma_m, np.sqrt(random_m2), flags, {})
+        row, column = scan_geometry.grid.row_and_column(outside.cell)
+        points = scan_geometry.grid.x_m[column], scan_geometry.grid.y_m[row], height_m
+        observation = Observation.from_points(
+            points, scan_geometry.position_m, outside.east_gradient, outside.north_gradient
+        )
+        flags |= Quality.HIGH_INCIDENCE * (observation.cos_incidence < HIGH_INCIDENCE_COS).view(np.uint8)
+        sampling_m2 = slope_sampling_variance(scan_geometry.grid.cell_m, observation.tan_slope, count)
+        random_m2 = (
+            shot_noise.height_variance(
+                observation, scan_geometry.scanner, published=scan_geometry.published_budget
+            )
+            / count
+            + sampling_m2
+        )
+        params = parameters.parameter_layout(scan_geometry.grid, scan_geometry.position_m, scan_geometry.axis)
+        east_m, north_m, up_m = (axis_m.astype(np.float32) for axis_m in observation.offset_m)
+        slopes = (
+            slope.astype(np.float32) for slope in (observation.east_gradient, observation.north_gradient)
+        )
+        jacobian = height_jacobian(params, (east_m, north_m, up_m), *slopes)
+        shared_m2, correction_m = self._systematic(jacobian)
+        terms = self._terms(jacobian, observation, count, sampling_m2) if scan_geometry.store_terms else {}
+        sigma_m = self._sigma(random_m2 + shared_m2)
+        return _CellEstimates(height_m - correction_m, no_change_m, sigma_m, np.sqrt(random_m2), flags, terms)
+
+    def _sigma(self, variance_m2: Reals) -> Reals:
+        """Return the standard deviation of cells [m], in the form configured for the site."""
+        if self.scan_geometry.published_budget:
+            return shot_noise.sigma_total_voordendag(
+                np.sqrt(variance_m2), self.scan_geometry.registration_sigma_m
+            )
+        return np.sqrt(variance_m2)
+
+    def _systematic(self, jacobian: HeightJacobian) -> tuple[Reals, Reals]:
+        """Return the systematic variance of cells [m²], and the correction to subtract from heights [m]."""
+        zeros = np.zeros_like(jacobian.sight_tilt)
+        if self.posterior is None:
+            return zeros, zeros
+        correction_m = zeros if self.correction is None else self.correction(jacobian)
+        if self.scan_geometry.published_budget:
+            return zeros, correction_m
+        return jacobian.variance(self.posterior), correction_m
+
+    def _terms(
+        self, jacobian: HeightJacobian, observation: Observation, count: Floats, sampling_m2: Floats
+    ) -> dict[str, Floats]:
+        """Return the error budget by term [m], in the form configured for the site."""
+        scan_geometry = self.scan_geometry
+        if scan_geometry.published_budget:
+            return budget.terms_voordendag(
+                observation, count, scan_geometry.scanner, scan_geometry.registration_sigma_m
+            )
+        if self.independent is None:
+            return {}
+        terms = budget.error_budget(
+            observation, count, sampling_m2, jacobian, self.independent, scan_geometry.scanner
+        )
+        return terms | budget.published_budget(observation, count, scan_geometry.scanner)

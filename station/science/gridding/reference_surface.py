@@ -1,0 +1,118 @@
+"""The reference surface that change is measured from: built from many scans, updated from more."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from station.quantities import Bools, Floats, Floats32, Reference, SharedParameters, VarianceComponents
+from station.science.adjustment import ground_classes
+from station.science.geometry.terrain import HALO_ROWS, row_blocks, smooth, smooth_gradient
+from station.science.gridding.scan_stack import ScanStack
+
+FIRST_PASS_SMOOTHING = 1.0  # cells: one sigma of the smoothing of the first pass
+MAX_DEVIATION_SIGMAS = 3.0  # of a mean over many scans, on stable ground
+MAX_VARIANCE_FACTOR = 3.0  # empirical over modelled variance from scan to scan, on stable ground
+
+Position = tuple[float, float, float]
+
+
+def build_reference(
+    stack: ScanStack,
+    base: Reference | None,
+    posteriors: list[SharedParameters | None],
+    position_m: Position | None,
+    version: str,
+    scan_ids: tuple[str, ...],
+    components: VarianceComponents,
+) -> Reference:
+    """Return the reference surface from scans stacked on `base`.
+
+    Without a base, their plain means are smoothed. A plain mean depends on where its points lie on the slope
+    (equations.md, 4.10), which a later pass of residuals cannot repair from cell to cell; but it restores the
+    terrain that smoothing removes. Errors shared within a scan are taken as independent between scans, so
+    that the mean of n scans has an nth of their mean covariance.
+    """
+    mean_m = stack.mean_residual()
+    if base is None:
+        datum_m = float(np.round(position_m[2])) if position_m else 0.0
+        elevation_m = np.where(np.isfinite(mean_m), smooth(mean_m, FIRST_PASS_SMOOTHING), np.nan) + datum_m
+    else:
+        elevation_m = base.elevation_m + mean_m
+    known = [posterior for posterior in posteriors if posterior is not None]
+    shared = None
+    if known:
+        total = known[0]
+        for posterior in known[1:]:
+            total = total + posterior
+        shared = replace(
+            total,
+            estimate=np.zeros(len(total.names)),
+            covariance=total.covariance / len(known) ** 2,
+            line_tilt_variance=total.line_tilt_variance / len(known) ** 2,
+        )
+    factor, stable = np.ones(stack.grid.shape, np.float32), np.zeros(stack.grid.shape, bool)
+    if position_m is not None:
+        factor, stable = _empirical_variance(stack, position_m, elevation_m)
+    roughness_m2 = stack.roughness()
+    return Reference(
+        grid=stack.grid,
+        version=version,
+        elevation_m=elevation_m,
+        random_variance_m2=stack.random_variance(roughness_m2) * factor,
+        roughness_m2=roughness_m2,
+        shared=shared,
+        scan_ids=scan_ids,
+        intensity=stack.intensity(),
+        variance_factor=factor,
+        stable=stable,
+        components=components,
+        visibility=stack.visibility(),
+    )
+
+
+def update_reference(
+    base: Reference, stack: ScanStack, position_m: Position, version: str, components: VarianceComponents
+) -> Reference:
+    """Return a reference whose stable ground is the mean of more scans, stacked on it and adjusted to it.
+
+    Elsewhere its heights stay, because change is measured from them. Variance factor, stable ground and
+    visibility are estimated again.
+    """
+    mean_m, mean_m2 = stack.mean_residual(), stack.random_variance(stack.roughness())
+    factor, steady = _empirical_variance(stack, position_m, base.elevation_m)
+    mean_m2 *= factor
+    unchanged = np.abs(mean_m) < MAX_DEVIATION_SIGMAS * np.sqrt(mean_m2 + base.random_variance_m2)
+    stable = steady & unchanged
+    elevation_m = base.elevation_m + np.where(stable, mean_m, 0.0)
+    return replace(
+        base,
+        version=version,
+        elevation_m=elevation_m,
+        random_variance_m2=np.where(stable, mean_m2, base.random_variance_m2).astype(np.float32),
+        variance_factor=factor,
+        stable=stable,
+        components=components,
+        visibility=stack.visibility(),
+    )
+
+
+def _empirical_variance(
+    stack: ScanStack, position_m: Position, elevation_m: Floats
+) -> tuple[Floats32, Bools]:
+    """Return the variance of cells from scan to scan over the modelled one, and the stable cells (ny, nx)."""
+    grid = stack.grid
+    classes, steep = np.empty(grid.shape, np.int32), np.empty(grid.shape, bool)
+    for rows in row_blocks(grid.ny):
+        window = slice(max(rows.start - HALO_ROWS, 0), rows.stop + HALO_ROWS)
+        inner = slice(rows.start - window.start, rows.stop - window.start)
+        east, north = smooth_gradient(elevation_m[window] - position_m[2], grid.cell_m, rows=inner)
+        tan_slope = np.hypot(east, north)
+        range_m = np.hypot(grid.x_m[None, :] - position_m[0], grid.y_m[rows, None] - position_m[1])
+        classes[rows], steep[rows] = (
+            ground_classes.noise_class(range_m, tan_slope),
+            tan_slope > ground_classes.MIN_STABLE_SLOPE,
+        )
+    factor = stack.variance_factor(classes)
+    return factor, np.isfinite(elevation_m) & steep & (factor < MAX_VARIANCE_FACTOR)

@@ -1,0 +1,353 @@
+"""Viewing geometry of the reference surface: slope, incidence, range and single-shot variance per cell.
+
+The scanner does not move, so these are the same for all scans. They are computed once per scanner position,
+in the order of the head's azimuth.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, fields
+from enum import IntFlag
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from station.quantities import VERTICAL_AXIS, Bools, Floats32, Grid, Ints, Ints32, Reals, Reference, Scanner
+from station.science.adjustment import ground_classes
+from station.science.geometry import terrain
+from station.science.geometry.observation import Observation
+from station.science.geometry.terrain import HALO_ROWS, BilinearSurface, smooth_gradient
+from station.science.uncertainty import shot_noise
+from station.science.uncertainty.jacobian import HeightJacobian, height_jacobian
+from station.science.uncertainty.parameters import (
+    TILT_KNOTS_PER_REFRACTION,
+    ParameterLayout,
+    parameter_layout,
+)
+
+MAX_MOVING_CELLS = 400_000  # cells of moving ground that an adjustment uses
+MAX_STABLE_CELLS = 800_000  # the same of stable ground, in whole rows; more add no information
+BLOCK_CELLS = 50_000  # cells per sector if the scanner's position is unknown
+VISIBILITY_BIN_M = 200.0  # range bin in which cells are counted for visibility
+MAX_VISIBILITY_CELLS = 500_000  # cells counted for visibility; of more, a sample
+HIGH_INCIDENCE_COS = float(np.cos(np.radians(80.0)))
+
+FLOAT_ARRAYS = [
+    "height_m",
+    "east_gradient",
+    "north_gradient",
+    "knot_position",
+    "shot_m2",
+    "point_variance_m2",
+    "reference_variance_m2",
+    "intensity",
+    "visibility",
+]
+CELL_ARRAYS = {  # per cell, by name
+    "cell": np.int32,
+    **dict.fromkeys(FLOAT_ARRAYS, np.float32),
+    "visibility_bin": np.int32,
+    "cell_class": np.uint8,
+}
+VISIBILITY_ARRAYS = ("visibility", "visibility_bin")  # for the `sampled` cells only
+
+Position = tuple[float, float, float]
+Array = NDArray[Any]
+
+
+class CellClass(IntFlag):
+    """Classes of a cell, as long as its intensity has not changed."""
+
+    STABLE = 1
+    HOLDOUT = 2  # if stable: excluded from every fit
+    SMOOTH = 4  # flat enough to change like its neighbours
+    GRAZING = 8  # incidence above 80°
+
+
+@dataclass(frozen=True)
+class AzimuthSector:
+    """Reference cells (n,) between two knots of the tilt, in order of cell index."""
+
+    cell: Ints32  # in the flattened grid
+    height_m: Floats32  # mean of the reference over the cell, above its datum
+    east_gradient: Floats32
+    north_gradient: Floats32
+    knot_position: Floats32  # azimuth in tilt knots, fractional
+    point_variance_m2: Floats32  # random variance of one point: shot and roughness, times the factor
+    reference_variance_m2: Floats32  # random variance of the reference
+    cell_class: NDArray[np.uint8]
+
+    def __len__(self) -> int:
+        """Return the number of cells."""
+        return len(self.cell)
+
+    def take(self, selection: Ints) -> AzimuthSector:
+        """Return the selected cells."""
+        return AzimuthSector(*(getattr(self, field.name).take(selection) for field in fields(self)))
+
+    def in_class(self, cell_class: CellClass) -> Bools:
+        """Return True for cells (n,) in a class."""
+        return np.asarray((self.cell_class & np.uint8(cell_class)) > 0)
+
+
+@dataclass(frozen=True)
+class ViewingGeometry:
+    """A reference as seen from `position_m`; None if scans come registered on the map without a position.
+
+    `height_above_datum_m` and `cell_index` (ny, nx) are those of `BilinearSurface`, above `datum_m`. `cells`
+    are arrays by cell index: the fields of `AzimuthSector` (n,), `shot_m2`, the random variance of one shot,
+    and `intensity`. `sector_bounds` divide them into sectors, and each sector into the cells that an
+    adjustment uses and the others: of very many cells a sample is enough. Visibility too is kept only for a
+    sample, the `sampled` cells: `visibility`, the share of the reference's scans that observed the cell, and
+    `visibility_bin`, its bin within `visibility_shape`. Arrays may be lazy, and are read when sliced.
+    """
+
+    reference: Reference
+    params: ParameterLayout | None
+    position_m: Position | None
+    datum_m: float
+    height_above_datum_m: Floats32
+    cell_index: Ints32
+    sector_bounds: Ints  # (2 sectors + 1,)
+    sampling_step: tuple[int, int]  # an adjustment uses every n-th cell: of moving ground, of stable ground
+    cells: Mapping[str, Array]
+
+    @property
+    def grid(self) -> Grid:
+        """Grid of the reference."""
+        return self.reference.grid
+
+    @property
+    def visibility_shape(self) -> tuple[int, int]:
+        """Number of azimuth sectors and of range bins in which visibility is counted."""
+        assert self.params is not None  # noqa: S101 - the callers' case
+        assert self.position_m is not None  # noqa: S101 - the callers' case
+        return self.params.knot_intervals // TILT_KNOTS_PER_REFRACTION, _visibility_bins(
+            self.grid, self.position_m
+        )
+
+    @property
+    def sampled(self) -> slice:
+        """Slice of the cells that are counted for visibility."""
+        return visibility_step(int(self.sector_bounds[-1]))
+
+    def surface(self) -> BilinearSurface:
+        """Return the reference surface for lookups by shots."""
+        return BilinearSurface(
+            self.grid, self.datum_m, np.asarray(self.height_above_datum_m), self.cell_index
+        )
+
+    def sectors(self, *, sampled: bool = False) -> Iterator[tuple[int, AzimuthSector]]:
+        """Yield the sectors that contain cells, each with the index of its first cell.
+
+        With `sampled` they contain only the cells that an adjustment uses.
+        """
+        last = 1 if sampled else 2
+        for first, end in zip(
+            self.sector_bounds[:-1:2].tolist(), self.sector_bounds[last::2].tolist(), strict=True
+        ):
+            if end > first:
+                columns = {field.name: self.cells[field.name][first:end] for field in fields(AzimuthSector)}
+                yield first, AzimuthSector(**columns)
+
+    def intensity(self, cell_index: Ints) -> Floats32:
+        """Intensity of the reference, 0-1, in cells (n,) of a sector, by ascending index."""
+        first, last = cell_index[0], cell_index[-1]
+        return np.asarray(self.cells["intensity"][first : last + 1].take(cell_index - first))
+
+    def select(self, *classes: CellClass) -> Ints:
+        """Return the indices (m,) of the cells that belong to all the given classes."""
+        mask = np.uint8(sum(classes))
+        return np.flatnonzero((self.cells["cell_class"][:] & mask) == mask)
+
+    def offset_m(self, cell: Ints32, height_m: Floats32) -> tuple[Floats32, Floats32, Floats32]:
+        """Offset from the scanner to cells (n,) at heights above the datum: east, north and up [m]."""
+        assert self.position_m is not None  # noqa: S101 - the callers' case
+        row, column = self.grid.row_and_column(cell)
+        return (
+            self._east_m.take(column),
+            self._north_m.take(row),
+            height_m + np.float32(self.datum_m - self.position_m[2]),
+        )
+
+    def jacobian(self, sector: AzimuthSector) -> HeightJacobian:
+        """Jacobian of the heights of cells with respect to the scanner's state."""
+        assert self.params is not None  # noqa: S101 - the callers' case
+        return height_jacobian(
+            self.params,
+            self.offset_m(sector.cell, sector.height_m),
+            sector.east_gradient,
+            sector.north_gradient,
+            sector.knot_position,
+        )
+
+    def observation(self, sector: AzimuthSector) -> Observation:
+        """Observation geometry of the cells of a sector."""
+        x_m, y_m, z_m = (axis.astype(np.float64) for axis in self.offset_m(sector.cell, sector.height_m))
+        east, north = (
+            gradient.astype(np.float64) for gradient in (sector.east_gradient, sector.north_gradient)
+        )
+        return Observation.from_points((x_m, y_m, z_m), (0.0, 0.0, 0.0), east, north)
+
+    @cached_property
+    def _east_m(self) -> Floats32:
+        assert self.position_m is not None  # noqa: S101 - the callers' case
+        return (self.grid.x_m - self.position_m[0]).astype(np.float32)
+
+    @cached_property
+    def _north_m(self) -> Floats32:
+        assert self.position_m is not None  # noqa: S101 - the callers' case
+        return (self.grid.y_m - self.position_m[1]).astype(np.float32)
+
+
+def compute_viewing_geometry(
+    reference: Reference,
+    stable: Bools,
+    scanner: Scanner,
+    position_m: Position | None,
+    axis: Position = VERTICAL_AXIS,
+    *,
+    published: bool = False,
+) -> ViewingGeometry:
+    """Return the viewing geometry of a reference; `stable` (ny, nx) marks ground known to be stable.
+
+    `published`: shot variance of Voordendag et al. (2023), and no roughness.
+    """
+    grid = reference.grid
+    params = parameter_layout(grid, position_m, axis) if position_m else None
+    surface = terrain.bilinear_surface(reference)
+    count, first = int(surface.cell_index.max()) + 1, 0
+    cells = {name: np.empty(count, dtype) for name, dtype in CELL_ARRAYS.items()}
+    for rows in terrain.row_blocks(grid.ny):
+        arrays = _cells(
+            reference, rows, surface, stable[rows], scanner, params, position_m, published=published
+        )
+        end = first + len(arrays["cell"])
+        for name, values in arrays.items():
+            cells[name][first:end] = values
+        first = end
+    is_stable = (cells["cell_class"] & np.uint8(CellClass.STABLE)) > 0
+    sampled, sampling_step = _sampled(grid, cells["cell"], is_stable)
+    if params is None:  # any small blocks will do
+        sector, sectors = np.arange(count, dtype=np.int32) // BLOCK_CELLS, count // BLOCK_CELLS + 1
+    else:
+        sector, sectors = cells["knot_position"].astype(np.int32), params.knot_intervals
+    sort_key = 2 * sector + ~sampled  # within a sector the sampled cells first
+    order = np.argsort(sort_key, kind="stable")
+    bounds = np.searchsorted(sort_key[order], np.arange(2 * sectors + 1))
+    for name in cells:  # one at a time: this is the peak of a scan's memory
+        cells[name] = cells[name][order[visibility_step(count)] if name in VISIBILITY_ARRAYS else order]
+    cell_index = np.full(grid.shape, -1, np.int32)
+    cell_index.reshape(-1)[cells["cell"]] = np.arange(count)
+    return ViewingGeometry(
+        reference,
+        params,
+        position_m,
+        surface.datum_m,
+        surface.height_above_datum_m,
+        cell_index,
+        bounds,
+        sampling_step,
+        cells,
+    )
+
+
+def _cells(
+    reference: Reference,
+    rows: slice,
+    surface: BilinearSurface,
+    stable: Bools,
+    scanner: Scanner,
+    params: ParameterLayout | None,
+    position_m: Position | None,
+    *,
+    published: bool,
+) -> dict[str, Array]:
+    """Return the arrays of `ViewingGeometry.cells` for the known cells of some rows."""
+    grid, known = reference.grid, surface.cell_index[rows] >= 0
+    row, column = np.nonzero(known)
+    first = max(rows.start - HALO_ROWS, 0)
+    window_m = np.where(
+        np.isfinite(reference.elevation_m[first : rows.stop + HALO_ROWS]),
+        reference.elevation_m[first : rows.stop + HALO_ROWS] - surface.datum_m,
+        np.nan,
+    )
+    inner = slice(rows.start - first, rows.stop - first)
+    gradient = smooth_gradient(window_m, grid.cell_m, rows=inner)
+    east, north = (np.nan_to_num(raster[known].astype(np.float64)) for raster in gradient)
+    x_m, y_m, height_m = grid.x_m[column], grid.y_m[rows][row], surface.cell_means(rows)[known]
+    cell_class = np.where(stable[known], CellClass.STABLE, 0) | np.where(
+        ground_classes.is_holdout(x_m, y_m), CellClass.HOLDOUT, 0
+    )
+    cell_class |= np.where(np.hypot(east, north) < ground_classes.MAX_MOVING_SLOPE, CellClass.SMOOTH, 0)
+    knot_position: Reals = np.zeros(len(row))
+    visibility_bin: Ints = np.zeros(len(row), np.int64)
+    shot_m2 = np.full(len(row), scanner.range_sigma_m**2)
+    if params is not None and position_m is not None:
+        observation = Observation.from_points(
+            (x_m, y_m, window_m[inner][known] + surface.datum_m), position_m, east, north
+        )
+        knot_position, shot_m2 = (
+            params.knot_position(observation.offset_m),
+            shot_noise.height_variance(observation, scanner, published=published),
+        )
+        cell_class |= np.where(observation.cos_incidence < HIGH_INCIDENCE_COS, CellClass.GRAZING, 0)
+        last = np.nextafter(np.float32(params.knot_intervals), np.float32(0))
+        knot_position = np.minimum(knot_position.astype(np.float32), last)
+        range_bin = (np.hypot(observation.offset_m[0], observation.offset_m[1]) / VISIBILITY_BIN_M).astype(
+            np.int64
+        )
+        visibility_bin = (knot_position / TILT_KNOTS_PER_REFRACTION).astype(np.int64) * _visibility_bins(
+            grid, position_m
+        ) + range_bin
+    if published:
+        point_variance_m2, reference_variance_m2 = shot_m2, np.zeros(len(row), np.float32)
+    else:
+        point_variance_m2 = (shot_m2 + reference.roughness_m2[rows][known]) * reference.variance_factor[rows][
+            known
+        ]
+        reference_variance_m2 = reference.random_variance_m2[rows][known]
+    return {
+        "cell": (rows.start + row) * grid.nx + column,
+        "height_m": height_m - surface.datum_m,
+        "east_gradient": east,
+        "north_gradient": north,
+        "knot_position": knot_position,
+        "shot_m2": shot_m2,
+        "point_variance_m2": point_variance_m2,
+        "reference_variance_m2": reference_variance_m2,
+        "intensity": reference.intensity[rows][known],
+        "visibility": reference.visibility[rows][known],
+        "visibility_bin": visibility_bin,
+        "cell_class": cell_class,
+    }
+
+
+def visibility_step(count: int) -> slice:
+    """Return the slice of `count` cells that are counted for visibility."""
+    return slice(None, count, 1 + count // MAX_VISIBILITY_CELLS)
+
+
+def _visibility_bins(grid: Grid, position_m: Position) -> int:
+    """Return the number of range bins from the scanner to the farthest cell of a grid."""
+    east_m, north_m = (
+        np.abs(axis_m - scanner_m).max()
+        for axis_m, scanner_m in zip((grid.x_m, grid.y_m), position_m[:2], strict=True)
+    )
+    return int(math.hypot(east_m, north_m) / VISIBILITY_BIN_M) + 1
+
+
+def _sampled(grid: Grid, cell: Array, stable: Bools) -> tuple[Bools, tuple[int, int]]:
+    """Return the mask (n,) of cells for an adjustment, and the sampling steps of moving and of stable cells.
+
+    If there are too many, stable cells are sampled in whole rows, the others in a regular pattern.
+    """
+    row, column = grid.row_and_column(cell)
+    step = 1 + int(np.count_nonzero(stable)) // MAX_STABLE_CELLS
+    column_step = 1 + len(row) // (step * MAX_MOVING_CELLS)
+    used = (row % step == 0) & (stable | ((row // step + column) % column_step == 0))
+    return used, (step * column_step, step)

@@ -1,0 +1,1 @@
+"""Uncertainty: random errors of single shots, and parameters shared by all points of a scan."""

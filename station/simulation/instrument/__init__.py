@@ -1,0 +1,1 @@
+"""The simulated scanner: its motion, its inclination sensor, its shots."""

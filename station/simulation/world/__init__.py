@@ -1,0 +1,1 @@
+"""The simulated valley: terrain, surface change, air, stable ground."""

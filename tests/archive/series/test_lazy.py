@@ -1,0 +1,131 @@
+"""`station.open`: the series as one lazy dataset, equal to what the epochs contain."""
+
+import shutil
+from dataclasses import replace
+from datetime import UTC, datetime
+
+import h5py
+import numpy as np
+import pytest
+import xarray as xr
+from support.epochs import GRID, make_epoch
+
+import station
+from station.archive.chunk_codec import read_column
+from station.archive.compaction import compact
+from station.archive.epochs import write_epoch
+from station.archive.netcdf_layout import Series
+from station.archive.series.index import list_epochs
+from station.archive.series.virtual import build_series
+
+HOURS = (1, 2, 3, 5, 30, 31)  # the first four become a compacted day
+WITHOUT_TERMS = 30  # an epoch that lacks the sigma terms
+RASTERS = ("elevation_change", "elevation_change_uncertainty", "point_count", "quality", "sigma_geometry")
+
+
+@pytest.fixture(scope="module")
+def stored(tmp_path_factory):
+    """Epochs in a compacted day and in their own files; the eastern half of the grid is never observed."""
+    series = Series(tmp_path_factory.mktemp("store"), "hef", GRID, "EPSG:32632")
+    for hour in HOURS:
+        result = make_epoch(hour, terms=hour != WITHOUT_TERMS)
+        result.measurement.cells["elevation_m"] = np.nan  # a variable without any chunk
+        write_epoch(series, result)
+    compact(series, datetime(2025, 11, 22, 12, tzinfo=UTC), lambda: None)
+    build_series(series)
+    return series
+
+
+@pytest.fixture
+def copied(stored, tmp_path):
+    """A copy of the store that a test may change."""
+    return replace(stored, folder=shutil.copytree(stored.folder, tmp_path / "copy"))
+
+
+def test_rasters_equal_those_of_the_epochs(stored):
+    with station.open(stored.folder) as ds:
+        assert ds.sizes["time"] == len(HOURS)
+        assert not any(ds[name]._in_memory for name in RASTERS)
+        for index, hour in enumerate(HOURS):
+            measurement = make_epoch(hour).measurement
+            for name, column in (
+                ("elevation_change", "change_m"),
+                ("elevation_change_uncertainty", "uncertainty_m"),
+            ):
+                expected = measurement.to_rasters(column)[0]
+                assert np.allclose(ds[name][index], expected, atol=1e-3, equal_nan=True)
+            assert np.array_equal(ds.point_count[index], measurement.to_rasters("count")[0])
+        assert np.isnan(ds.elevation).all()
+        assert np.isnan(ds.sigma_geometry[HOURS.index(WITHOUT_TERMS)]).all()
+        assert np.isfinite(ds.sigma_geometry[0, :, :75]).all()
+
+
+@pytest.mark.parametrize(
+    "selection",
+    [
+        {"y": slice(120, 135), "x": slice(5, 140)},
+        {"time": slice(1, 5, 2), "y": slice(None, None, 7), "x": slice(None, None, -3)},
+        {"time": [5, 0, 4], "y": [139, 2, 130, 3], "x": [149, 0, 1]},
+        {"time": 2, "y": 3, "x": 4},
+        {"time": slice(0, 0)},
+        {"y": xr.DataArray([3, 130, 70], dims="point"), "x": xr.DataArray([60, 15, 12], dims="point")},
+    ],
+)
+def test_lazy_selections_equal_those_of_the_loaded_series(stored, selection):
+    with station.open(stored.folder) as lazy, station.open(stored.folder) as loaded:
+        xr.testing.assert_identical(
+            lazy.elevation_change.isel(selection).load(), loaded.elevation_change.load().isel(selection)
+        )
+
+
+def test_times_and_texts_are_decoded(stored):
+    with station.open(stored.folder) as ds:
+        assert ds.time.values[0] == np.datetime64("2025-11-21T01:07:30")
+        assert ds.scan_id.values.tolist() == [f"251121_{hour % 24:02d}0000" for hour in HOURS]
+        assert ds.epoch_file.values[-1] == "hef_20251122T070000Z.nc"
+        assert ds.change_step.dtype == np.float64  # seconds and metres are not decoded as time differences
+
+
+def test_an_open_series_stays_readable_while_the_service_writes(copied):
+    with station.open(copied.folder) as ds:
+        write_epoch(copied, make_epoch(40))
+        build_series(copied)
+        compact(copied, datetime(2025, 11, 24, tzinfo=UTC), lambda: None)
+        build_series(copied)
+        change_m = ds.elevation_change[:, 139, 5].values
+        assert change_m == pytest.approx(np.array(HOURS) / 100, abs=1e-3)
+    with station.open(copied.folder) as ds:
+        assert ds.sizes["time"] == len(HOURS) + 1
+
+
+def test_a_damaged_chunk_raises_an_error(copied):
+    damaged = list_epochs(copied)[3]
+    with h5py.File(damaged.path) as file:
+        chunk = file["elevation_change"].id.get_chunk_info_by_coord((damaged.index, 0, 0))
+    with damaged.path.open("r+b") as file:
+        file.seek(chunk.byte_offset + 20)
+        file.write(b"\xff" * (chunk.size - 40))
+    with station.open(copied.folder) as ds:
+        assert np.isfinite(ds.elevation_change[2]).any()
+        with pytest.raises((OSError, RuntimeError)):
+            ds.elevation_change[:, 5, 5].load()
+
+
+def test_read_column_equals_h5py(stored, tmp_path):
+    with h5py.File(stored.path) as file:
+        columns = [dataset for dataset in file.values() if dataset.chunks and len(dataset) == len(HOURS)]
+        assert {"epoch_file", "time", "verdict", "point_total"} <= {column.name[1:] for column in columns}
+        for column in columns:
+            assert read_column(column).dtype == column.dtype
+            assert np.array_equal(read_column(column), column[:])
+    values = np.random.default_rng(1).integers(0, 99, (23, 5)).astype("i2")
+    with h5py.File(tmp_path / "columns.h5", "w") as file:
+        for name, chunks in (("whole rows", (4, 5)), ("split rows", (4, 3))):
+            column = file.create_dataset(
+                name, (23, 5), "i2", chunks=chunks, compression="gzip", shuffle=True, maxshape=(None, 5)
+            )
+            assert np.array_equal(read_column(column), np.zeros((23, 5)))  # nothing is written yet
+            column[:] = values
+            assert np.array_equal(read_column(column), values)
+            assert np.array_equal(read_column(column, 8), values[8:])  # the start of a chunk
+            assert np.array_equal(read_column(column, 3), values[3:])

@@ -1,0 +1,223 @@
+"""Growth of `series.nc`: appending equals rebuilding, and an epoch costs the same however long the series."""
+
+import dataclasses
+import os
+from datetime import UTC, datetime
+
+import h5py
+import numpy as np
+import pytest
+
+from station.archive import areas, epochs, netcdf_layout
+from station.archive.areas import AreaChange, update_areas
+from station.archive.compaction import compact
+from station.archive.series import epoch_reader, manifest, virtual
+from station.archive.series.index import SeriesIndex, list_epochs
+from station.archive.series.virtual import build_series
+from station.quantities import Grid, SharedParameters
+
+SMALL_GRID = Grid(west_m=632000.0, north_m=5186000.0, cell_m=10.0, nx=6, ny=5)
+TIMES_PER_CHUNK = 4  # so that a dozen epochs fill some chunks
+
+
+class HourAggregator:
+    """Returns the hour of an epoch in centimetres as its change."""
+
+    def area(self, _, epoch):
+        return AreaChange(epoch.start.hour / 100, 0.02, epoch.start.hour / 50, 0.03, 0.5)
+
+
+@pytest.fixture(autouse=True)
+def short_chunks(monkeypatch):
+    for module in (netcdf_layout, virtual, areas):
+        monkeypatch.setattr(module, "TIMES_PER_CHUNK", TIMES_PER_CHUNK)
+
+
+@pytest.fixture
+def growing(series):
+    """A store on a small grid, and a function that updates series.nc and areas.nc."""
+    small = dataclasses.replace(series, grid=SMALL_GRID)
+    masks = {"all": np.ones(SMALL_GRID.shape, bool), "none": np.zeros(SMALL_GRID.shape, bool)}
+
+    def update():
+        build_series(small)
+        update_areas(small, masks, HourAggregator(), lambda: None)
+
+    return small, update
+
+
+def file_contents(path):
+    """Return values, types, chunks, attributes and virtual sources of all variables of a file."""
+    with h5py.File(path) as file:
+        attributes = {key: str(value) for key, value in file.attrs.items() if key != "_NCProperties"}
+        return {name: describe(dataset) for name, dataset in file.items()} | {"attributes": attributes}
+
+
+def describe(dataset):
+    attributes = {
+        key: str(value)
+        for key, value in dataset.attrs.items()
+        if key not in {"DIMENSION_LIST", "REFERENCE_LIST"}
+    }
+    sources = [
+        (
+            source.file_name,
+            source.dset_name,
+            source.vspace.get_select_bounds(),
+            source.src_space.get_select_bounds(),
+        )
+        for source in (dataset.virtual_sources() if dataset.is_virtual else ())
+    ]
+    values = dataset[...].tobytes() if dataset.shape is not None else None
+    return values, dataset.dtype.str, dataset.shape, dataset.chunks, attributes, sources
+
+
+def contents(series):
+    return [file_contents(series.folder / name) for name in ("series.nc", "areas.nc")]
+
+
+def rebuild(series, update):
+    (series.folder / manifest.MANIFEST).unlink()
+    (series.folder / "areas.nc").unlink()
+    update()
+
+
+def parameters(names, units, covariance):
+    return SharedParameters(names, units, np.ones(len(names)), covariance, np.zeros(len(names)))
+
+
+@pytest.mark.integration
+def test_appending_equals_rebuilding(growing, epoch):
+    """After epochs in order, late ones, revisions, other shared parameters, and compaction."""
+    series, update = growing
+    relocated = parameters(("tilt_north", "heading"), ("rad", "rad"), np.eye(2))
+    fewer = parameters(("range_bias", "tilt_east"), ("m", "rad"), 3 * np.eye(2))
+    steps = [
+        *((hour, {}) for hour in (1, 2, 3, 4, 5, 8, 9, 10, 11)),
+        (7, {}),  # arrives late
+        (5, {"scan_id": "again"}),  # a second revision
+        (25, {}),
+        (30, {"shared": fewer}),
+        (31, {}),
+        (50, {"shared": relocated}),
+        (51, {"shared": None}),
+        (52, {}),
+    ]
+    compact_after = {25: datetime(2025, 11, 22, 12, tzinfo=UTC), 52: datetime(2025, 12, 4, tzinfo=UTC)}
+    for hour, changes in steps:
+        epochs.write_epoch(series, dataclasses.replace(epoch(hour, grid=SMALL_GRID), **changes))
+        update()
+        if hour in compact_after:
+            assert len(compact(series, compact_after[hour], lambda: None)) == (hour == 25)
+            update()
+        appended = contents(series)
+        rebuild(series, update)
+        assert contents(series) == appended, hour
+    assert list(SeriesIndex(series)) == list_epochs(series)
+    assert len(SeriesIndex(series)) == 16
+
+
+@pytest.mark.integration
+def test_only_the_new_epoch_of_a_long_series_is_opened(growing, epoch, monkeypatch):
+    series, update = growing
+    opened = []
+    read_source = epoch_reader.read_source
+    for module in (virtual, manifest, areas):
+        monkeypatch.setattr(
+            module, "read_source", lambda path, *rest: opened.append(path.name) or read_source(path, *rest)
+        )
+    monkeypatch.setattr(
+        virtual, "list_epochs", lambda series: opened.append("all epochs") or list_epochs(series)
+    )
+    for hour in range(1, 14):
+        opened.clear()
+        written = epochs.write_epoch(series, epoch(hour, grid=SMALL_GRID))
+        update()
+        if hour > 1:
+            assert set(opened) == {written.path.name, "series.nc"}
+    opened.clear()
+    update()
+    assert not opened
+
+
+@pytest.mark.integration
+def test_a_file_replaced_under_its_name_is_read_again(growing, epoch):
+    """For example, an operator restores an older copy."""
+    series, update = growing
+    for hour in (1, 2, 3):
+        written = epochs.write_epoch(series, epoch(hour, grid=SMALL_GRID))
+        update()
+    original = written.path.read_bytes()
+    with h5py.File(written.path, "r+") as file:
+        file["platform_roll"][0] = 7.0
+    modified = written.path.read_bytes()
+    for file_bytes, roll in ((modified, 7.0), (original, 0.12)):
+        written.path.unlink()
+        written.path.write_bytes(file_bytes)
+        update()
+        with h5py.File(series.path) as file:
+            assert file["platform_roll"][:].tolist() == [0.12, 0.12, roll]
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        b"{}",
+        None,
+        pytest.param(b"", marks=pytest.mark.integration),
+        pytest.param(b'{"header_hash": 1}', marks=pytest.mark.integration),
+    ],
+)
+def test_with_an_invalid_manifest_the_series_is_rebuilt(growing, epoch, text):
+    series, update = growing
+    epochs.write_epoch(series, epoch(1, grid=SMALL_GRID))
+    update()
+    first = contents(series)
+    path = series.folder / manifest.MANIFEST
+    if text is None:
+        os.utime(series.path)
+    else:
+        path.write_bytes(text)
+    epochs.write_epoch(series, epoch(2, grid=SMALL_GRID))
+    update()
+    assert contents(series) != first
+    assert len(SeriesIndex(series)) == 2
+
+
+def test_changed_metadata_of_the_station_is_written_to_the_series(growing, epoch):
+    series, update = growing
+    epochs.write_epoch(series, epoch(1, grid=SMALL_GRID))
+    update()
+    build_series(dataclasses.replace(series, name="Kesselwandferner"))
+    with h5py.File(series.path) as file:
+        assert file.attrs["station_name"] == b"Kesselwandferner"
+
+
+def test_the_index_is_current_until_a_file_is_added_or_removed(growing, epoch):
+    series, update = growing
+    assert manifest.index_if_current(series) is None
+    for hour in (1, 2):
+        written = epochs.write_epoch(series, epoch(hour, grid=SMALL_GRID))
+        assert manifest.index_if_current(series) is None
+        update()
+        assert list(manifest.index_if_current(series)) == list_epochs(series)
+    os.utime(written.path)
+    assert manifest.index_if_current(series) is None
+    update()
+    assert len(manifest.index_if_current(series)) == 2
+    written.path.unlink()
+    assert manifest.index_if_current(series) is None
+
+
+@pytest.mark.slow
+def test_the_cost_of_an_epoch_hardly_grows_over_a_year(tmp_path, monkeypatch):
+    """CPU time of series, areas and page; measuring a scan does not depend on the length of the series."""
+    from benchmarks import growth
+
+    monkeypatch.undo()
+    cpu_s = []
+    for count in (600, 8760):
+        site = growth.station_of(tmp_path / str(count), growth.SMALL)
+        cost = growth.cost(site, growth.fill(site, count))
+        cpu_s.append(cost["update_s"] + cost["publish_s"])
+    assert cpu_s[1] < 1.35 * cpu_s[0]

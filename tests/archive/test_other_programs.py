@@ -1,0 +1,240 @@
+"""The files of the store as other programs read them: CF checker, ncdump, CDO, NCO, GDAL, xarray."""
+
+import dataclasses
+import json
+import pickle
+import shutil
+import subprocess
+import sys
+from contextlib import contextmanager
+from datetime import UTC, datetime
+
+import numpy as np
+import pytest
+import xarray as xr
+
+from station.archive import epochs, reference_files
+from station.archive.areas import AreaChange, update_areas
+from station.archive.compaction import compact
+from station.archive.series.virtual import build_series
+from station.quantities import Reference
+
+pytestmark = pytest.mark.integration
+
+
+def tool(name):
+    path = shutil.which(name)
+    if path is None:
+        pytest.skip(f"{name} is not installed")
+    return path
+
+
+def run(*command):
+    return subprocess.run(command, capture_output=True, text=True, check=True, timeout=120)
+
+
+def gdal_value(path):
+    """Return the elevation change of the fourth epoch at a map position, as GDAL reads it."""
+    name, position = f"NETCDF:{path}:elevation_change", ("632055", "5185955")
+    return float(run(tool("gdallocationinfo"), "-valonly", "-b", "4", "-geoloc", name, *position).stdout)
+
+
+@pytest.fixture
+def built(series, epoch):
+    for hour in range(4):
+        epochs.write_epoch(series, epoch(hour, terms=True))
+    elevation = np.full(series.grid.shape, 2900.125)
+    reference_files.write_reference(
+        series,
+        Reference.from_elevation(series.grid, "1", elevation),
+    )
+    return build_series(series)
+
+
+def findings(report, *paths):
+    """Return the objections of the CF checker to files: path, check, messages."""
+    checker = shutil.which("compliance-checker", path=f"{sys.prefix}/bin") or tool("compliance-checker")
+    subprocess.run(
+        [checker, "--test=cf:1.11", "--format=json_new", f"--output={report}", *paths],
+        capture_output=True,
+        check=False,
+        timeout=120,
+    )
+    results = json.loads(report.read_text())
+    assert set(results) == set(map(str, paths))
+    return [
+        (path, check["name"], check["msgs"])
+        for path, result in results.items()
+        for priority in ("high_priorities", "medium_priorities", "low_priorities")
+        for check in result["cf:1.11"][priority]
+        if check["msgs"]
+    ]
+
+
+def test_compliance_checker_accepts_epoch_series_and_reference(built, tmp_path):
+    epoch = built.parent / "epochs/2025/11/21/hef_20251121T010000Z.nc"
+    assert findings(tmp_path / "report.json", built, built.parent / "reference.nc", epoch) == []
+
+
+def test_compliance_checker_accepts_compacted_files(built, series, tmp_path):
+    compact(series, datetime(2026, 2, 1, tzinfo=UTC), lambda: None)
+    build_series(series)
+    month = built.parent / "months/2025/hef_202511_r1.nc"
+    assert findings(tmp_path / "report.json", built, month) == []
+
+
+def test_compliance_checker_accepts_files_without_a_map_projection(series, epoch, tmp_path):
+    local = dataclasses.replace(series, crs=None, vertical_datum="")
+    epochs.write_epoch(local, epoch(0))
+    build_series(local)
+    elevation = np.full(series.grid.shape, 2900.125)
+    reference_files.write_reference(local, Reference.from_elevation(series.grid, "1", elevation))
+    paths = [series.folder / name for name in ("series.nc", "reference.nc")]
+    for path in paths:
+        with xr.open_dataset(path) as ds:
+            assert "crs" not in ds
+    assert findings(tmp_path / "report.json", *paths) == []
+
+
+def test_other_programs_read_compacted_files(built, series, tmp_path):
+    compact(series, datetime(2026, 2, 1, tzinfo=UTC), lambda: None)
+    build_series(series)
+    for path in (built, built.parent / "months/2025/hef_202511_r1.nc"):
+        assert "elevation_change" in run(tool("cdo"), "infon", path).stdout
+        assert run(tool("ncdump"), "-v", "scan_id", path).stdout.count('"251121_0') == 4
+        assert gdal_value(path) == pytest.approx(0.03, abs=1e-3)
+        mean = tmp_path / "mean.nc"
+        run(tool("ncra"), "-O", "-3", "-v", "elevation_change", path, mean)
+        with xr.open_dataset(mean) as ds:
+            assert float(ds.elevation_change[0, 5, 5]) == pytest.approx(0.015, abs=1e-3)
+
+
+def test_ncdump_prints_header_and_values(built):
+    assert "elevation_change(time, y, x)" in run(tool("ncdump"), "-h", built).stdout
+    assert "0.03" in run(tool("ncdump"), "-v", "elevation_change", built).stdout
+
+
+def test_cdo_reads_values_and_grid_without_a_warning(built):
+    shown = run(tool("cdo"), "infon", built)
+    assert "elevation_change" in shown.stdout
+    warnings = [line for line in shown.stderr.splitlines() if "(char/string), skipped" not in line]
+    assert "warning" not in "".join(warnings).lower()
+    grid = run(tool("cdo"), "griddes", built).stdout
+    assert "+proj=utm +zone=32" in grid
+
+
+@pytest.mark.parametrize("chunking", ["-3", "--cnk_plc=xst"])
+def test_nco_averages_over_time(built, tmp_path, chunking):
+    """NCO 5.1.4 invents chunk sizes for virtual variables unless the chunking of the output is given."""
+    mean = tmp_path / "mean.nc"
+    run(tool("ncra"), "-O", chunking, "-v", "elevation_change", built, mean)
+    with xr.open_dataset(mean) as ds:
+        assert float(ds.elevation_change[0, 5, 5]) == pytest.approx(0.015, abs=1e-3)
+        assert np.isnan(ds.elevation_change[0, 5, -1])
+
+
+def test_gdal_reads_position_orientation_and_projection(built):
+    info = json.loads(run(tool("gdalinfo"), "-json", f"NETCDF:{built}:elevation_change").stdout)
+    assert info["geoTransform"] == [632000.0, 10.0, 0.0, 5186000.0, 0.0, -10.0]
+    assert 'ID["EPSG",32632]' in info["coordinateSystem"]["wkt"]
+    assert len(info["bands"]) == 4
+    assert gdal_value(built) == pytest.approx(0.03, abs=1e-3)
+
+
+class ConstantAggregator:
+    def area(self, cells, _epoch):
+        return AreaChange(*((0.25, 0.125, 0.2, 0.2, 0.5) if cells.all() else (*[np.nan] * 4, 0.0)))
+
+
+@pytest.fixture
+def areas_file(series, epoch):
+    for hour in range(4):
+        epochs.write_epoch(series, epoch(hour))
+    build_series(series)
+    everywhere = np.ones(series.grid.shape, bool)
+    areas = {"Süd": everywhere, "unobserved": np.tri(*series.grid.shape, dtype=bool)}
+    return update_areas(series, areas, ConstantAggregator(), lambda: None)
+
+
+def test_compliance_checker_accepts_areas(areas_file, tmp_path):
+    assert findings(tmp_path / "report.json", areas_file) == []
+
+
+def test_ncdump_prints_times_names_and_missing_values_of_areas(areas_file):
+    text = run(tool("ncdump"), "-t", "-v", "time,area_name,mean_change", areas_file).stdout
+    assert '"2025-11-21 00:07:30"' in text
+    assert r'"S\303\274d"' in text  # ncdump prints UTF-8 in octal
+    assert "0.25, _" in text
+
+
+def test_cdo_averages_areas_over_time_without_a_warning(areas_file):
+    output = run(tool("cdo"), "-s", "output", "-timmean", "-selname,mean_change", areas_file).stdout
+    assert [float(value) for value in output.split()] == pytest.approx([0.25, 9.96921e36])
+    shown = run(tool("cdo"), "infon", areas_file)
+    assert "volume_change" in shown.stdout
+    warnings = [line for line in shown.stderr.splitlines() if "(char/string), skipped" not in line]
+    assert "warning" not in "".join(warnings).lower()
+
+
+def test_nco_averages_areas_over_time(areas_file, tmp_path):
+    mean = tmp_path / "mean.nc"
+    run(tool("ncra"), "-O", "-v", "mean_change", areas_file, mean)
+    with xr.open_dataset(mean) as ds:
+        assert ds.area_name.values.tolist() == ["Süd", "unobserved"]
+        assert ds.mean_change.values[0, 0] == 0.25
+        assert np.isnan(ds.mean_change.values[0, 1])
+
+
+@contextmanager
+def continuously_rebuilt(series):
+    """Rebuild the series in another process, as the service does: within a process, HDF5 has one lock."""
+    program = (
+        "import sys, pickle; from station.archive.series.manifest import MANIFEST\n"
+        "from station.archive.series.virtual import build_series\n"
+        "series = pickle.loads(bytes.fromhex(sys.argv[1]))\n"
+        "while True:\n"
+        "    (series.folder / MANIFEST).unlink(missing_ok=True)\n"  # else there is nothing to do
+        "    build_series(series)\n"
+    )
+    writer = subprocess.Popen([sys.executable, "-c", program, pickle.dumps(series).hex()])
+    first_inode = series.path.stat().st_ino
+    try:
+        while series.path.stat().st_ino == first_inode:
+            assert writer.poll() is None
+        yield
+        assert writer.poll() is None
+    finally:
+        writer.kill()
+        writer.wait()
+
+
+@pytest.mark.parametrize("engine", ["netcdf4", pytest.param("h5netcdf", marks=pytest.mark.slow)])
+def test_xarray_while_the_series_is_replaced(built, series, engine):
+    with continuously_rebuilt(series):
+        for _ in range(6):
+            with xr.open_dataset(built, engine=engine) as ds:
+                assert ds.elevation_change[:, 5, 5].values == pytest.approx([0, 0.01, 0.02, 0.03], abs=1e-3)
+
+
+def test_other_programs_while_the_series_is_replaced(built, series):
+    ncdump, cdo, gdal = tool("ncdump"), tool("cdo"), tool("gdalinfo")
+    with continuously_rebuilt(series):
+        for _ in range(5):
+            assert "elevation_change(time, y, x)" in run(ncdump, "-h", built).stdout
+            assert "elevation_change" in run(cdo, "infon", built).stdout
+            assert 'ID["EPSG",32632]' in run(gdal, f"NETCDF:{built}:elevation_change").stdout
+
+
+def test_nco_averages_over_epochs(built, tmp_path):
+    mean = tmp_path / "mean.nc"
+    run(tool("ncra"), "-O", *sorted(built.parent.glob("epochs/*/*/*/*.nc")), mean)
+    with xr.open_dataset(mean) as ds:
+        assert float(ds.elevation_change[0, 5, 5]) == pytest.approx(0.015, abs=1e-3)
+
+
+@pytest.mark.filterwarnings("ignore::PendingDeprecationWarning")  # rioxarray's own use of affine
+def test_rioxarray_reads_the_projection(built):
+    rioxarray = pytest.importorskip("rioxarray")
+    with rioxarray.open_rasterio(f"netcdf:{built}:elevation_change") as ds:
+        assert ds.rio.crs.to_epsg() == 32632
+        assert ds.rio.transform().e == -10.0

@@ -1,0 +1,237 @@
+"""A worker process that hangs, dies, panics or exhausts its memory costs one scan and nothing else."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from contextlib import suppress
+from pathlib import Path
+
+import pytest
+
+from station.errors import NotReadyError, ScanError, StoreError
+from station.processing import isolation
+
+HERE = Path(__file__).parent
+
+
+@pytest.fixture
+def tasks(monkeypatch):
+    monkeypatch.syspath_prepend(HERE)
+    import isolated_tasks
+
+    # pytest, because a worker imports the main module, which is that of pytest in a test run
+    isolation.start_forkserver(("station.processing.isolation", "numpy", "pytest"))
+    return isolated_tasks
+
+
+@pytest.fixture(autouse=True)
+def short_retry_delays(monkeypatch):
+    monkeypatch.setattr(isolation, "RETRY_DELAYS_S", (0.01, 0.01))
+
+
+def run(task, *args, memory_gb=1.0, timeout_s=20.0, **hooks):
+    return isolation.run_isolated(task, *args, memory_gb=memory_gb, timeout_s=timeout_s, **hooks)
+
+
+def test_result_is_returned_and_progress_is_reported(tasks):
+    reports = []
+    assert run(tasks.progress_all_the_time, 0.5, on_progress=lambda: reports.append(1)) > 1000
+    assert 4 <= len(reports) < 100  # each takes time of the parent too
+    assert run(tasks.add, 2, 3) == 5
+    assert len(run(tasks.many_bytes, 5_000_000)) == 5_000_000
+
+
+def test_second_worker_starts_within_a_tenth_of_a_second(tasks):
+    run(tasks.add, 1, 1)
+    durations_s = []
+    for _ in range(5):
+        start_s = time.monotonic()
+        run(tasks.add, 1, 1)
+        durations_s.append(time.monotonic() - start_s)
+    assert min(durations_s) < 0.1
+
+
+def test_worker_has_one_thread_and_the_parent_keeps_its_environment(tasks, monkeypatch):
+    monkeypatch.delenv("OPENBLAS_NUM_THREADS", raising=False)
+    assert run(tasks.environment, "OPENBLAS_NUM_THREADS") == ("1", 1)
+    assert "OPENBLAS_NUM_THREADS" not in os.environ
+
+
+def test_full_disk_of_stderr_raises_not_ready(tasks, monkeypatch):
+    """Buffered output is flushed before each worker is started."""
+    with suppress(OSError), Path("/dev/full").open("w") as full, monkeypatch.context() as patch:
+        full.write("a line of the log")
+        patch.setattr(sys, "stderr", full)
+        with pytest.raises(NotReadyError, match=r"could not be started: .* No space left"):
+            run(tasks.add, 2, 3)
+    assert run(tasks.add, 2, 3) == 5
+
+
+@pytest.mark.parametrize("task", ["allocate", "allocate_in_numpy"])
+def test_memory_limit_raises_scan_error(tasks, task):
+    with pytest.raises(ScanError, match="needs more than 1 GB"):
+        run(getattr(tasks, task), 10)
+
+
+@pytest.mark.integration
+def test_memory_of_preloaded_modules_does_not_count(tasks):
+    assert run(tasks.allocate, 0.9, memory_gb=1.0) > 9e8
+    with pytest.raises(ScanError, match="needs more"):
+        run(tasks.allocate, 1.1, memory_gb=1.0)
+
+
+@pytest.mark.parametrize(
+    ("number", "error"),
+    [
+        (signal.SIGABRT, ScanError),
+        (signal.SIGSEGV, ScanError),
+        (signal.SIGKILL, NotReadyError),  # not sent by a decoder: the machine is out of memory
+        (signal.SIGTERM, NotReadyError),
+    ],
+)
+def test_death_by_signal_is_classified_by_the_signal(tasks, number, error):
+    with pytest.raises(error, match=number.name):
+        run(tasks.kill, number)
+
+
+def test_killed_worker_is_restarted_twice(tasks, tmp_path):
+    assert run(tasks.killed_times, 2, str(tmp_path / "count")) == 2
+    with pytest.raises(NotReadyError, match="SIGKILL"):
+        run(tasks.killed_times, 9, str(tmp_path / "other"))
+    assert (tmp_path / "other").stat().st_size == 3
+
+
+def test_worker_killed_during_its_report_is_restarted(tasks, tmp_path):
+    """The report exceeds the pipe's buffer, and the parent reads it after the worker was killed."""
+    delays_s = [1.0]
+
+    def read_late():
+        time.sleep(delays_s.pop() if delays_s else 0)
+
+    result = run(tasks.killed_during_its_report, str(tmp_path / "note"), on_progress=read_late)
+    assert len(result) == 5_000_000
+    assert not delays_s
+
+
+def test_stop_ends_the_delay_before_a_restart(tasks, tmp_path, monkeypatch):
+    monkeypatch.setattr(isolation, "RETRY_DELAYS_S", (60.0,))
+    until_s = time.monotonic() + 1.0
+    with pytest.raises(NotReadyError, match="stopped"):
+        run(tasks.killed_times, 9, str(tmp_path / "count"), should_stop=lambda: time.monotonic() > until_s)
+    assert time.monotonic() < until_s + 10.0
+
+
+@pytest.mark.parametrize(
+    ("task", "message"), [("abort", "SIGABRT"), ("segfault", "SIGSEGV"), ("vanish", "without a message")]
+)
+def test_native_crash_raises_scan_error(tasks, task, message):
+    with pytest.raises(ScanError, match=message):
+        run(getattr(tasks, task))
+
+
+@pytest.mark.parametrize("task", ["panic", "exit_task"])
+def test_base_exceptions_of_a_task_raise_scan_error(tasks, task):
+    with pytest.raises(ScanError, match=r"panicked: (Panic: called|SystemExit)"):
+        run(getattr(tasks, task))
+
+
+def test_hanging_worker_is_killed_at_its_timeout(tasks, tmp_path):
+    reports = []
+    start_s = time.monotonic()
+    with pytest.raises(ScanError, match="longer than 1 s"):
+        run(
+            tasks.hang_ignoring_signals,
+            str(tmp_path / "pid"),
+            timeout_s=1.0,
+            on_progress=lambda: reports.append(1),
+        )
+    assert time.monotonic() - start_s < 3.0
+    assert len(reports) >= 3
+    assert not is_alive(int((tmp_path / "pid").read_text()))
+
+
+def test_stop_ends_the_worker_with_not_ready(tasks):
+    until_s = time.monotonic() + 0.4
+    with pytest.raises(NotReadyError, match="stopped"):
+        run(tasks.hang, should_stop=lambda: time.monotonic() > until_s)
+
+
+def test_station_errors_of_a_task_are_raised(tasks):
+    with pytest.raises(ScanError, match=r"^contains no points$"):
+        run(tasks.raise_scan_error)
+    with pytest.raises(StoreError, match=r"^no space left$"):
+        run(tasks.raise_store_error)
+
+
+@pytest.mark.parametrize(
+    ("task", "message"), [("raise_key_error", "KeyError: 'missing'"), ("return_unpicklable", "pickle")]
+)
+def test_bug_raises_runtime_error_with_its_traceback(tasks, task, message):
+    with pytest.raises(RuntimeError, match=message) as raised:
+        run(getattr(tasks, task))
+    assert f"a bug in {task}" in str(raised.value)
+
+
+SERVICE = """
+import sys
+sys.path.insert(0, sys.argv[1])
+import isolated_tasks
+from station.processing import isolation
+if __name__ == "__main__":
+    isolation.start_forkserver(("station.processing.isolation",))
+    isolation.run_isolated(isolated_tasks.hang_ignoring_signals, sys.argv[2], memory_gb=1, timeout_s=60)
+"""
+
+
+def test_worker_dies_with_its_killed_parent(tmp_path):
+    script, pid_file = tmp_path / "service.py", tmp_path / "pid"
+    script.write_text(SERVICE)
+    with subprocess.Popen([sys.executable, str(script), str(HERE), str(pid_file)]) as service:
+        wait_for(lambda: pid_file.exists() and pid_file.read_text())
+        worker = int(pid_file.read_text())
+        assert is_alive(worker)
+        service.kill()
+    wait_for(lambda: not is_alive(worker))
+
+
+ORPHAN = """
+import multiprocessing, os
+from station.processing import isolation
+read_end, write_end = os.pipe()
+os.close(write_end)
+class Parent:
+    sentinel = read_end
+multiprocessing.parent_process = Parent
+parent_conn, child_conn = multiprocessing.Pipe()
+parent_conn.close()
+"""
+
+
+@pytest.mark.parametrize("step", ["_die_with_parent()", "_send(child_conn, 'progress', None)"])
+def test_orphaned_worker_exits_without_a_traceback(step):
+    """A traceback in the system's log after every power cut would look like a bug."""
+    process = subprocess.run(
+        [sys.executable, "-c", f"{ORPHAN}isolation.{step}\nprint('still running')"],
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert (process.returncode, process.stdout, process.stderr) == (1, "", "")
+
+
+def is_alive(pid):
+    try:
+        return "Z" not in Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()[0]
+    except (FileNotFoundError, ProcessLookupError):
+        return False
+
+
+def wait_for(condition, within_s=10.0):
+    until_s = time.monotonic() + within_s
+    while not condition():
+        assert time.monotonic() < until_s
+        time.sleep(0.02)

@@ -1,0 +1,282 @@
+"""Processing of scans with missing or faulty inputs: verdict, reasons, sigma, or an error."""
+
+import os
+import re
+import shutil
+from dataclasses import replace
+
+import laspy
+import netCDF4
+import numpy as np
+import pytest
+
+from station.config import read_site
+from station.errors import ConfigError, NotReadyError, ScanError
+from station.inbox.scan_files import scan_file
+from station.processing import reference_tasks, scan_tasks
+from station.processing.pipeline import to_map
+from station.processing.scan_inputs import load_scan_inputs
+from station.readers.scan import utc_interval
+from station.science.uncertainty.parameters import LINE_GROUPS_PER_KNOT
+from station.simulation.instrument.motion import sensor_faults
+from station.simulation.station import simulate, small
+
+SCENARIO = replace(small(hours=2), avalanche_m=0.0, melt_m_per_h=0.0)
+
+
+@pytest.fixture(scope="module")
+def simulated(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("simulated") / "station"
+    simulate(folder, SCENARIO)
+    return folder
+
+
+@pytest.fixture
+def folder(simulated, tmp_path):
+    return shutil.copytree(simulated, tmp_path / "station")
+
+
+def edited_site(folder, *changes):
+    path = folder / "site.toml"
+    text = path.read_text()
+    for old, new in changes:
+        assert old in text
+        text = text.replace(old, new)
+    path.write_text(text)
+    return read_site(path)
+
+
+def process(folder, *changes, scan=1, **options):
+    """Return the result of one scan and the sigma of its shared parameters."""
+    site = edited_site(folder, *changes)
+    scans = sorted(site.scans.inbox.glob("*.laz"))
+    result = scan_tasks.process(site, scan_file(site, scans[scan]), lambda: None, **options)
+    with netCDF4.Dataset(site.station.data / result.epoch) as file:
+        variance = np.diagonal(file["shared_parameter_covariance"][0])
+    return result, np.sqrt(variance)
+
+
+def log_file(folder, scan=1):
+    return sorted((folder / "inbox").glob("*-incl.txt"))[scan]
+
+
+def test_complete_inputs_give_verdict_good(folder):
+    result, _ = process(folder)
+    assert (result.verdict, result.reason) == ("good", "")
+
+
+def test_line_times_match_the_shots(folder):
+    """True north deviates from grid north by 1.3°, which the head turns in 2.6 s."""
+    site = edited_site(folder)
+    scan = scan_file(site, min(site.scans.inbox.glob("*.laz")))
+    with scan_tasks.open_scan_for(site, scan.path) as reader:
+        start, end, _ = utc_interval(reader, site.scans.name)
+        inputs = load_scan_inputs(site, reader, scan.log, start, end)
+        shots = next(iter(reader.blocks()))
+    points = to_map(shots, inputs.pose)
+    offset_m = tuple(
+        points_m - origin_m for points_m, origin_m in zip(points, inputs.geometry.position_m, strict=True)
+    )
+    far = np.hypot(*offset_m[:2]) > 200
+    line = (inputs.adjustment_inputs.params.knot_position(offset_m)[far] * LINE_GROUPS_PER_KNOT).astype(int)
+    delay_s = inputs.adjustment_inputs.lines.time_s[line] - shots.time_s[far]
+    assert abs(np.median(delay_s)) < 0.3
+    assert np.quantile(np.abs(delay_s), 0.95) < 1.0
+
+
+def test_missing_log_increases_the_tilt_sigma(folder):
+    _, sigma_with_log = process(folder)
+    log_file(folder).unlink()
+    result, sigma = process(folder)
+    assert result.verdict == "degraded"
+    assert "inclination log missing" in result.reason
+    assert sigma[0] > 3 * sigma_with_log[0]
+
+
+def change_log(folder, change):
+    path = log_file(folder)
+    head, *rows = path.read_text().splitlines()
+    path.write_text("\n".join([head, *change(rows)]) + "\n")
+
+
+@pytest.mark.integration
+@pytest.mark.parametrize(
+    ("change", "reason"),
+    [
+        (lambda rows: rows[: len(rows) // 2], "inclination log covers"),
+        (lambda rows: rows[:100] + rows[180:], "has a gap of"),
+        (lambda rows: ["x,y,z"] * 100 + rows[100:], "rows rejected"),
+        (lambda rows: rows[:5], "valid rows"),
+        (
+            lambda rows: [f"{float(r.split(',')[0]) + 90000},{r.split(',', 1)[1]}" for r in rows],
+            "another time",
+        ),
+        (lambda rows: ["?"] * len(rows), "inclination log unusable"),
+        (
+            lambda rows: [f"{float(r.split(',')[0]) + 30},{r.split(',', 1)[1]}" for r in rows],
+            "inclination log covers",
+        ),
+        (
+            lambda rows: [f"{row.split(',')[0]},10.0,-1.3" if n % 3 else row for n, row in enumerate(rows)],
+            "tilt out of the inclination sensor's range of 10 degree in 67% of its log",
+        ),
+    ],
+    ids=["short", "gap", "bad rows", "few", "other time", "unreadable", "half a minute late", "saturated"],
+)
+def test_faulty_log_degrades_the_scan(folder, change, reason):
+    change_log(folder, change)
+    result, _ = process(folder)
+    assert result.verdict == "degraded"
+    assert reason in result.reason
+
+
+@pytest.mark.integration
+def test_spikes_in_the_log_are_removed(folder):
+    good, _ = process(folder)
+    rows = log_file(folder).read_text().splitlines()
+    for row in range(20, len(rows), 40):
+        rows[row] = rows[row].split(",")[0] + ",9.999,-9.999"
+    log_file(folder).write_text("\n".join(rows) + "\n")
+    spiked, _ = process(folder)
+    assert spiked.verdict == "good"
+    assert spiked.metrics["sigma_median_m"] == pytest.approx(good.metrics["sigma_median_m"], rel=0.05)
+
+
+@pytest.mark.integration
+def test_optional_log_may_be_missing_or_saturated(folder):
+    """It is saturated if the mount tilts beyond the sensor's range, as at Mammoth Mountain."""
+    change_log(folder, lambda rows: [f"{row.split(',')[0]},-10.0,10.0" for row in rows])
+    result, _ = process(folder, ("required = true", "required = false"))
+    assert result.verdict == "good"
+    log_file(folder).unlink()
+    result, _ = process(folder)
+    assert result.verdict == "good"
+
+
+def test_clock_offset_of_the_log_is_estimated_from_the_cyclic_tilt(folder):
+    """A tilted mount shows waves of 4°; the clock of the second log is 6 s late."""
+    head_rad = np.radians(np.linspace(97, 245, 10_000))
+    for scan, late_s in ((0, 0.0), (1, 6.0)):
+        path = log_file(folder, scan)
+        head, *rows = path.read_text().splitlines()
+        time_s, roll, pitch = np.array([[float(v) for v in row.split(",")] for row in rows]).T
+        share = (time_s - time_s[0] - 6) / 300  # the log begins 6 s before the scan
+        azimuth_rad = np.interp(share, np.linspace(0, 1, len(head_rad)), head_rad)
+        roll, pitch = roll + 4 * np.cos(azimuth_rad), pitch + 4 * np.sin(azimuth_rad)
+        rows = [f"{t + late_s:.4f},{r:.3f},{p:.3f}" for t, r, p in zip(time_s, roll, pitch, strict=True)]
+        path.write_text("\n".join([head, *rows]) + "\n")
+    result, _ = process(folder)
+    assert result.verdict == "degraded"
+    match = re.search(r"clock of the inclination log ([+-][\d.]+) s off, sigma ([\d.]+) s", result.reason)
+    clock_s = [sensor_faults(SCENARIO, scan).clock_s for scan in (0, 1)]
+    assert float(match[1]) == pytest.approx(6 + clock_s[1] - clock_s[0], abs=0.6)
+    assert float(match[2]) < 0.5
+
+
+@pytest.mark.integration
+def test_missing_weather_degrades_the_scan_or_defers_it(folder):
+    (folder / "weather.dat").unlink()
+    result, sigma = process(folder)
+    assert result.verdict == "degraded"
+    assert "weather" in result.reason
+    assert sigma[7] == pytest.approx(4.0)  # ppm of the range, against 0.8 with weather
+    with pytest.raises(NotReadyError, match="weather"):
+        process(folder, wait_for_weather=True)
+    for path in (folder / "inbox").iterdir():
+        os.utime(path, (1.7e9, 1.7e9))  # it arrived long ago
+    assert process(folder, wait_for_weather=True)[0].verdict == "degraded"
+
+
+@pytest.mark.integration
+@pytest.mark.parametrize(
+    ("keep", "verdict", "reason"),
+    [
+        (lambda distance_m, _: distance_m < 400, "degraded", "none beyond 400 m: fog"),
+        (lambda distance_m, _: distance_m < 125, "unusable", "of the usually visible cells observed"),
+        (lambda _, share: share < 0.6, "degraded", "partial sweep: no points at azimuth"),
+    ],
+    ids=["fog", "dense fog", "partial sweep"],
+)
+def test_obstructed_scan_gets_a_verdict_and_one_reason(folder, keep, verdict, reason):
+    site = read_site(folder / "site.toml")
+    first, path = sorted(site.scans.inbox.glob("*.laz"))
+    reference_tasks.build_reference_version(site, [scan_file(site, first)], "1", lambda: None)
+    full, _ = process(folder)
+    assert (full.verdict, full.reason) == ("good", "")
+    scan = laspy.read(path)
+    share = (np.asarray(scan.gps_time) - scan.gps_time.min()) / np.ptp(scan.gps_time)
+    scan.points = scan.points[keep(np.hypot(scan.x, scan.y), share)]
+    scan.write(path)
+    result, _ = process(folder)
+    assert result.verdict == verdict
+    assert reason in result.reason
+    assert result.reason.count(";") == 0
+    assert result.epoch  # stored whatever the verdict
+
+
+def test_points_without_time_get_the_mean_tilt(folder):
+    result, _ = process(folder, ('frame = "scanner"', 'frame = "scanner"\npoint_time = "none"'))
+    assert result.verdict == "good"  # as the site file declares
+
+
+def test_missing_log_of_the_sop_scan_degrades_the_scan(folder):
+    log_file(folder, 0).unlink()
+    result, _ = process(folder)
+    assert result.verdict == "degraded"
+    assert "the scan of the SOP, not found" in result.reason
+
+
+def test_scan_without_points_on_the_grid_is_rejected(folder):
+    """The scanner's frame is taken for the map."""
+    with pytest.raises(ScanError, match=r"no point falls on the grid: wrong scans\.frame"):
+        process(folder, ('frame = "scanner"', 'frame = "map"'))
+
+
+def test_sop_outside_the_map_raises_config_error(folder):
+    site = edited_site(folder)
+    origin = next(
+        line for line in (folder / "site.toml").read_text().splitlines() if line.startswith("origin")
+    )
+    with pytest.raises(ConfigError, match=r"set map\.origin or map\.pop"):
+        process(folder, (origin, ""))
+    assert site.map.origin is not None
+
+
+@pytest.mark.integration
+def test_identical_epoch_is_stored_once_and_changed_content_as_a_revision(folder):
+    first, _ = process(folder)
+    repeated, _ = process(folder)
+    assert (repeated.epoch, repeated.revision) == (first.epoch, 1)
+    first_scan, second_scan = sorted((folder / "inbox").glob("*.laz"))
+    shutil.copyfile(first_scan, second_scan)
+    changed, _ = process(folder)
+    assert changed.revision == 2
+    assert changed.epoch != first.epoch
+
+
+def test_linked_scan_is_rejected(folder):
+    scan = sorted((folder / "inbox").glob("*.laz"))[1]
+    scan.rename(folder / "elsewhere.laz")
+    scan.symlink_to(folder / "elsewhere.laz")
+    with pytest.raises(ScanError, match="not a regular file"):
+        process(folder)
+
+
+@pytest.mark.integration
+def test_reference_from_a_geotiff(folder, simulated):
+    rasterio = pytest.importorskip("rasterio")
+    import xarray as xr
+
+    site = read_site(simulated / "site.toml")
+    grid = site.grid_cells
+    with xr.open_dataset(simulated / "truth.nc") as truth:
+        elevation = truth.unchanged_elevation.values.astype(np.float32)
+    transform = rasterio.Affine(grid.cell_m, 0.0, grid.west_m, 0.0, -grid.cell_m, grid.north_m)
+    with rasterio.open(
+        folder / "dem.tif", "w", driver="GTiff", width=grid.nx, height=grid.ny, count=1, dtype="float32",
+        crs="EPSG:32632", transform=transform, nodata=-9999.0,
+    ) as tif:  # fmt: skip
+        tif.write(np.nan_to_num(elevation, nan=-9999.0), 1)
+    result, _ = process(folder, ("scans = 1 ", 'scans = "dem.tif" '))
+    assert result.reference.startswith("dem-")
+    assert abs(result.metrics["change_median_m"]) < 0.2

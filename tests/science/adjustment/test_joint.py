@@ -1,0 +1,685 @@
+"""Joint adjustment of a scan, compared with dense least squares and with simulated scans of known state."""
+
+import math
+from dataclasses import dataclass, replace
+from functools import cache
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+from scipy.spatial.transform import Rotation
+
+from station.quantities import SharedParameters, VarianceComponents
+from station.science.adjustment import joint, prior
+from station.science.adjustment.joint import adjust_scan
+from station.science.adjustment.normal_equations import LineInclination
+from station.science.adjustment.patches import GroundClass, Patches
+from station.science.analysis.verdict import adjustment_warnings
+from station.science.uncertainty import parameters, propagation
+from station.science.uncertainty.common_mode import cross_covariance
+from station.science.uncertainty.jacobian import HeightJacobian, height_jacobian
+
+COMPONENTS = VarianceComponents()
+START_DEG, WIDTH_DEG = 20, 40  # scanned sector
+PARAMS = parameters.ParameterLayout(math.radians(START_DEG), WIDTH_DEG, full_circle=False)
+FULL_CIRCLE = replace(PARAMS, knot_intervals=360, full_circle=True)
+NO_TILT = np.zeros((3, PARAMS.line_groups))
+RANGE_BINS = range(6, 38)  # 480 to 3,040 m away
+GLOBAL_COUNT = 9
+
+
+@cache
+def dense_prior(params):
+    """Prior covariance (u, u) of a scan's state by line group, and its Cholesky factor."""
+    lines = prior.line_times(params, np.eye(3), None)
+    sigma = prior.globals_sigma(COMPONENTS, weather_known=True)
+    tilts = (
+        prior.tilt_covariance(COMPONENTS, lines),
+        prior.refraction_covariance(COMPONENTS, params),
+        prior.cross_tilt_covariance(COMPONENTS, params, lines),
+    )
+    covariance = prior.block_diagonal_covariance(params, sigma, *tilts)
+    return covariance, np.linalg.cholesky(covariance)
+
+
+@cache
+def knot_prior(params):
+    """The prior as the adjustment uses it: tilt drift is linear between knots."""
+    return prior.state_prior(
+        params, prior.line_times(params, np.eye(3), None), COMPONENTS, weather_known=True
+    )
+
+
+@dataclass
+class Sites:
+    """Sites of patches: line group, range bin, offset from the scanner and terrain gradient."""
+
+    line: np.ndarray
+    range_bin: np.ndarray
+    offset_m: tuple
+    east: np.ndarray
+    north: np.ndarray
+
+    def matrix(self, params=PARAMS):
+        """Dense Jacobian of heights (n, u) by line group, written independently from equations.md, 6.1."""
+        x, y, z = self.offset_m
+        horizontal_m, east, north = np.hypot(x, y), self.east, self.north
+        normal_m = z - east * x - north * y
+        rise = horizontal_m + z * (east * x + north * y) / horizontal_m
+        refraction_m = horizontal_m * rise / (2 * 6_371_000.0)
+        globals_ = [-(y + north * z), x + east * z, east * y - north * x, east, north, -np.ones_like(x)]
+        globals_ += [normal_m / np.hypot(horizontal_m, z), normal_m * 1e-6, refraction_m]
+        azimuth_deg = (np.degrees(np.arctan2(x, y)) - START_DEG) % 360
+        line = np.floor(azimuth_deg / 0.2)[:, None] == np.arange(params.line_groups)
+        knot = np.maximum(1 - abs(azimuth_deg[:, None] / 5 - np.arange(params.knot_intervals / 5 + 1)), 0)
+        if params.full_circle:
+            knot[:, 0] += knot[:, -1]
+            knot = knot[:, :-1]
+        cross = z * (east * y - north * x) / horizontal_m  # cross tilt
+        effects = [-rise[:, None] * line, refraction_m[:, None] * knot, cross[:, None] * knot]
+        return np.hstack([np.stack(globals_, axis=-1), *effects])
+
+    def jacobian(self, params=PARAMS):
+        return height_jacobian(params, self.offset_m, self.east, self.north)
+
+    def patches(self, residual_m, sigma_m=0.01, ground_class=GroundClass.STABLE, params=PARAMS):
+        count = len(self.line)
+        return Patches(
+            self.jacobian(params),
+            self.range_bin,
+            np.full(count, ground_class, np.int64) if np.ndim(ground_class) == 0 else ground_class,
+            np.asarray(residual_m, dtype=float),
+            np.full(count, sigma_m**2),
+            np.full(count, 20.0),
+        )
+
+
+def random_sites(seed, count, sector_deg=(0, WIDTH_DEG), steep=0.7):
+    """Random sites in a part of the sector, at most one per line group and range bin."""
+    rng = np.random.default_rng(seed)
+    lines = np.arange(5 * sector_deg[0], 5 * sector_deg[1])
+    index = rng.choice(len(lines) * len(RANGE_BINS), count, replace=False)
+    line, range_bin = lines[index % len(lines)], RANGE_BINS[0] + index // len(lines)
+    azimuth = np.radians(START_DEG + 0.2 * (line + 0.5))
+    range_m = 80 * (range_bin + 0.5)
+    height_m = rng.uniform(-300, 600, count)
+    slopes = rng.uniform(-steep, steep, (2, count))
+    return Sites(line, range_bin, (range_m * np.sin(azimuth), range_m * np.cos(azimuth), height_m), *slopes)
+
+
+def concatenate(*patches):
+    """Concatenate patches of several ground classes."""
+    jacobians = [part.jacobian for part in patches]
+    return Patches(
+        HeightJacobian(
+            jacobians[0].params,
+            np.hstack([part.pose for part in jacobians]),
+            *(
+                np.concatenate([getattr(part, name) for part in jacobians])
+                for name in ("sight_tilt", "refraction", "cross_tilt", "knot_position")
+            ),
+        ),
+        *(
+            np.concatenate([getattr(part, name) for part in patches])
+            for name in ("range_bin", "ground_class", "residual_m", "variance_m2", "cell_count")
+        ),
+    )
+
+
+def no_patches():
+    return random_sites(0, 1).patches([0.0]).take(np.array([False]))
+
+
+SENSOR_ERROR_RAD = np.radians(0.0015)
+
+
+def sensor_error_modes(params=PARAMS):
+    """Effect of a bias about east and north and of a change of the cyclic error (lines, 4) [rad]."""
+    azimuth = params.line_azimuth_rad
+    columns = [np.cos(azimuth), -np.sin(azimuth), np.cos(2 * azimuth), np.sin(2 * azimuth)]
+    return SENSOR_ERROR_RAD * np.stack(columns, axis=-1)
+
+
+def log_design(params=PARAMS):
+    """Design matrix of the inclination log (lines, u); equations.md, 6.3."""
+    azimuth = np.radians(START_DEG + 0.2 * (np.arange(params.line_groups) + 0.5))
+    effect = np.zeros((params.line_groups, len(dense_prior(params)[0])))
+    effect[:, 0], effect[:, 1] = np.cos(azimuth), -np.sin(azimuth)
+    effect[:, GLOBAL_COUNT : GLOBAL_COUNT + params.line_groups] = np.eye(params.line_groups)
+    return effect
+
+
+LOG_SIGMA_RAD = np.radians(0.008)
+
+
+def simulated_log(state, rng):
+    """Inclination log of a state, with the sensor's systematic errors and noise."""
+    error_modes = sensor_error_modes()
+    sight_tilt_rad = log_design() @ state + error_modes @ rng.normal(size=error_modes.shape[1])
+    sight_tilt_rad += rng.normal(0, LOG_SIGMA_RAD, len(sight_tilt_rad))
+    return LineInclination(sight_tilt_rad, np.full(len(sight_tilt_rad), LOG_SIGMA_RAD**-2), error_modes)
+
+
+def height_sigma(adjustment, cells):
+    return np.sqrt(cells.jacobian().variance(adjustment.to_shared_parameters()))
+
+
+def simulate(seed, stable, *, log=False, moving=0, change_m=None, sigma_m=0.01):
+    """Errors of adjusted heights over the sector, their stated sigmas, and the adjustment of one scan."""
+    rng = np.random.default_rng(seed)
+    _, root = dense_prior(PARAMS)
+    state = root @ rng.normal(size=len(root))
+    patches = stable.patches(stable.matrix() @ state + rng.normal(0, sigma_m, len(stable.line)), sigma_m)
+    if moving:
+        snow = random_sites(seed + 10_000, moving, steep=0.3)
+        snow_m = snow.matrix() @ state + rng.normal(0, sigma_m, moving)
+        snow_m += 0.0 if change_m is None else change_m(snow, rng)
+        patches = concatenate(patches, snow.patches(snow_m, sigma_m, GroundClass.MOVING))
+    adjustment = adjust_scan(patches, NO_TILT, knot_prior(PARAMS), simulated_log(state, rng) if log else None)
+    cells = random_sites(seed + 20_000, 200)
+    return (
+        cells.matrix() @ state - adjustment.effect(cells.jacobian()),
+        height_sigma(adjustment, cells),
+        adjustment,
+    )
+
+
+def smooth_snow(mean_m):
+    """Snow depth that varies by 30 % over the glacier, in waves of 200° and 6 km."""
+
+    def snow_depth(snow, rng):
+        phase = rng.uniform(0, 2 * math.pi, 2)
+        waves = np.cos(math.radians(1.8) * snow.line + phase[0]) * np.cos(snow.range_bin / 12 + phase[1])
+        return mean_m * (1 + 0.3 * waves)
+
+    return snow_depth
+
+
+def standardised_errors(draws, stable, **scan):
+    """Standardised errors, errors and sigmas (draws, cells) of many simulated scans."""
+    error_m, sigma_m, _ = zip(*(simulate(seed, stable, **scan) for seed in range(draws)), strict=True)
+    return np.array(error_m) / np.array(sigma_m), np.array(error_m), np.array(sigma_m)
+
+
+def dense_least_squares(design, residual_m, variance_m2, covariance):
+    """Estimate and covariance by the Kalman gain, without normal equations."""
+    cross_covariance_m = covariance @ design.T
+    gain = np.linalg.solve(design @ cross_covariance_m + np.diag(variance_m2), cross_covariance_m.T).T
+    return gain @ residual_m, covariance - gain @ cross_covariance_m.T
+
+
+@pytest.mark.parametrize("with_log", [False, True], ids=["no log", "log"])
+@pytest.mark.parametrize(
+    "params",
+    [pytest.param(PARAMS, id="sector"), pytest.param(FULL_CIRCLE, id="full circle", marks=pytest.mark.slow)],
+)
+def test_estimate_and_covariance_match_dense_least_squares(params, with_log, monkeypatch):
+    monkeypatch.setattr(joint, "MAX_ITERATIONS", 1)  # initial weights
+    rng = np.random.default_rng(1)
+    motion, root = dense_prior(params)
+    covariance = knot_prior(params).line_covariance()
+    stable, no_tilt = (
+        random_sites(2, 2000, sector_deg=(0, params.knot_intervals)),
+        np.zeros((3, params.line_groups)),
+    )
+    design, variance_m2 = stable.matrix(params), np.full(2000, 0.02**2)
+    state = root @ rng.normal(size=len(root))
+    residual_m = design @ state + rng.normal(0, 0.02, 2000)
+    lines = log_design(params)
+    error_modes, sight_tilt_rad = sensor_error_modes(params), lines @ state
+    log = (
+        LineInclination(sight_tilt_rad, np.full(params.line_groups, LOG_SIGMA_RAD**-2), error_modes)
+        if with_log
+        else None
+    )
+    adjustment = adjust_scan(
+        stable.patches(residual_m, 0.02, params=params), no_tilt, knot_prior(params), log
+    )
+    # The lower bound of the excess sigma of stable patches is 2 mm.
+    noise_m2 = variance_m2 + 0.002**2
+    full_design, observations, prior_covariance = design, residual_m, covariance
+    if with_log:
+        prior_covariance = np.block(
+            [[covariance, np.zeros((len(covariance), 4))], [np.zeros((4, len(covariance))), np.eye(4)]]
+        )
+        full_design = np.block([[design, np.zeros((2000, 4))], [lines, error_modes]])
+        observations = np.concatenate([residual_m, sight_tilt_rad])
+        noise_m2 = np.concatenate([noise_m2, np.full(params.line_groups, LOG_SIGMA_RAD**2)])
+    estimate, expected = dense_least_squares(full_design, observations, noise_m2, prior_covariance)
+    sigma = np.sqrt(np.diag(expected))[: len(covariance)]
+    actual, expected = (
+        c[: len(sigma), : len(sigma)] / np.outer(sigma, sigma) for c in (adjustment.covariance, expected)
+    )
+    assert np.abs((adjustment.estimate - estimate[: len(covariance)]) / sigma).max() < 1e-8
+    assert np.abs(actual - expected).max() < 1e-8
+    assert np.abs(adjustment.effect(stable.jacobian(params)) - design @ adjustment.estimate).max() < 1e-9
+    # The adjustment interpolates tilt drift between knots. With drift by line group the result is the same,
+    # except at the seam, where the head starts and stops.
+    interpolation_error = np.zeros_like(prior_covariance)
+    interpolation_error[: len(motion), : len(motion)] = motion - covariance
+    estimate, expected = dense_least_squares(
+        full_design, observations, noise_m2, prior_covariance + interpolation_error
+    )
+    difference = np.abs((adjustment.estimate - estimate[: len(covariance)]) / sigma)
+    seam = (
+        [*range(9, 24), *range(9 + params.line_groups - 15, 9 + params.line_groups)]
+        if params.full_circle
+        else []
+    )
+    assert np.delete(difference, seam).max() < (0.1 if params.full_circle else 0.01)
+    assert difference.max() < 0.5
+    variance = np.diag(expected)[: len(sigma)]
+    assert np.delete(variance, seam) == pytest.approx(
+        np.delete(sigma**2, seam), rel=0.02 if params.full_circle else 0.01
+    )
+    assert np.all(variance[seam] < 1.02 * sigma[seam] ** 2)  # sigma is conservative there
+    condensed = propagation.condense_to_knots(params, adjustment.estimate, adjustment.covariance)
+    shared = adjustment.to_shared_parameters()
+    assert_allclose(shared.covariance, condensed.covariance, rtol=1e-6, atol=1e-9 * sigma[0] ** 2)
+    assert_allclose(shared.line_tilt_variance, condensed.line_tilt_variance, rtol=1e-6)
+    assert_allclose(shared.estimate, condensed.estimate, rtol=1e-6, atol=1e-12)
+
+
+@pytest.mark.integration
+@pytest.mark.parametrize(
+    ("stable", "scan"),
+    [
+        (random_sites(31, 150), {}),
+        (random_sites(32, 60, sector_deg=(0, 10)), {"log": True}),
+        (random_sites(33, 60, sector_deg=(0, 10)), {"moving": 600}),
+    ],
+    ids=[
+        "stable ground everywhere",
+        "a distant ridge and the log",
+        "a distant ridge and an unchanged glacier",
+    ],
+)
+def test_sigma_matches_the_errors_of_simulated_scans(stable, scan):
+    z, error_m, sigma_m = standardised_errors(60 if "moving" not in scan else 30, stable, **scan)
+    assert 0.85 < np.sqrt(np.mean(z**2)) < 1.15
+    assert 0.90 < np.mean(np.abs(z) < 1.96) < 0.99
+    assert abs(z.mean()) < 0.25
+    assert error_m.std() == pytest.approx(np.sqrt(np.mean(sigma_m**2)), rel=0.25)
+
+
+def test_tilt_already_applied_to_the_points_does_not_change_adjusted_heights():
+    rng = np.random.default_rng(4)
+    _, root = dense_prior(PARAMS)
+    stable, cells = random_sites(5, 300), random_sites(6, 200)
+    raw_m = stable.matrix() @ (root @ rng.normal(size=len(root))) + rng.normal(0, 0.01, 300)
+    applied_rad = np.radians(rng.normal(0, 0.003, (3, PARAMS.line_groups)))
+
+    def rise_by_rotation(sites):
+        """Rise of rotated points above the slope they were on [m], from rotation matrices."""
+        original_m = np.stack(sites.offset_m, axis=-1)
+        shift_m = Rotation.from_rotvec(applied_rad[:, sites.line].T).apply(original_m) - original_m
+        return shift_m[:, 2] - sites.east * shift_m[:, 0] - sites.north * shift_m[:, 1]
+
+    plain = adjust_scan(stable.patches(raw_m), NO_TILT, knot_prior(PARAMS), None)
+    rotated = adjust_scan(
+        stable.patches(raw_m + rise_by_rotation(stable)), applied_rad, knot_prior(PARAMS), None
+    )
+    assert np.abs(rise_by_rotation(cells)).max() > 0.1
+    # Corrected height: the rise by the rotation minus the effect of the state beyond that rotation.
+    corrected_m = rise_by_rotation(cells) - (
+        rotated.effect(cells.jacobian()) - joint.tilt_effect(cells.jacobian(), applied_rad)
+    )
+    assert corrected_m == pytest.approx(-plain.effect(cells.jacobian()), abs=2e-4)
+
+
+def test_log_without_ground_gives_its_tilt_with_the_uncertainty_of_the_sensor():
+    covariance, _ = dense_prior(PARAMS)
+    lines, error_modes = log_design(), sensor_error_modes()
+    state = np.zeros(len(covariance))
+    state[0] = np.radians(0.01)
+    log = LineInclination(lines @ state, np.full(PARAMS.line_groups, LOG_SIGMA_RAD**-2), error_modes)
+    adjustment = adjust_scan(no_patches(), NO_TILT, knot_prior(PARAMS), log)
+    assert lines @ adjustment.estimate == pytest.approx(lines @ state, rel=0.2)
+    posterior_rad, prior_rad = (
+        np.sqrt(np.einsum("ij,jk,ik->i", lines, c, lines)) for c in (adjustment.covariance, covariance)
+    )
+    noise_rad = LOG_SIGMA_RAD / math.sqrt(PARAMS.line_groups)
+    assert (posterior_rad > np.radians(0.0015)).all()  # the bias of the sensor
+    assert (posterior_rad > noise_rad).all()
+    assert (posterior_rad < 0.5 * prior_rad).all()
+    cells, stable = random_sites(7, 200), random_sites(8, 300)
+    with_ground = adjust_scan(stable.patches(np.zeros(300)), NO_TILT, knot_prior(PARAMS), log)
+    assert np.median(height_sigma(adjustment, cells)) > 3 * np.median(height_sigma(with_ground, cells))
+    assert adjustment_warnings(adjustment, COMPONENTS) == ["no stable ground observed"]
+
+
+def reference_of(sigma_rad):
+    """Shared parameters of a reference with errors in tilt only, global and from knot to knot."""
+    names, tilt_slice = PARAMS.names, slice(GLOBAL_COUNT, GLOBAL_COUNT + PARAMS.sight_tilt_knots)
+    covariance = np.zeros((len(names),) * 2)
+    covariance[[0, 1], [0, 1]] = sigma_rad**2
+    knots = np.arange(PARAMS.sight_tilt_knots)
+    covariance[tilt_slice, tilt_slice] = sigma_rad**2 * np.exp(-np.abs(np.subtract.outer(knots, knots)) / 20)
+    return SharedParameters(names, PARAMS.units, np.zeros(len(names)), covariance, np.zeros(len(names)))
+
+
+@pytest.mark.integration
+@pytest.mark.parametrize(("sigma_deg", "min_rms_z"), [(0.002, 1.3), (0.004, 2.0)])
+def test_sigma_includes_the_tilt_error_of_the_reference_that_the_log_cannot_observe(sigma_deg, min_rms_z):
+    """With the tilt modes of the reference z is about 1; without them sigma is too small."""
+    lines, reference = log_design(), reference_of(math.radians(sigma_deg))
+    state_prior = knot_prior(PARAMS).relative_to(reference)
+    root = np.linalg.cholesky(reference.covariance + 1e-24 * np.eye(len(PARAMS.names)))
+    with_modes, without_modes = [], []
+    for seed in range(60):
+        rng = np.random.default_rng(seed)
+        state = dense_prior(PARAMS)[1] @ rng.normal(size=len(dense_prior(PARAMS)[0]))
+        log = simulated_log(state, rng)
+        state -= propagation.expand_rows(PARAMS, root @ rng.normal(size=(len(root), 1)))[:, 0]
+        for ratios, used_log in (
+            (with_modes, log.relative_to(PARAMS, reference.covariance)),
+            (without_modes, log),
+        ):
+            adjustment = adjust_scan(no_patches(), NO_TILT, state_prior, used_log)
+            sigma_rad = np.sqrt(np.einsum("ij,jk,ik->i", lines, adjustment.covariance, lines))
+            ratios.append(lines @ (adjustment.estimate - state) / sigma_rad)
+    assert 0.85 < np.sqrt(np.mean(np.square(with_modes))) < 1.15
+    assert np.sqrt(np.mean(np.square(without_modes))) > min_rms_z
+
+
+@pytest.mark.integration
+def test_sigma_of_the_predicted_log_matches_its_errors():
+    """With stable ground and a tilted reference: the scan's tilt is the sum of both."""
+    lines, stable, reference = log_design(), random_sites(3, 400), reference_of(math.radians(0.003))
+    state_prior, ratios = knot_prior(PARAMS).relative_to(reference), []
+    root = np.linalg.cholesky(reference.covariance + 1e-24 * np.eye(len(PARAMS.names)))
+    for seed in range(30):
+        rng = np.random.default_rng(seed)
+        scan_state = dense_prior(PARAMS)[1] @ rng.normal(size=len(dense_prior(PARAMS)[0]))
+        state = scan_state - propagation.expand_rows(PARAMS, root @ rng.normal(size=(len(root), 1)))[:, 0]
+        residual_m = stable.matrix() @ state + rng.normal(0, 0.01, 400)
+        log = simulated_log(scan_state, rng).relative_to(PARAMS, reference.covariance)
+        adjustment = adjust_scan(stable.patches(residual_m), NO_TILT, state_prior, log)
+        sigma_rad = np.sqrt(np.diag(adjustment.posterior.sight_tilt_covariance(log)))
+        ratios.append((adjustment.predicted_log_rad - lines @ scan_state) / sigma_rad)
+    assert np.sqrt(np.mean(np.square(ratios))) == pytest.approx(1, abs=0.3)
+
+
+def test_line_groups_without_log_samples_have_no_influence():
+    tilt_rad = np.full(PARAMS.line_groups, 1e-4)
+    weight = np.where(np.arange(PARAMS.line_groups) < 100, LOG_SIGMA_RAD**-2, 0.0)
+    invalid_rad = np.where(weight > 0, tilt_rad, 0.3)
+    valid, invalid = (
+        adjust_scan(
+            no_patches(), NO_TILT, knot_prior(PARAMS), LineInclination(log_rad, weight, sensor_error_modes())
+        )
+        for log_rad in (tilt_rad, invalid_rad)
+    )
+    assert np.array_equal(valid.estimate, invalid.estimate)
+
+
+def test_posterior_without_observations_is_the_prior():
+    covariance = knot_prior(PARAMS).line_covariance()
+    adjustment = adjust_scan(no_patches(), NO_TILT, knot_prior(PARAMS), None)
+    assert np.abs(adjustment.estimate).max() == 0.0
+    sigma = np.sqrt(np.diag(covariance))
+    scale = np.outer(sigma, sigma)
+    assert_allclose(adjustment.covariance / scale, covariance / scale, rtol=0, atol=1e-6)
+
+
+def test_smooth_snowfall_hardly_biases_the_state_if_stable_ground_is_spread_out():
+    stable = random_sites(41, 100)
+    for seed in range(4):
+        error_m, sigma_m, adjustment = simulate(seed, stable, moving=1000, change_m=smooth_snow(0.4))
+        assert adjustment.change_step_m >= 0.05
+        assert np.abs(error_m).max() < 0.06
+        assert np.sqrt(np.mean(error_m**2)) < 0.02
+        assert np.sqrt(np.mean((error_m / sigma_m) ** 2)) < 2.0
+
+
+@pytest.mark.integration
+@pytest.mark.parametrize(
+    ("stable", "log"),
+    [(random_sites(42, 60, sector_deg=(0, 10)), False), (random_sites(43, 1, sector_deg=(0, 10)), True)],
+    ids=["a distant ridge", "the log only"],
+)
+def test_sigma_covers_the_errors_during_snowfall_with_little_stable_ground(stable, log):
+    z, _, _ = standardised_errors(12, stable, log=log, moving=800, change_m=smooth_snow(0.4))
+    assert np.sqrt(np.mean(z**2)) < 2.0
+
+
+def test_an_unchanged_glacier_improves_the_adjustment():
+    stable = random_sites(44, 60, sector_deg=(0, 10))
+    with_glacier, without_glacier = (simulate(45, stable, moving=moving) for moving in (1000, 0))
+    assert with_glacier[2].change_step_m <= 0.005
+    assert np.median(with_glacier[1]) < 0.3 * np.median(without_glacier[1])
+    assert np.sqrt(np.mean(with_glacier[0] ** 2)) < 0.015
+
+
+def adjust_with_outliers(seed, count, share):
+    """Adjust to stable ground of which a random share is a metre too high."""
+    rng = np.random.default_rng(seed)
+    _, root = dense_prior(PARAMS)
+    stable, cells = random_sites(seed + 51, count), random_sites(seed + 500, 200)
+    state = root @ rng.normal(size=len(root))
+    residual_m = stable.matrix() @ state + rng.normal(0, 0.01, count)
+    outlier = rng.uniform(size=count) < share
+    adjustment = adjust_scan(stable.patches(residual_m + outlier), NO_TILT, knot_prior(PARAMS), None)
+    return (
+        cells.matrix() @ state - adjustment.effect(cells.jacobian()),
+        height_sigma(adjustment, cells),
+        adjustment,
+        outlier,
+    )
+
+
+@pytest.mark.integration
+def test_ten_percent_outliers_of_a_metre_are_rejected():
+    error_m, sigma_m, adjustment, outlier = zip(
+        *(adjust_with_outliers(seed, 1000, 0.1) for seed in range(8)), strict=True
+    )
+    clean_m = np.array([adjust_with_outliers(seed, 1000, 0.0)[0] for seed in range(8)])
+    z = np.array(error_m) / np.array(sigma_m)
+    assert np.sqrt(np.mean(z**2)) < 1.2
+    assert np.median(np.abs(error_m)) < 1.5 * np.median(np.abs(clean_m))
+    for adjusted, rejected in zip(adjustment, outlier, strict=True):
+        assert adjusted.stable_weights[rejected].max() == 0.0
+        assert np.median(adjusted.stable_weights[~rejected]) > 0.9
+        assert adjustment_warnings(adjusted, COMPONENTS) == []
+
+
+def test_inconsistent_stable_ground_gives_a_warning():
+    _, _, adjustment, _ = adjust_with_outliers(53, 400, 0.4)
+    assert any("is inconsistent" in reason for reason in adjustment_warnings(adjustment, COMPONENTS))
+
+
+@pytest.mark.parametrize(
+    ("index", "size", "word"), [(0, 0.0006, "tilted"), (2, 0.00011, "rotated"), (5, 0.013, "shifted")]
+)
+def test_a_moved_scanner_gives_a_warning(index, size, word):
+    covariance, _ = dense_prior(PARAMS)
+    at_rest = adjust_scan(random_sites(54, 400).patches(np.zeros(400)), NO_TILT, knot_prior(PARAMS), None)
+    assert adjustment_warnings(at_rest, COMPONENTS) == []
+    for share, expected in ((0.5, []), (1.0, [word])):
+        moved = np.zeros(len(covariance))
+        moved[index] = share * size
+        reasons = adjustment_warnings(replace(at_rest, estimate=moved), COMPONENTS)
+        assert [word for reason in reasons if word in reason] == expected
+        assert len(reasons) == len(expected)
+
+
+def test_holdout_patches_have_no_influence():
+    rng = np.random.default_rng(60)
+    stable = random_sites(61, 300)
+    ground_class = rng.choice([GroundClass.STABLE, GroundClass.HOLDOUT], 300, p=[0.9, 0.1])
+    residual_m = rng.normal(0, 0.01, 300)
+    adjustment, repeated = (
+        adjust_scan(stable.patches(values_m, ground_class=ground_class), NO_TILT, knot_prior(PARAMS), None)
+        for values_m in (residual_m, residual_m + 5.0 * (ground_class == GroundClass.HOLDOUT))
+    )
+    assert np.array_equal(adjustment.estimate, repeated.estimate)
+    assert np.array_equal(adjustment.covariance, repeated.covariance)
+    assert len(adjustment.stable_weights) == np.count_nonzero(ground_class == GroundClass.STABLE)
+
+
+def test_an_avalanche_does_not_change_heights_elsewhere():
+    rng = np.random.default_rng(70)
+    _, root = dense_prior(PARAMS)
+    state = root @ rng.normal(size=len(root))
+    stable, glacier, cells = random_sites(71, 100), random_sites(72, 3000, steep=0.3), random_sites(73, 400)
+    path = (np.abs(glacier.line - 100) < 4) & (np.abs(glacier.range_bin - 20) < 3)
+    assert 8 <= np.count_nonzero(path) <= 30
+    plain_m = glacier.matrix() @ state + rng.normal(0, 0.01, 3000)
+    patches = stable.patches(stable.matrix() @ state + rng.normal(0, 0.01, 100))
+    adjustment, with_avalanche = (
+        adjust_scan(
+            concatenate(patches, glacier.patches(values_m, ground_class=GroundClass.MOVING)),
+            NO_TILT,
+            knot_prior(PARAMS),
+            None,
+        )
+        for values_m in (plain_m, plain_m + 2.0 * path)
+    )
+    difference_m = with_avalanche.effect(cells.jacobian()) - adjustment.effect(cells.jacobian())
+    elsewhere = np.abs(cells.line - 100) > 12
+    assert np.abs(difference_m[elsewhere]).max() < 0.005
+    assert with_avalanche.change_step_m <= 0.005
+
+
+def simulate_thin_snow(seed, change_m):
+    """Standardised errors and errors, where glacier and all but steep rock changed by `change_m`."""
+    rng = np.random.default_rng(seed)
+    _, root = dense_prior(PARAMS)
+    state = root @ rng.normal(size=len(root))
+    stable, glacier, cells = (
+        random_sites(seed + 90, 1500, steep=2.0),
+        random_sites(seed + 95, 1500, steep=0.3),
+        random_sites(99, 200),
+    )
+    snow_covered = np.hypot(stable.east, stable.north) < np.tan(np.radians(40)) if change_m > 0 else 0.0
+    patches = concatenate(
+        stable.patches(stable.matrix() @ state + rng.normal(0, 0.003, 1500) + change_m * snow_covered, 0.003),
+        glacier.patches(
+            glacier.matrix() @ state + rng.normal(0, 0.003, 1500) + change_m, 0.003, GroundClass.MOVING
+        ),
+    )
+    adjustment = adjust_scan(patches, NO_TILT, knot_prior(PARAMS), None)
+    error_m = cells.matrix() @ state - adjustment.effect(cells.jacobian())
+    return error_m / height_sigma(adjustment, cells), error_m
+
+
+def test_thin_snow_on_rock_is_not_mistaken_for_a_shift_of_the_scanner():
+    z, error_m = (
+        np.array(values)
+        for values in zip(*(simulate_thin_snow(seed, 0.006) for seed in range(6)), strict=True)
+    )
+    assert np.abs(error_m.mean(axis=1)).max() < 0.003  # without the snow depths: 6 mm
+    assert np.sqrt(np.mean(z**2)) < 1.3
+    sigma_m, sigma_melt_m = (
+        np.median(np.divide(*simulate_thin_snow(7, change)[::-1])) for change in (0.006, -0.006)
+    )
+    assert sigma_melt_m < sigma_m  # without a rise of the glacier the snow depths are fixed
+
+
+def test_the_uncertainty_of_the_reference_is_added_to_the_prior():
+    p = len(PARAMS.names)
+    root = np.random.default_rng(80).normal(size=(p, p)) * 1e-5
+    reference = SharedParameters(PARAMS.names, PARAMS.units, np.zeros(p), root @ root.T, np.zeros(p))
+    state_prior = knot_prior(PARAMS)
+    assert state_prior.relative_to(None) is state_prior
+    cells = random_sites(81, 50)
+    design = cells.matrix()
+    added = state_prior.relative_to(reference).line_covariance() - state_prior.line_covariance()
+    added_m2 = np.einsum("ij,jk,ik->i", design, added, design)
+    assert added_m2 == pytest.approx(cells.jacobian().variance(reference), rel=1e-6)
+    relocated = replace(reference, names=(*PARAMS.names[:-1], "parameter of another position"))
+    relocated_covariance = state_prior.relative_to(relocated).line_covariance()
+    assert_allclose(relocated_covariance, 2 * state_prior.line_covariance(), rtol=1e-12)
+
+
+def test_prior_on_knots_matches_the_prior_by_line_group():
+    for params in (PARAMS, FULL_CIRCLE):
+        covariance, _ = dense_prior(params)
+        sigma = np.sqrt(np.diag(covariance))
+        difference = np.abs(knot_prior(params).line_covariance() - covariance) / np.outer(sigma, sigma)
+        assert np.diag(difference).max() < 1e-12
+        assert np.median(difference) < 2e-4
+        seam = 15 if params.full_circle else 0  # line groups where the head starts and stops
+        lines = slice(9 + seam, 9 + params.line_groups - seam)
+        assert difference[lines, lines].max() < 0.01
+
+
+RIDGE, GLACIER = random_sites(1, 40, sector_deg=(0, 5)), random_sites(2, 900, steep=0.3)
+BOXES = [GLACIER.line // 50 == part for part in range(4)] + [np.ones(900, bool)]
+
+
+def glacier_change(seed):
+    """Random change of the glacier [m], 20 mm at knots every 4° and 240 m, bilinear between them."""
+    knots = np.random.default_rng(seed).normal(0, 0.02, (13, 14))
+    u, v = (GLACIER.line + 0.5) / 20, (GLACIER.range_bin + 0.5) / 3
+    i, j = u.astype(int), v.astype(int)
+    u, v = u - i, v - j
+    near_m = (1 - u) * ((1 - v) * knots[i, j] + v * knots[i, j + 1])
+    return near_m + u * ((1 - v) * knots[i + 1, j] + v * knots[i + 1, j + 1]) + knots[-1, -1]
+
+
+def glacier_mean_errors(seed, change_m):
+    """Errors of box means over the glacier [m], and the shared parameters of the adjustment."""
+    rng = np.random.default_rng(seed)
+    _, root = dense_prior(PARAMS)
+    state = root @ rng.normal(size=len(root))
+    ridge_m, glacier_m = (
+        sites.matrix() @ state + rng.normal(0, 0.01, len(sites.line)) for sites in (RIDGE, GLACIER)
+    )
+    patches = concatenate(
+        RIDGE.patches(ridge_m), GLACIER.patches(glacier_m + change_m, ground_class=GroundClass.MOVING)
+    )
+    adjustment = adjust_scan(patches, NO_TILT, knot_prior(PARAMS), None)
+    error_m = GLACIER.matrix() @ state - adjustment.effect(GLACIER.jacobian())
+    return np.array([error_m[box].mean() for box in BOXES]), adjustment.to_shared_parameters()
+
+
+def difference_z_std(draws, change_of):
+    """Standard deviation of z of differences of two scans: errors independent, and with common errors."""
+    height_errors = GLACIER.jacobian()
+    effect = np.array([height_errors.aggregate(box / box.sum()) for box in BOXES])
+    independent, with_common = [], []
+    for draw in range(draws):
+        (first_m, first), (second_m, second) = (
+            glacier_mean_errors(2 * draw + n, change_m) for n, change_m in enumerate(change_of(draw))
+        )
+        variance_m2 = sum(
+            np.array(
+                [
+                    propagation.aggregate_variance(box / box.sum(), np.zeros(900), height_errors, parameters_)
+                    for box in BOXES
+                ]
+            )
+            for parameters_ in (first, second)
+        )
+        common_m2 = np.sum((effect @ cross_covariance(first, second)) * effect, axis=1)
+        independent.append((first_m - second_m) / np.sqrt(variance_m2))
+        with_common.append((first_m - second_m) / np.sqrt(variance_m2 - 2 * common_m2))
+    return np.std(independent), np.std(with_common)
+
+
+@pytest.mark.integration
+def test_common_errors_of_equal_change_cancel_in_a_difference():
+    independent, with_common = difference_z_std(
+        25, lambda seed: (glacier_change(seed), 0.9 * glacier_change(seed))
+    )
+    assert independent < 0.65
+    assert 1.25 * independent < with_common < 1.2
+
+
+@pytest.mark.integration
+def test_common_errors_of_opposite_change_add_up_in_a_difference():
+    independent, with_common = difference_z_std(
+        25, lambda seed: (glacier_change(seed), -glacier_change(seed))
+    )
+    assert independent > 1.2
+    assert 0.8 < with_common < 1.2
+
+
+@pytest.mark.integration
+def test_unrelated_change_leaves_independent_errors_in_a_difference():
+    independent, with_common = difference_z_std(
+        25, lambda seed: (glacier_change(seed), glacier_change(seed + 1000))
+    )
+    assert 0.8 < independent < 1.2
+    assert 0.8 < with_common < 1.2

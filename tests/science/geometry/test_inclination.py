@@ -1,0 +1,189 @@
+"""Inclination log: cleaning, cyclic error, clock offset, low-pass filter and relative tilt."""
+
+import math
+
+import numpy as np
+import pytest
+from scipy import signal
+
+from station.quantities import AzimuthTrack, InclinationLog
+from station.science.geometry import inclination
+from station.science.geometry.inclination import NO_CYCLIC_ERROR, CyclicError
+
+STEP = math.radians(0.001)
+NOISE = math.radians(0.008)
+RANGE = math.radians(10.0)
+AZIMUTH_TRACK = AzimuthTrack(np.linspace(0.0, 920.0, 200), np.radians(np.linspace(10.0, 130.0, 200)))
+CYCLIC_ERROR = CyclicError((0.001, math.radians(0.04), 0.0), (-0.002, 0.0, math.radians(0.03)))
+
+
+def inclination_log(roll_rad, pitch_rad, time_s=None):
+    time_s = np.arange(len(roll_rad), dtype=float) if time_s is None else time_s
+    return InclinationLog(time_s, roll_rad, pitch_rad)
+
+
+def test_clean_removes_spikes_invalid_values_and_times_that_do_not_increase():
+    roll = np.full(100, 0.01)
+    roll[20] = 0.02  # a spike
+    roll[30] = math.nan
+    roll[40] = 3.0
+    time_s = np.arange(100.0)
+    time_s[50] = 49.0  # a duplicate
+    time_s[60] = 10.0  # back in time
+    cleaned, dropped = inclination.clean(inclination_log(roll, np.zeros(100), time_s), RANGE)
+    assert dropped == 5
+    assert np.all(np.diff(cleaned.time_s) > 0)
+    assert np.all(cleaned.roll_rad == 0.01)
+
+
+def test_clean_of_a_log_without_valid_rows():
+    cleaned, dropped = inclination.clean(inclination_log(np.array([math.nan]), np.zeros(1)), RANGE)
+    assert (len(cleaned.time_s), dropped) == (0, 1)
+
+
+def test_blackman_window_noise_gain_and_cutoff():
+    """Noise gain sqrt(1.73 / N) = 0.13 for 101 samples, -3 dB frequency 0.82 / N: equations.md, 2.8."""
+    weights = inclination.blackman(101)
+    assert weights.sum() == pytest.approx(1.0)
+    assert math.sqrt(np.sum(weights**2)) == pytest.approx(0.13, abs=0.002)
+    power = abs(np.sum(weights * np.exp(-2j * math.pi * 0.82 / 101 * np.arange(101)))) ** 2
+    assert power == pytest.approx(0.5, abs=0.02)
+
+
+def test_low_pass_preserves_a_line_to_its_ends():
+    line = 0.5 + 0.001 * np.arange(400)
+    assert inclination.low_pass(line, inclination.blackman(101)) == pytest.approx(line, abs=0.006)
+    assert inclination.low_pass(np.ones(50), inclination.blackman(41)) == pytest.approx(np.ones(50))
+
+
+def test_window_length_follows_the_spectrum():
+    """Motion up to 0.02 or 0.1 Hz under white noise: the cut-off lies just above the motion."""
+    rng = np.random.default_rng(4)
+    white = rng.normal(0, NOISE, 2400)
+    motion = rng.normal(0, 1, 2400)
+    slow, fast = (
+        20 * NOISE * signal.sosfilt(signal.butter(6, hz, fs=1.0, output="sos"), motion) for hz in (0.02, 0.1)
+    )
+    long = inclination.window_length(slow + white, 1.0, None)
+    short = inclination.window_length(fast + white, 1.0, None)
+    assert 0.82 / long == pytest.approx(0.03, abs=0.02)
+    assert 0.82 / short == pytest.approx(0.15, abs=0.05)
+    assert inclination.window_length(white, 1.0, 0.00812) == 101
+
+
+def test_cyclic_error_is_recovered_from_one_turn():
+    rng = np.random.default_rng(2)
+    track = AzimuthTrack(np.array([0.0, 2770.0]), np.array([0.0, 2 * math.pi]))
+    time_s = np.arange(0.0, 2770.0)
+    roll, pitch = CYCLIC_ERROR.at(inclination.head_azimuth(track, time_s))
+    fitted = inclination.fit_cyclic_error(
+        inclination_log(
+            roll + rng.normal(0, NOISE, len(roll)), pitch + rng.normal(0, NOISE, len(roll)), time_s
+        ),
+        track,
+        NOISE,
+    )
+    assert np.degrees(fitted.roll_rad) == pytest.approx(np.degrees(CYCLIC_ERROR.roll_rad), abs=0.001)
+    assert np.degrees(fitted.pitch_rad) == pytest.approx(np.degrees(CYCLIC_ERROR.pitch_rad), abs=0.001)
+
+
+def test_clock_offset_of_a_tilted_mount():
+    """A cyclic error of 5° determines the log's clock to well under a second."""
+    rng = np.random.default_rng(3)
+    cyclic_error = CyclicError((0.0, math.radians(5), 0.0), (0.0, 0.0, math.radians(5)))
+    time_s = np.arange(0.0, 920.0)
+    roll, pitch = cyclic_error.at(inclination.head_azimuth(AZIMUTH_TRACK, time_s))
+    log = inclination_log(roll + rng.normal(0, NOISE, 920), pitch + rng.normal(0, NOISE, 920), time_s + 3.3)
+    offset_s, sigma_s = inclination.clock_offset(log, AZIMUTH_TRACK, cyclic_error, NOISE)
+    assert offset_s == pytest.approx(3.3, abs=0.2)
+    assert sigma_s < 0.3  # includes drift of the mount
+
+
+def test_clock_offset_of_a_minute_overrules_the_prior():
+    rng = np.random.default_rng(5)
+    cyclic_error = CyclicError((0.0, math.radians(5), 0.0), (0.0, 0.0, math.radians(5)))
+    time_s = np.arange(-80.0, 1000.0)
+    roll, pitch = cyclic_error.at(inclination.head_azimuth(AZIMUTH_TRACK, time_s))
+    noise = rng.normal(0, NOISE, (2, len(time_s)))
+    offset_s, sigma_s = inclination.clock_offset(
+        inclination_log(roll + noise[0], pitch + noise[1], time_s + 60), AZIMUTH_TRACK, cyclic_error, NOISE
+    )
+    assert offset_s == pytest.approx(60, abs=0.4)
+    assert sigma_s < 0.3
+
+
+@pytest.mark.integration
+def test_clock_offset_sigma_is_calibrated_while_the_mount_moves():
+    """Cyclic error of 0.5°; the mount drifts by 0.0018° in the scan of the SOP and in this one: z of one."""
+    rng = np.random.default_rng(6)
+    cyclic_error = CyclicError((0.0, math.radians(0.5), 0.0), (0.0, 0.0, math.radians(0.5)))
+    time_s = np.arange(0.0, 920.0)
+    azimuth_rad = inclination.head_azimuth(AZIMUTH_TRACK, time_s)
+
+    def drift_and_noise():
+        steps = rng.normal(0, math.radians(0.0018) * math.sqrt(2 / 300), (2, 920))
+        drift = signal.lfilter([1], [1, -math.exp(-1 / 300)], steps, axis=1)
+        return drift + rng.normal(0, NOISE, (2, 920))
+
+    z = []
+    for _ in range(60):
+        cyclic_tilt = np.stack(cyclic_error.at(azimuth_rad))
+        fitted = inclination.fit_cyclic_error(
+            inclination_log(*(cyclic_tilt + drift_and_noise()), time_s), AZIMUTH_TRACK, NOISE
+        )
+        delay_s = rng.uniform(-5, 5)
+        log = inclination_log(*(cyclic_tilt + drift_and_noise()), time_s + delay_s)
+        offset_s, sigma_s = inclination.clock_offset(log, AZIMUTH_TRACK, fitted, NOISE)
+        z.append((offset_s - delay_s) / sigma_s)
+    assert 0.5 < np.sqrt(np.mean(np.square(z))) < 1.3
+
+
+def test_saturated_samples_are_removed_and_counted():
+    roll = np.full(100, math.radians(3.0))
+    roll[40:] = RANGE
+    log = inclination_log(roll, np.zeros(100))
+    assert inclination.saturated_fraction(log, RANGE) == pytest.approx(0.6)
+    cleaned, dropped = inclination.clean(log, RANGE)
+    assert (len(cleaned.time_s), dropped) == (40, 60)
+    assert inclination.saturated_fraction(inclination_log(np.full(50, math.nan), np.zeros(50)), RANGE) == 0.0
+
+
+def test_clock_offset_without_cyclic_error_is_the_prior():
+    rng = np.random.default_rng(3)
+    log = inclination_log(*rng.normal(0, NOISE, (2, 900)))
+    offset_s, sigma_s = inclination.clock_offset(log, AZIMUTH_TRACK, NO_CYCLIC_ERROR, NOISE)
+    assert offset_s == pytest.approx(0.0, abs=1e-9)
+    assert sigma_s == pytest.approx(2.5, rel=1e-3)
+
+
+def test_tilt_contained_in_the_sop_is_not_applied_again():
+    """For the scan that the SOP was solved from, without motion, the relative tilt is zero."""
+    time_s = np.arange(0.0, 920.0)
+    log = inclination_log(*CYCLIC_ERROR.at(inclination.head_azimuth(AZIMUTH_TRACK, time_s)), time_s)
+    cyclic_error = inclination.fit_cyclic_error(log, AZIMUTH_TRACK, NOISE)
+    record = inclination.relative_tilt(log, AZIMUTH_TRACK, cyclic_error, NOISE)
+    assert np.abs(record.tilt.roll_rad).max() < math.radians(1e-4)
+    assert np.abs(record.tilt.pitch_rad).max() < math.radians(1e-4)
+
+
+def test_relative_tilt_passes_drift_and_removes_noise():
+    rng = np.random.default_rng(8)
+    time_s = np.arange(0.0, 920.0)
+    drift = math.radians(0.006) * time_s / 920
+    roll, pitch = CYCLIC_ERROR.at(inclination.head_azimuth(AZIMUTH_TRACK, time_s))
+    log = inclination_log(roll + drift + rng.normal(0, NOISE, 920), pitch + rng.normal(0, NOISE, 920), time_s)
+    record = inclination.relative_tilt(log, AZIMUTH_TRACK, CYCLIC_ERROR, NOISE)
+    middle = slice(60, -60)
+    assert np.degrees(record.tilt.roll_rad - drift)[middle].std() < 0.0015
+    assert np.degrees(record.noise_rad) == pytest.approx(0.008, abs=0.001)
+    error = np.degrees(np.concatenate([record.tilt.roll_rad - drift, record.tilt.pitch_rad]))
+    assert error.std() == pytest.approx(np.degrees(record.filtered_noise_rad), rel=0.5)
+
+
+def test_mean_tilt_of_a_real_log(shared_data):
+    table = np.loadtxt(shared_data / "riegl" / "140123_202748-incl.txt", delimiter=",", skiprows=1)
+    log = InclinationLog(table[:, 0], *np.radians(table[:, 1:].T))
+    cleaned, dropped = inclination.clean(log, RANGE)
+    assert dropped == 0
+    record = inclination.relative_tilt(cleaned, None, NO_CYCLIC_ERROR, NOISE)
+    assert math.degrees(record.mean_roll_rad) == pytest.approx(-0.2868, abs=0.001)

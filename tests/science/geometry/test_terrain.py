@@ -1,0 +1,111 @@
+"""Gradients, normals and smoothing of a surface, and its height between the cell centres."""
+
+import math
+
+import numpy as np
+import pytest
+from scipy import ndimage
+
+from station.quantities import Grid, Reference
+from station.science.geometry import beam, terrain
+from station.science.gridding import significance
+
+GRID = Grid(0.0, 50.0, 1.0, 40, 50)
+
+
+def plane(east, north):
+    x_m, y_m = np.meshgrid(GRID.x_m, GRID.y_m)
+    return 2000 + east * x_m + north * y_m
+
+
+def test_normal_from_slope_and_aspect_equals_that_from_the_gradient():
+    """Voordendag Eq. 14 against (-dz/dx, -dz/dy, 1), for a slope that falls towards the south-east."""
+    slope, aspect = math.radians(30.0), math.radians(135.0)
+    east, north = -math.tan(slope) * math.sin(aspect), -math.tan(slope) * math.cos(aspect)
+    normal = terrain.normal(np.array(slope), np.array(aspect))
+    gradient_form = np.array([-east, -north, 1.0])
+    assert normal == pytest.approx(gradient_form / np.linalg.norm(gradient_form))
+    assert beam.cos_incidence(np.array([0.0, 0.0, -1.0]), normal) == pytest.approx(math.cos(slope))
+
+
+def test_smooth_gradient_of_a_plane_with_gaps():
+    surface = plane(0.4, -0.1)
+    surface[10:14, 20:23] = np.nan
+    east, north = terrain.smooth_gradient(surface, 1.0)
+    known = np.isfinite(east)
+    assert known[11, 21]
+    assert east[known] == pytest.approx(0.4, abs=1e-4)
+    assert north[known] == pytest.approx(-0.1, abs=1e-4)
+
+
+def test_smooth_equals_a_normalised_gaussian_filter_on_all_and_on_some_rows():
+    rng = np.random.default_rng(3)
+    values = rng.normal(size=(41, 33)).astype(np.float32)
+    values[rng.uniform(size=values.shape) < 0.3] = np.nan
+    values[20:35, 5:20] = np.nan
+    actual = terrain.smooth(values, 1.5)
+    known = np.isfinite(values)
+    total, weight = (
+        ndimage.gaussian_filter(v, 1.5, truncate=2.0, mode="constant")
+        for v in (np.where(known, values, 0.0).astype(float), known.astype(float))
+    )
+    assert np.array_equal(np.isfinite(actual), weight > 1e-3)
+    assert np.isnan(actual).any()
+    near = weight > 1e-3
+    assert actual[near] == pytest.approx((total[near] / weight[near]), abs=2e-5)
+    for rows in (slice(4, 30), slice(3, 41, 5), slice(0, 41, 50)):
+        assert np.array_equal(terrain.smooth(values, 1.5, rows), actual[rows], equal_nan=True)
+        for part, whole in zip(
+            terrain.smooth_gradient(values, 2.0, rows=rows), terrain.smooth_gradient(values, 2.0), strict=True
+        ):
+            assert np.array_equal(part, whole[rows], equal_nan=True)
+
+
+@pytest.mark.parametrize("shape", [(1, 1), (2, 9), (40, 33)])
+def test_gradient_at_cells_equals_smooth_gradient(shape):
+    rng = np.random.default_rng(4)
+    surface = rng.normal(size=shape).astype(np.float32)
+    surface[rng.uniform(size=shape) < 0.5] = np.nan
+    surface[20:, 15:] = np.nan
+    row, column = np.nonzero(rng.uniform(size=shape) < 0.9)
+    actual = terrain.gradient_at(surface, 2.0, row, column)
+    for part, whole in zip(actual, terrain.smooth_gradient(surface, 2.0), strict=True):
+        assert part == pytest.approx(whole[row, column], abs=1e-6, nan_ok=True)
+
+
+def test_bilinear_surface_is_exact_on_a_plane_up_to_its_edge():
+    elevation_m = plane(0.5, 0.25)
+    elevation_m[20:, 30:] = np.nan
+    bilinear = terrain.bilinear_surface(Reference.from_elevation(GRID, "1", elevation_m))
+    x_m, y_m = np.random.default_rng(0).uniform([[0.0], [0.01]], [[39.99], [50.0]], (2, 4000))
+    known = bilinear.known[(50 - y_m).astype(int), x_m.astype(int)]
+    height_m, east, north = bilinear.height_and_gradient(x_m[known], 50 - y_m[known])
+    assert height_m == pytest.approx(2000 + 0.5 * x_m[known] + 0.25 * y_m[known], abs=1e-4)
+    assert east == pytest.approx(0.5, abs=1e-3)
+    assert north == pytest.approx(0.25, abs=1e-3)
+
+
+def test_cell_means_of_a_curved_surface_and_nodes_from_them():
+    """A paraboloid of radius 1 km on 10 m cells: means differ from nodes by 12.5 mm per direction."""
+    rng = np.random.default_rng(2)
+    grid = Grid(0.0, 300.0, 10.0, 30, 30)
+    nodes = np.broadcast_to(grid.x_m, grid.shape) ** 2 / 2000
+    surface = terrain.BilinearSurface(grid, 0.0, nodes.astype(np.float32), np.ones(grid.shape, np.int32))
+    column, row = rng.uniform(14, 15, (2, 200_000))
+    assert terrain.cell_means(nodes)[14, 14] == pytest.approx(
+        surface.height_and_gradient(column, row)[0].mean(), abs=1e-3
+    )
+    assert terrain.cell_means(nodes)[14, 14] - nodes[14, 14] == pytest.approx(0.0125, abs=1e-6)
+    means = nodes + 1.0
+    assert terrain.cell_means(terrain.nodes_from_means(means))[3:-3, 3:-3] == pytest.approx(
+        means[3:-3, 3:-3], abs=1e-9
+    )
+    means[10, 10] = np.nan
+    assert np.array_equal(np.isnan(terrain.nodes_from_means(means)), np.isnan(means))
+
+
+def test_significance_at_the_95_percent_level():
+    sigma = np.full(100_000, 0.1, np.float32)
+    noise = np.random.default_rng(1).normal(0, 0.1, 100_000).astype(np.float32)
+    assert significance.significant(noise, sigma).mean() == pytest.approx(0.05, abs=0.003)
+    assert not significance.significant(np.array([np.nan], np.float32), sigma[:1])[0]

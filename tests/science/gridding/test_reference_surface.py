@@ -1,0 +1,99 @@
+"""Update of a reference from more scans: stable ground improves, changed ground stays."""
+
+import numpy as np
+
+from station.quantities import Grid, Reference, VarianceComponents
+from station.science.gridding.gridder import Gridder
+from station.science.gridding.reference_surface import update_reference
+from station.science.gridding.scan_stack import ScanStack
+
+GRID = Grid(west_m=1000.0, north_m=2000.0, cell_m=10.0, nx=60, ny=50)
+POSITION = (0.0, 0.0, 3000.0)
+NOISE_M = 0.05
+SHOT_M2 = np.full(GRID.shape, NOISE_M**2, np.float32)
+
+
+def reference_and_truth():
+    """Return a reference with errors of up to 3 cm, steep in the west and flat in the east; and the truth."""
+    x, y = np.meshgrid(np.arange(GRID.nx), np.arange(GRID.ny))
+    height_m = np.where(x < 30, 12.0 * (30 - x), 0.0)
+    error_m = 0.03 * np.sin(x / 4) * np.cos(y / 5)
+    reference = Reference.from_elevation(GRID, "1", height_m + error_m)
+    reference.random_variance_m2[:] = 0.03**2
+    return reference, height_m
+
+
+def stacked_scans(reference, height_m, seed=1, count=24, rise_m=0.0):
+    rng = np.random.default_rng(seed)
+    stack = ScanStack(GRID)
+    cell = np.repeat(np.arange(GRID.nx * GRID.ny), 4)
+    for _ in range(count):
+        gridder = Gridder(GRID, None, POSITION[2])
+        residual = (height_m - reference.elevation_m + rise_m).ravel()[cell]
+        noise = rng.normal(0, NOISE_M, len(cell))
+        gridder.add(gridder.cell_indices(cell % GRID.nx, cell // GRID.nx), residual + noise, None)
+        stack.add(gridder, (SHOT_M2, np.zeros_like(SHOT_M2)), np.zeros_like(SHOT_M2))
+    return stack
+
+
+def test_stable_ground_improves_and_the_rest_stays():
+    reference, height_m = reference_and_truth()
+    updated = update_reference(
+        reference, stacked_scans(reference, height_m), POSITION, "2", VarianceComponents(tilt_rad=1e-5)
+    )
+    assert (updated.version, updated.components.tilt_rad) == ("2", 1e-5)
+    interior = np.zeros(GRID.shape, bool)
+    interior[5:-5, 5:25] = True
+    assert updated.stable[interior].mean() > 0.9
+    assert not updated.stable[:, 34:].any()  # flat ground may hold snow
+    error_before_m, error_after_m = (
+        np.abs(surface.elevation_m - height_m)[interior & updated.stable].mean()
+        for surface in (reference, updated)
+    )
+    assert error_after_m < error_before_m / 2
+    assert np.array_equal(updated.elevation_m[:, 34:], reference.elevation_m[:, 34:])
+    assert np.median(updated.random_variance_m2[interior & updated.stable]) < 0.01**2
+
+
+def test_steep_ground_that_changed_is_not_stable():
+    reference, height_m = reference_and_truth()
+    rise_m = np.zeros(GRID.shape)
+    rise_m[20:30, 10:20] = 0.5
+    updated = update_reference(
+        reference, stacked_scans(reference, height_m, rise_m=rise_m), POSITION, "2", VarianceComponents()
+    )
+    assert not updated.stable[20:30, 10:20].any()
+    assert np.array_equal(updated.elevation_m[20:30, 10:20], reference.elevation_m[20:30, 10:20])
+
+
+def test_variance_factor_of_cells_that_vary_more_than_modelled():
+    reference, _ = reference_and_truth()
+    rng = np.random.default_rng(3)
+    stack = ScanStack(GRID)
+    cell = np.arange(GRID.nx * GRID.ny)
+    varying = np.zeros(GRID.shape, bool)
+    varying[:, 40:50] = True
+    sigma = np.where(varying, 0.15, NOISE_M).ravel()
+    for _ in range(40):
+        gridder = Gridder(GRID, None, POSITION[2])
+        gridder.add(gridder.cell_indices(cell % GRID.nx, cell // GRID.nx), rng.normal(0, sigma), None)
+        stack.add(gridder, (SHOT_M2, np.zeros_like(SHOT_M2)), np.zeros_like(SHOT_M2))
+    factor = update_reference(reference, stack, POSITION, "2", VarianceComponents()).variance_factor
+    assert 6 < np.median(factor[varying]) < 10  # nine, less the steps clipped at six sigma
+    assert 0.8 < np.median(factor[~varying]) < 1.5
+
+
+def test_visibility_is_the_share_of_scans_that_observed_a_cell():
+    reference, _ = reference_and_truth()
+    stack = ScanStack(GRID)
+    cell = np.arange(GRID.nx * GRID.ny)
+    for scan in range(8):
+        gridder = Gridder(GRID, None, POSITION[2])
+        observed = cell[: len(cell) // 2] if scan < 6 else cell
+        gridder.add(
+            gridder.cell_indices(observed % GRID.nx, observed // GRID.nx), np.zeros(len(observed)), None
+        )
+        stack.add(gridder)
+    updated = update_reference(reference, stack, POSITION, "2", VarianceComponents())
+    assert np.unique(updated.visibility[:25]).tolist() == [1.0]
+    assert np.unique(updated.visibility[25:]).tolist() == [0.25]

@@ -1,0 +1,63 @@
+"""Fixtures of a small store on a grid at Hintereisferner."""
+
+import numpy as np
+import pytest
+
+from station.archive.epochs import Epoch
+from station.archive.netcdf_layout import Series
+from station.quantities import ChangeErrors, Grid, Measurement, SharedParameters
+
+GRID = Grid(west_m=632000.0, north_m=5186000.0, cell_m=10.0, nx=150, ny=140)
+START_S = 1_763_683_200.0  # 2025-11-21 00:00 UTC
+
+
+@pytest.fixture
+def series(tmp_path):
+    return Series(
+        tmp_path, "hef", GRID, "EPSG:32632", "EGM2008 geoid", "Hintereisferner", "Institute of Tests"
+    )
+
+
+@pytest.fixture
+def epoch():
+    return make_epoch
+
+
+def make_epoch(hour, *, value=None, grid=GRID, terms=False):
+    """Return an epoch; its change is the hour in centimetres, on the western half of the grid."""
+    observed = np.zeros(grid.shape, bool)
+    observed[:, : grid.nx // 2] = True
+    change = np.where(observed, hour / 100 if value is None else value, np.nan).astype(np.float32)
+    elevation = np.where(observed, 2800.0 + grid.y_m[:, None] / 1e6, np.nan)
+    count = np.where(observed, 3, 0).astype(np.int32)
+    sigma = np.where(observed, 0.05, np.nan).astype(np.float32)
+    measurement = Measurement.from_rasters(
+        grid,
+        observed.astype(np.uint8),
+        elevation_m=elevation,
+        change_m=change,
+        uncertainty_m=2 * sigma,
+        random_uncertainty_m=sigma,
+        spread_m=sigma,
+        count=count,
+        **({"sigma_geometry": sigma} if terms else {}),
+    )
+    names = ("tilt_east", "tilt_north", "range_bias")
+    return Epoch(
+        start_s=START_S + 3600 * hour,
+        end_s=START_S + 3600 * hour + 900,
+        scan_id=f"251121_{hour % 24:02d}0000",
+        measurement=measurement,
+        shared=SharedParameters(
+            names,
+            ("rad", "rad", "m"),
+            np.zeros(3),
+            np.diag([1e-10, 2e-10, 1.6e-5]),
+            np.zeros(3),
+            ChangeErrors(np.full((3, 32), hour * 1e-6), np.full(288, hour / 8)),
+        ),
+        verdict="good",
+        verdict_reason="",
+        scalars={"platform_roll": 0.12, "air_temperature": -3.5, "point_total": 1234.0, "coverage": 0.5},
+        provenance={"scan_sha256": "ab" * 32, "sop_id": "sop-1", "reference_version": "1"},
+    )
