@@ -84,9 +84,10 @@ def test_quick_benchmark_prints_all_rows_with_correct_ratios(quick):
         if title:
             rows[title] = cells
     base_s = float(rows["laspy + lazrs, one thread"][0])
-    for title in ("station, on the grid", "station, epoch written", "station, running service"):
-        cpu_s, ratio = map(float, rows[title][:2])
-        assert ratio == pytest.approx(cpu_s / base_s, rel=0.01 / base_s)
+    cpu_s, ratio = map(float, rows["station, running service"][:2])
+    assert (cpu_s - 0.005) / (base_s + 0.005) - 0.005 <= ratio <= (cpu_s + 0.005) / (base_s - 0.005) + 0.005
+    for title in ("station, on the grid", "station, epoch written"):  # beside their own decodes, not printed
+        assert all(float(cell) > 0 for cell in rows[title][:2])
     for title in ("scipy binned_statistic_2d", "datashader", "PDAL", "CloudCompare", "py4dgeo M3C2"):
         assert rows[title][0] or rows[title][-1] == "not installed"
     assert {"50 x 62", "200 x 250", "0.004 million", "0.08 million", "station --help"} <= set(rows)

@@ -9,6 +9,7 @@ pytestmark = pytest.mark.integration
 
 ALL = range(harness.SCANS)
 RANDOM_KILLS = 300
+ONE_LIFE_S = 600.0  # a service survives hundreds of kills of its workers, 0.2 s each on an idle machine
 HOLDS = "lost=0 doubled=0 wrong=0"
 
 
@@ -23,7 +24,7 @@ def run_until_finished(station, undisturbed, plans, capsys, *, hours=ALL):
     station.drop(*hours)
     for plan in plans:
         station.start(**plan)
-        station.wait_until(lambda: station.is_finished(*hours) or not station.is_alive())
+        station.wait_until(lambda: station.is_finished(*hours) or not station.is_alive(), ONE_LIFE_S)
         if station.is_alive():
             station.end()
             break
