@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import importlib
 import os
 import shutil
 import signal
@@ -28,6 +29,7 @@ from station.errors import StoreError
 from station.inbox.journal import Journal, State
 from station.inbox.scan_files import scan_file
 from station.processing import scan_tasks
+from station.processing.isolation import PRELOAD
 from station.processing.pipeline import Pose
 from station.processing.reference_tasks import build_reference_version
 from station.processing.scan_inputs import load_scan_inputs
@@ -231,6 +233,8 @@ def _no_progress() -> None:
 
 
 if __name__ == "__main__":
+    for module in PRELOAD:  # as the service's workers have, before their start-up ends
+        importlib.import_module(module)
     jobs: tuple[Callable[..., dict[str, Any]], ...] = (
         make, grid_task, gridding, large_blocks, epoch, reference, unadjusted, service_site, service, year,
     )  # fmt: skip
