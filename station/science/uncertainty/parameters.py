@@ -27,6 +27,7 @@ GLOBAL = (
 TILT_KNOT_RAD = math.radians(1.0)
 TILT_KNOTS_PER_REFRACTION = 5  # sight-tilt knots for each refraction knot
 LINE_GROUPS_PER_KNOT = 5  # scan-line groups between two sight-tilt knots: 0.2° each, about one second
+AXIS_NEAR_NORTH_COS = math.cos(math.radians(45.0))  # closer to north or south, azimuth zero is not north
 MAX_AXIS_TILT_COS = math.cos(math.radians(10.0))  # with more tilt, map azimuth no longer bounds head azimuth
 
 
@@ -35,8 +36,10 @@ class ParameterLayout:
     """Index map of the parameter vector: globals, then sight tilt, refraction and cross tilt at knots.
 
     Azimuths are head azimuths: about the head's rotation axis `axis` (east, north, up), clockwise from grid
-    north. Every scan line therefore has one azimuth, even on a tilted mount. The first knot lies at
-    `start_rad`; with `full_circle` the knots cover all 360°.
+    north. Every scan line therefore has one azimuth, even on a tilted mount. Azimuth zero is the direction
+    normal to the axis that is closest to north. Of an axis within 45° of north it is the one closest to down,
+    of an axis within 45° of south the one closest to up: north would be lost or turn with the axis. The first
+    knot lies at `start_rad`; with `full_circle` the knots cover all 360°.
     """
 
     start_rad: float
@@ -144,9 +147,11 @@ def _degrees(azimuth_rad: float) -> str:
 def _head_axes(axis: tuple[float, float, float]) -> tuple[Floats, Floats]:
     """Return the head's viewing directions at azimuth 90° and 0°, both normal to the axis."""
     up = np.array(axis)
-    north = np.array([0.0, 1.0, 0.0]) - up[1] * up
-    north /= np.linalg.norm(north)
-    return np.cross(north, up), north
+    near_north = abs(up[1]) > AXIS_NEAR_NORTH_COS
+    zero = np.array([0.0, 0.0, -np.sign(up[1])]) if near_north else np.array([0.0, 1.0, 0.0])
+    zero -= (zero @ up) * up
+    zero /= np.linalg.norm(zero)
+    return np.cross(zero, up), zero
 
 
 def parameter_layout(
