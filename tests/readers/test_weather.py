@@ -69,6 +69,84 @@ def test_csv_with_time_zones(tmp_path):
 
 
 @pytest.mark.parametrize(
+    ("units", "values", "expected"),
+    [
+        ("C,%,mbar", (-1.5, 50, 684.5), (-1.5, 50, 684.5)),
+        ("Deg C,%RH,hPa", (-1.5, 50, 684.5), (-1.5, 50, 684.5)),
+        ("Deg F,%,kPa", (14.0, 50, 68.45), (-10.0, 50, 684.5)),
+        ("degF,%,Pa", (-40.0, 50, 68450), (-40.0, 50, 684.5)),
+        ("F,0-1,inHg", (212.0 - 180.0, 0.5, 29.9213), (0.0, 50, 1013.25)),
+        ("°F,frac,mmHg", (50.0, 0.5, 760), (10.0, 50, 1013.25)),
+        ("K,1,mb", (263.15, 0.012, 684.5), (-10.0, 1.2, 684.5)),
+        ("Kelvin,%,bar", (263.15, 1.2, 0.6845), (-10.0, 1.2, 684.5)),
+        (",,", (-1.5, 50, 684.5), (-1.5, 50, 684.5)),
+        ("volt,?,x", (-1.5, 50, 684.5), (-1.5, 50, 684.5)),
+    ],
+)
+def test_units_of_a_toa5_file_are_converted(tmp_path, units, values, expected):
+    """32 °F is 0 °C, -40 °F is -40 °C; 29.9213 inHg and 760 mmHg are 1013.25 hPa."""
+    unit_row = '"TS","RN",' + ",".join(f'"{unit}"' for unit in units.split(","))
+    text = TOA5.replace('"TS","RN","C","%","mbar"', unit_row)
+    rows = [f'"2024-10-01 05:0{minute}:00",1,{",".join(map(str, values))}\r\n' for minute in range(3)]
+    log = read_weather(
+        write_log(tmp_path, text + "".join(rows)), format="toa5", columns=LOGGER, utc_offset_h=0
+    )
+    actual = log.temperature_c[0], log.humidity_pct[0], log.pressure_hpa[0]
+    assert actual == pytest.approx(expected, rel=1e-5, abs=1e-9)
+
+
+def csv_rows(times):
+    return "".join(f"{time},1.5,55,700\n" for time in times)
+
+
+@pytest.mark.parametrize(
+    ("first", "second"),
+    [
+        ("15.07.2025 00:00", "15.07.2025 00:10"),
+        ("2025/07/15 00:00", "2025/07/15 00:10"),
+        ("1752537600", "1752538200"),
+        ("1752537600.5", "1752538200.5"),
+        ("Jul 15 2025", "Jul 16 2025"),
+    ],
+)
+@pytest.mark.parametrize("window", [None, (START_S, START_S + 3600)])
+@pytest.mark.parametrize("repeated", [1, 3000])
+def test_unreadable_times_are_an_error_that_shows_the_first(tmp_path, first, second, window, repeated):
+    path = write_log(tmp_path, "time,t,rh,p\n" + csv_rows([first, second] * repeated))
+    with pytest.raises(ScanError, match="no row has a readable time") as error:
+        read_weather(path, format="csv", columns=PLAIN, utc_offset_h=0, window_utc_s=window)
+    assert repr(first) in str(error.value)
+    assert "ISO 8601" in str(error.value)
+
+
+@pytest.mark.parametrize("window_h", [None, 1.0, 20.0, 39.0])
+def test_a_log_with_the_newest_rows_first_is_an_error(tmp_path, window_h):
+    """40 hours of minutes; a service that silently finds no weather would degrade every scan."""
+    times = [
+        f"{datetime.fromtimestamp(START_S + 60 * minute, UTC):%Y-%m-%dT%H:%M:%S}" for minute in range(2400)
+    ]
+    path = write_log(tmp_path, "time,t,rh,p\n" + csv_rows(times[::-1]))
+    centre_s = START_S + 3600 * (window_h or 0)
+    window = None if window_h is None else (centre_s - 600, centre_s + 600)
+    with pytest.raises(ScanError, match="not in time order, the newest come first"):
+        read_weather(path, format="csv", columns=PLAIN, utc_offset_h=0, window_utc_s=window)
+
+
+@pytest.mark.parametrize(("humidity", "is_fraction"), [("0.55", True), ("1.0", True), ("1.6", False)])
+def test_humidity_that_can_only_be_a_fraction_is_an_error(tmp_path, humidity, is_fraction):
+    rows = "".join(f"2024-10-01 05:0{n}:00,1.5,{humidity if n else 0.4},700\n" for n in range(5))
+    path = write_log(tmp_path, "time,t,rh,p\n" + rows)
+    if is_fraction:
+        with pytest.raises(
+            ScanError, match=r"humidity is at most .*: a fraction of 1\? It must be in percent"
+        ):
+            read_weather(path, format="csv", columns=PLAIN, utc_offset_h=0)
+    else:
+        log = read_weather(path, format="csv", columns=PLAIN, utc_offset_h=0)
+        assert log.humidity_pct.max() == 1.6
+
+
+@pytest.mark.parametrize(
     ("text", "format_", "reason"),
     [
         (TOA5.replace('"P"', '"Pact"'), "toa5", "has no column P; it has TIMESTAMP, RECORD, T, RH, Pact"),
