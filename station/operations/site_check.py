@@ -17,7 +17,7 @@ from station.inbox.scan_files import scan_file
 from station.monitoring.preconditions import EARLIEST_S
 from station.processing import isolation
 from station.processing.integrity import check_store
-from station.processing.scan_inputs import scanner_to_map
+from station.processing.scan_inputs import pressure_fault, scanner_height_m, scanner_to_map
 from station.processing.scan_tasks import dry_run, load_areas, polygon_cells, series_for
 from station.readers.flags import read_flags
 from station.readers.scan import suffixes
@@ -168,9 +168,20 @@ def _weather(site: Site) -> Iterator[Finding]:
     last_s = float(log.time_utc_s[-1])
     air = interpolate_air(log, last_s, settings.max_age_s)
     message = f"{len(log.time_utc_s)} rows up to {time.strftime('%Y-%m-%d %H:%M UTC', time.gmtime(last_s))}"
-    if air is not None:
-        message += f": {air.temperature_c:.1f} °C, {air.pressure_hpa:.1f} hPa, {air.humidity_pct:.0f} %"
-    yield _finding("ok", "weather", message)
+    if air is None:
+        yield _finding("ok", "weather", message)
+        return
+    message += f": {air.temperature_c:.1f} °C, {air.pressure_hpa:.1f} hPa, {air.humidity_pct:.0f} %"
+    fault = pressure_fault(air, _newest_height_m(site))
+    yield _finding("warning" if fault else "ok", "weather", f"{message}; {fault}" if fault else message)
+
+
+def _newest_height_m(site: Site) -> float | None:
+    """Return the height of the scanner under the newest SOP [m]; None if it is unknown."""
+    try:
+        return scanner_height_m(site, max(site.sop, key=lambda sop: sop.from_)) if site.sop else None
+    except StationError:  # a finding of its own
+        return None
 
 
 def _scans(site: Site) -> list[Path]:

@@ -20,11 +20,16 @@ from station.archive.schema import FILL
 from station.archive.series.epoch_reader import contiguous_runs, read_source
 from station.archive.series.index import list_epochs
 from station.config import Site
-from station.errors import NotReadyError, ScanError
+from station.errors import ConfigError, NotReadyError, ScanError
 from station.inbox.file_hash import sha256_file
 from station.inbox.inbox import ScanFile
 from station.inbox.journal import Entry
-from station.processing.scan_inputs import air_from_log, read_tilt_offset, sop_identity
+from station.processing.scan_inputs import (
+    air_from_log,
+    read_tilt_offset,
+    scanner_height_m,
+    sop_identity,
+)
 from station.quantities import Air
 from station.readers.flags import read_flags, reasons_for
 from station.readers.sop import valid_sop
@@ -114,6 +119,7 @@ class CurrentConfig:
         self._site = site
         self._flags = read_flags(site.flags.file) if site.flags else []
         self._sop_id = cache(sop_identity)
+        self._height_m = cache(lambda sop: scanner_height_m(site, sop))
         self._tilt_offset = cache(lambda sop_id: read_tilt_offset(site, sop_id))
 
     def changed_settings(self, provenance: ScanProvenance) -> list[str]:
@@ -170,7 +176,7 @@ class CurrentConfig:
     def _changed_weather(self, provenance: ScanProvenance) -> list[str]:
         if self._site.weather is None or not provenance.sop_id:
             return []
-        air = _air_if_known(self._site.weather, (provenance.start_s + provenance.end_s) / 2)
+        air = self._air_if_known(self._site.weather, provenance)
         if air is None:
             return []
         if not provenance.air:
@@ -178,10 +184,10 @@ class CurrentConfig:
         values = (air.temperature_c, air.pressure_hpa, air.humidity_pct)
         return ["other weather"] if np.abs(np.subtract(values, provenance.air)).max() > MIN_AIR_CHANGE else []
 
-
-def _air_if_known(section: WeatherSection, time_utc_s: float) -> Air | None:
-    """Return the air at a time; None if the log has a gap or cannot be used."""
-    try:
-        return air_from_log(section, time_utc_s)
-    except (ScanError, NotReadyError):
-        return None
+    def _air_if_known(self, section: WeatherSection, provenance: ScanProvenance) -> Air | None:
+        """Return the air at the middle of a scan; None if the log has a gap, or it or the SOP is unusable."""
+        try:
+            sop = valid_sop(self._site.sop, datetime.fromtimestamp(provenance.start_s, UTC))
+            return air_from_log(section, (provenance.start_s + provenance.end_s) / 2, self._height_m(sop))
+        except (ConfigError, ScanError, NotReadyError):
+            return None

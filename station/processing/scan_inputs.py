@@ -22,6 +22,7 @@ from station.quantities import (
     VERTICAL_AXIS,
     Air,
     AzimuthTrack,
+    Floats,
     InclinationLog,
     ScanGeometry,
     SharedParameters,
@@ -40,6 +41,8 @@ from station.sections import Origin, SopSection, WeatherSection
 
 MIN_LOG_COVERAGE = 0.97  # of the scan duration that a complete log covers
 MIN_LOG_ROWS = 20  # a shorter log is not filtered
+MIN_ABSOLUTE_LOG_S = 60.0  # of a scan whose static tilt is known from its log alone
+MAX_PRESSURE_DEVIATION_HPA = 60.0  # from the standard atmosphere; weather amounts to 40 hPa
 MAX_SATURATED = 0.1  # of the rows of a log, at the limit of the sensor's range
 MIN_CLOCK_OFFSET_S = 4.0  # clock offset of a log, and its significance, that lead to a warning
 MIN_CLOCK_OFFSET_SIGMAS = 3.0
@@ -57,6 +60,7 @@ class ScanInputs:
     air: Air | None
     warnings: tuple[str, ...]
     provenance: dict[str, str]
+    faults: tuple[str, ...] = ()  # that make the scan unusable
 
     @cached_property
     def log_only_shared(self) -> SharedParameters | None:
@@ -80,33 +84,16 @@ def load_scan_inputs(
     NotReadyError is raised if there is no weather yet.
     """
     if site.scans.frame == "map":
-        position_m = _map_position(site)
-        geometry, log_only_covariance, adjustment_inputs = scan_geometry(site, position_m), None, None
-        if position_m is not None:  # registered elsewhere, with unknown accuracy
-            params = parameters.parameter_layout(geometry.grid, position_m)
-            lines = prior.line_times(params, np.eye(3), None)
-            adjustment_inputs = AdjustmentInputs(
-                params, lines, np.zeros((3, params.line_groups)), None, weather_known=False
-            )
-            log_only_covariance = partial(
-                prior.log_only_covariance,
-                params,
-                lines,
-                None,
-                NO_CYCLIC_ERROR,
-                VarianceComponents(),
-                weather_known=False,
-            )
-        return ScanInputs(
-            geometry, Pose(None, None), log_only_covariance, adjustment_inputs, None, None, (), {}
-        )
+        return _inputs_in_map_frame(site)
     sop = valid_sop(site.sop, start)
     transform, sop_id = scanner_to_map(site, sop), sop_identity(sop)
     warnings: list[str] = []
     track = reader.azimuth_track() if site.scans.point_time == "auto" else None
     if track is None and site.scans.point_time == "auto":
         warnings.append("no time per point: one mean tilt for the whole scan")
-    log = _load_log(site, log_path, track, warnings)
+    rotation = transform.to_local[:3, :3]
+    log = _load_log(site, log_path, track, rotation, warnings)
+    faults = _static_tilt_faults(site, log)
     tilt_offset = read_tilt_offset(site, sop_id)
     if tilt_offset is None:
         tilt_offset = _find_tilt_offset(site, sop, reader, log, track, warnings)
@@ -115,11 +102,10 @@ def load_scan_inputs(
             write_tilt_offset(site, sop_id, tilt_offset)
     tilt_record = _tilt_record(site, log, track, tilt_offset, warnings)
     air, weather_known = _air(site, start + (end - start) / 2, transform.position_m[2], warnings)
-    rotation = transform.to_local[:3, :3]
     axis = (float(rotation[0, 2]), float(rotation[1, 2]), float(rotation[2, 2]))
     geometry = scan_geometry(site, transform.position_m, axis)
     if wait_for_weather and site.weather is not None and not weather_known:
-        raise NotReadyError(warnings[-1])
+        raise NotReadyError(next(warning for warning in warnings if warning.startswith("weather")))
     params = parameters.parameter_layout(geometry.grid, transform.position_m, axis)
     lines = prior.line_times(params, rotation, track)
     assumed_rad, line_inclination = np.zeros((3, params.line_groups)), None
@@ -155,7 +141,30 @@ def load_scan_inputs(
         air if weather_known else None,
         tuple(warnings),
         provenance,
+        faults,
     )
+
+
+def _inputs_in_map_frame(site: Site) -> ScanInputs:
+    """Return the inputs of a scan that is already on the map."""
+    position_m = _map_position(site)
+    geometry, log_only_covariance, adjustment_inputs = scan_geometry(site, position_m), None, None
+    if position_m is not None:  # registered elsewhere, with unknown accuracy
+        params = parameters.parameter_layout(geometry.grid, position_m)
+        lines = prior.line_times(params, np.eye(3), None)
+        adjustment_inputs = AdjustmentInputs(
+            params, lines, np.zeros((3, params.line_groups)), None, weather_known=False
+        )
+        log_only_covariance = partial(
+            prior.log_only_covariance,
+            params,
+            lines,
+            None,
+            NO_CYCLIC_ERROR,
+            VarianceComponents(),
+            weather_known=False,
+        )
+    return ScanInputs(geometry, Pose(None, None), log_only_covariance, adjustment_inputs, None, None, (), {})
 
 
 def scan_geometry(
@@ -227,9 +236,12 @@ def _map_position(site: Site) -> tuple[float, float, float] | None:
 
 
 def _load_log(
-    site: Site, path: Path | None, track: AzimuthTrack | None, warnings: list[str]
+    site: Site, path: Path | None, track: AzimuthTrack | None, rotation: Floats, warnings: list[str]
 ) -> InclinationLog | None:
-    """Return the cleaned inclination log of a scan, or None; append what is wrong with it to `warnings`."""
+    """Return the cleaned inclination log of a scan, or None; append what is wrong with it to `warnings`.
+
+    `rotation` (3, 3) of the SOP contains the tilt of the mount, which shows whether the axes are right.
+    """
     if site.inclination is None:
         return None
     if path is None:
@@ -241,10 +253,13 @@ def _load_log(
     except ScanError as error:
         warnings.append(f"inclination log unusable: {error}")
         return None
-    if log is None or track is None:
+    if log is None:
+        return None
+    warnings += inclination.axes_warnings(log, rotation)
+    if track is None:
         return log
     log = align_gps_week(log, float(track.time_s[0]))
-    return log if _overlaps(log, track, warnings) else None
+    return log if _overlaps(site, log, track, warnings) else None
 
 
 def _clean_log(site: Site, raw: InclinationLog, warnings: list[str]) -> InclinationLog | None:
@@ -269,16 +284,34 @@ def _clean_log(site: Site, raw: InclinationLog, warnings: list[str]) -> Inclinat
     return log
 
 
-def _overlaps(log: InclinationLog, track: AzimuthTrack, warnings: list[str]) -> bool:
-    """Return True if a log overlaps the scan in time; warn if it does not cover the whole scan."""
-    first_s, last_s = track.time_s[0], track.time_s[-1]
-    overlap_s = min(last_s, log.time_s[-1]) - max(first_s, log.time_s[0])
-    if overlap_s <= 0:
-        warnings.append(f"inclination log is of another time: {first_s - log.time_s[0]:+.0f} s off")
+def _overlaps(site: Site, log: InclinationLog, track: AzimuthTrack, warnings: list[str]) -> bool:
+    """Return True if a log can be used for a scan by its times; warn if it does not cover the whole scan."""
+    first_s, last_s = float(track.time_s[0]), float(track.time_s[-1])
+    late_s, early_s = log.time_s[0] - first_s, last_s - log.time_s[-1]
+    duration_s = last_s - first_s
+    if max(late_s, early_s) >= duration_s:
+        side = "begins {:,.0f} s after" if late_s >= duration_s else "ends {:,.0f} s before"
+        side = side.format(max(late_s, early_s) - duration_s)
+        warnings.append(f"inclination log is of another time: it {side} the scan")
         return False
-    if overlap_s < MIN_LOG_COVERAGE * (last_s - first_s):
-        warnings.append(f"inclination log covers {overlap_s:.0f} of {last_s - first_s:.0f} s")
-    return True
+    overlap_s = duration_s - max(late_s, 0.0) - max(early_s, 0.0)
+    if overlap_s < MIN_LOG_COVERAGE * duration_s:
+        lacking = [f"begins {late_s:,.0f} s after the start"] if late_s > 0 else []
+        lacking += [f"ends {early_s:,.0f} s before the end"] if early_s > 0 else []
+        warnings.append(f"inclination log {' and '.join(lacking)} of the scan")
+    is_absolute = site.inclination is not None and site.inclination.mode == "absolute"
+    return not is_absolute or overlap_s >= min(MIN_ABSOLUTE_LOG_S, MIN_LOG_COVERAGE * duration_s)
+
+
+def _static_tilt_faults(site: Site, log: InclinationLog | None) -> tuple[str, ...]:
+    """Return a message if the tilt of the mount itself is unknown: an absolute log is its only source."""
+    if log is not None or site.inclination is None or site.inclination.mode == "relative":
+        return ()
+    message = (
+        'tilt of the scanner unknown: with inclination.mode = "absolute" the SOP does not contain it, and'
+        " there is no inclination log of at least a minute of the scan"
+    )
+    return (message,)
 
 
 def _tilt_record(
@@ -297,8 +330,9 @@ def _tilt_record(
     sigma_rad = site.instrument.inclination_sigma_rad
     filtered = site.inclination.filter == "blackman"
     tilt_record = inclination.relative_tilt(log, track, tilt_offset, sigma_rad, cutoff_hz, filtered=filtered)
-    if tilt_record.gap_s > 2 * tilt_record.correlation_time_s:
-        warnings.append(f"inclination log has a gap of {tilt_record.gap_s:.0f} s")
+    gap_s = float(np.ptp(tilt_record.gaps_s, axis=1).max(initial=0.0))
+    if gap_s > 2 * tilt_record.correlation_time_s:
+        warnings.append(f"inclination log has a gap of {gap_s:,.0f} s")
     if abs(tilt_record.offset_s) > max(
         MIN_CLOCK_OFFSET_S, MIN_CLOCK_OFFSET_SIGMAS * tilt_record.offset_sigma_s
     ):
@@ -368,6 +402,8 @@ def _load_earlier_log(site: Site, stem: str) -> tuple[InclinationLog | None, Azi
     with open_scan(scans[0], range_max_m=site.scanner.range_max_m) as reader:
         track = reader.azimuth_track()
     log, _ = inclination.clean(read_inclination(log_path), site.instrument.inclination_range_rad)
+    if track is not None and len(log.time_s):
+        log = align_gps_week(log, float(track.time_s[0]))
     return log, track
 
 
@@ -377,10 +413,11 @@ def _fit_tilt_offset(log: InclinationLog, track: AzimuthTrack | None, sigma_rad:
     return CyclicError((float(log.roll_rad.mean()), 0.0, 0.0), (float(log.pitch_rad.mean()), 0.0, 0.0))
 
 
-def air_from_log(section: WeatherSection, time_utc_s: float) -> Air | None:
+def air_from_log(section: WeatherSection, time_utc_s: float, height_m: float | None) -> Air | None:
     """Return the air at a time, interpolated in the weather log; None if the log has a gap.
 
-    Raises ScanError or NotReadyError if the log cannot be used.
+    `height_m` is that of the scanner, None if it is unknown. Raises ScanError if the log or its pressure
+    cannot be used, NotReadyError if the log cannot be read.
     """
     log = read_weather(
         section.file,
@@ -389,7 +426,31 @@ def air_from_log(section: WeatherSection, time_utc_s: float) -> Air | None:
         utc_offset_h=section.utc_offset_h,
         window_utc_s=(time_utc_s - section.max_age_s, time_utc_s + section.max_age_s),
     )
-    return interpolate_air(log, time_utc_s, section.max_age_s)
+    air = interpolate_air(log, time_utc_s, section.max_age_s)
+    if air is not None and (message := pressure_fault(air, height_m)):
+        raise ScanError(message)
+    return air
+
+
+def scanner_height_m(site: Site, sop: SopSection) -> float | None:
+    """Return the height of the scanner above the ellipsoid [m]; None without a map, whose zero is unknown."""
+    return None if site.map.crs is None else scanner_to_map(site, sop).position_m[2]
+
+
+def pressure_fault(air: Air, height_m: float | None) -> str:
+    """Return a message if the pressure cannot be that at a height [m], '' if it can or that is unknown."""
+    if height_m is None:
+        return ""
+    expected_hpa, sea_level_hpa = (standard_air(height).pressure_hpa for height in (height_m, 0.0))
+    if abs(air.pressure_hpa - expected_hpa) <= MAX_PRESSURE_DEVIATION_HPA:
+        return ""
+    message = (
+        f"pressure of {air.pressure_hpa:.1f} hPa, but at {height_m:,.0f} m the standard atmosphere has"
+        f" {expected_hpa:.0f} hPa: "
+    )
+    if abs(air.pressure_hpa - sea_level_hpa) <= MAX_PRESSURE_DEVIATION_HPA:
+        return message + "it is reduced to sea level; log the pressure at the station itself"
+    return message + "wrong column or unit, a failed sensor, or a wrong height of the SOP"
 
 
 def _air(site: Site, mid_scan: datetime, height_m: float, warnings: list[str]) -> tuple[Air, bool]:
@@ -397,14 +458,14 @@ def _air(site: Site, mid_scan: datetime, height_m: float, warnings: list[str]) -
     if site.weather is not None:
         section = site.weather
         try:
-            air = air_from_log(section, mid_scan.timestamp())
+            air = air_from_log(section, mid_scan.timestamp(), None if site.map.crs is None else height_m)
+            age = timedelta(seconds=section.max_age_s)
+            message = f"weather missing within {age} of {mid_scan:%Y-%m-%d %H:%M} UTC"
         except (ScanError, NotReadyError) as error:  # a scan does not wait for its weather indefinitely
-            warnings.append(f"weather unusable: {error}")
-            air = None
+            air, message = None, f"weather unusable: {error}"
         if air is not None:
             return air, True
-        age = timedelta(seconds=section.max_age_s)
-        warnings.append(f"weather missing within {age} of {mid_scan:%Y-%m-%d %H:%M} UTC")
+        warnings.append(message)
     if site.air is None or site.air.scanner_setting == "weather":
         return standard_air(height_m), False
     return site.air.scanner_setting.air, False

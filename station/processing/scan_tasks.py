@@ -253,6 +253,7 @@ def _compute_epoch(
         viewing,
         attempt,
         scalars.get("stable_z_std", 0.0) if adjustment else None,
+        inputs.faults,
     )
     return epochs.Epoch(
         start_s=start.timestamp(),

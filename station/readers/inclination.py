@@ -42,7 +42,7 @@ def read_inclination(path: Path) -> InclinationLog:
     readable = np.isfinite(rows).all(axis=-1)
     if not readable.any():
         raise ScanError(f"{path.name}: none of {len(rows)} rows can be read")
-    time_s = _unwrap_week(rows[:, 0], rows[readable][0, 0])
+    time_s = _unwrap_week(rows[:, 0])
     readable &= np.abs(time_s - np.median(time_s[readable])) <= MAX_TIME_DIFFERENCE_S
     time_s[~readable] = rows[~readable] = np.nan
     return InclinationLog(time_s, np.radians(rows[:, 1]), np.radians(rows[:, 2]))
@@ -69,7 +69,11 @@ def _parse_row(line: str, indices: list[int]) -> tuple[float, ...]:
         return (np.nan,) * len(indices)
 
 
-def _unwrap_week(time_s: Floats, first_s: float) -> Floats:
-    """Return seconds of the GPS week that continue past its end instead of falling back to zero [s]."""
-    wrapped = (time_s >= 0) & (time_s < first_s - WEEK_S / 2) & (first_s < WEEK_S)
-    return np.where(wrapped, time_s + WEEK_S, time_s)
+def _unwrap_week(time_s: Floats) -> Floats:
+    """Return seconds of the GPS week that continue past its end instead of falling back to zero [s].
+
+    A log with times of the week's last day contains no times of its first day, except after the rollover.
+    """
+    if not np.any((time_s > WEEK_S - MAX_TIME_DIFFERENCE_S) & (time_s < WEEK_S)):
+        return time_s
+    return np.where((time_s >= 0) & (time_s < MAX_TIME_DIFFERENCE_S), time_s + WEEK_S, time_s)

@@ -13,9 +13,11 @@ import pytest
 from station.config import read_site
 from station.errors import ConfigError, NotReadyError, ScanError
 from station.inbox.scan_files import scan_file
-from station.processing import reference_tasks, scan_tasks
+from station.operations import site_check
+from station.processing import provenance, reference_tasks, scan_tasks
 from station.processing.pipeline import to_map
-from station.processing.scan_inputs import load_scan_inputs
+from station.processing.scan_inputs import load_scan_inputs, pressure_fault
+from station.quantities import Air
 from station.readers.scan import utc_interval
 from station.science.uncertainty.parameters import LINE_GROUPS_PER_KNOT
 from station.simulation.instrument.motion import sensor_faults
@@ -103,18 +105,18 @@ def change_log(folder, change):
 @pytest.mark.parametrize(
     ("change", "reason"),
     [
-        (lambda rows: rows[: len(rows) // 2], "inclination log covers"),
+        (lambda rows: rows[: len(rows) // 2], r"inclination log ends 14\d s before the end of the scan"),
         (lambda rows: rows[:100] + rows[180:], "has a gap of"),
         (lambda rows: ["x,y,z"] * 100 + rows[100:], "rows rejected"),
         (lambda rows: rows[:5], "valid rows"),
         (
             lambda rows: [f"{float(r.split(',')[0]) + 90000},{r.split(',', 1)[1]}" for r in rows],
-            "another time",
+            r"another time: it begins 89,69\d s after the scan",
         ),
         (lambda rows: ["?"] * len(rows), "inclination log unusable"),
         (
             lambda rows: [f"{float(r.split(',')[0]) + 30},{r.split(',', 1)[1]}" for r in rows],
-            "inclination log covers",
+            r"inclination log begins 2\d s after the start of the scan",
         ),
         (
             lambda rows: [f"{row.split(',')[0]},10.0,-1.3" if n % 3 else row for n, row in enumerate(rows)],
@@ -127,7 +129,96 @@ def test_faulty_log_degrades_the_scan(folder, change, reason):
     change_log(folder, change)
     result, _ = process(folder)
     assert result.verdict == "degraded"
-    assert reason in result.reason
+    assert re.search(reason, result.reason)
+
+
+@pytest.mark.parametrize(
+    ("keep", "reason"),
+    [
+        (lambda rows: rows[:50], r"inclination log ends 25\d s before the end of the scan"),
+        (lambda rows: rows[:5], "inclination log has 5 valid rows"),
+        (None, "inclination log missing"),
+    ],
+    ids=["50 s", "5 s", "missing"],
+)
+def test_scan_without_its_absolute_log_is_unusable(folder, keep, reason):
+    """The SOP of an upright scanner does not contain the tilt of the mount."""
+    if keep is None:
+        log_file(folder).unlink()
+    else:
+        change_log(folder, keep)
+    result, _ = process(folder, ('mode = "relative"', 'mode = "absolute"'))
+    assert result.verdict == "unusable"
+    assert result.reason.startswith('tilt of the scanner unknown: with inclination.mode = "absolute"')
+    assert re.search(reason, result.reason)
+
+
+def test_swapped_axes_of_the_log_are_named(folder):
+    """The mount of the simulated station rolls by 2.1° and pitches by -1.3°."""
+    change_log(folder, lambda rows: ["{0},{2},{1}".format(*row.split(",")) for row in rows])
+    result, _ = process(folder)
+    assert result.verdict == "degraded"
+    assert "axes of the inclination log are wrong: roll and pitch are swapped" in result.reason
+    assert "in the SOP 2.10, -1.30" in result.reason
+    (finding,) = site_check._newest_scan(read_site(folder / "site.toml"))
+    assert finding["level"] == "warning"
+    assert "roll and pitch are swapped" in finding["message"]
+
+
+def test_a_wrong_time_in_the_log_changes_nothing(folder):
+    good, _ = process(folder)
+
+    def wrong_time(rows):
+        time_s, tilt = rows[30].split(",", 1)
+        return [*rows[:30], f"{float(time_s) + 5000},{tilt}", *rows[31:]]
+
+    change_log(folder, wrong_time)
+    result, _ = process(folder)
+    assert (result.verdict, result.reason) == ("good", "")
+    assert result.metrics["sigma_median_m"] == pytest.approx(good.metrics["sigma_median_m"], rel=0.01)
+    assert result.metrics["roll_deg"] == pytest.approx(good.metrics["roll_deg"], abs=2e-4)
+
+
+def test_pressure_is_compared_with_the_standard_atmosphere():
+    """ICAO: 701.1 hPa at 3,000 m, 898.7 hPa at 1,000 m."""
+    assert pressure_fault(Air(-1.0, 701.1 + 59, 50.0), 3000.0) == ""
+    assert pressure_fault(Air(-1.0, 701.1 - 59, 50.0), 3000.0) == ""
+    assert pressure_fault(Air(-1.0, 1013.0, 50.0), None) == ""
+    assert "at 3,000 m the standard atmosphere has 701 hPa: it is reduced to sea level" in pressure_fault(
+        Air(-1.0, 1025.0, 50.0), 3000.0
+    )
+    assert "wrong column or unit" in pressure_fault(Air(-1.0, 701.1 - 61, 50.0), 3000.0)
+    assert "the standard atmosphere has 899 hPa: it is reduced" in pressure_fault(
+        Air(5.0, 1000.0, 50.0), 1000.0
+    )
+
+
+def test_pressure_reduced_to_sea_level_is_refused(folder):
+    path = folder / "weather.dat"
+    text = path.read_text()
+    lines = text.splitlines()
+    column = lines[1].split(",").index('"Pact"')
+    for row in range(4, len(lines)):
+        fields = lines[row].split(",")
+        fields[column] = "1013.2"
+        lines[row] = ",".join(fields)
+    path.write_text("\n".join(lines) + "\n")
+    result, sigma = process(folder)
+    assert result.verdict == "degraded"
+    assert "weather unusable: pressure of 1013.2 hPa, but at" in result.reason
+    assert "it is reduced to sea level; log the pressure at the station itself" in result.reason
+    assert sigma[7] == pytest.approx(4.0)  # ppm of the range, as without weather
+    site = read_site(folder / "site.toml")
+    (finding,) = site_check._weather(site)
+    assert finding["level"] == "warning"
+    assert "reduced to sea level" in finding["message"]
+    (epoch,) = provenance.stored_epochs(scan_tasks.series_for(site))
+    assert provenance.CurrentConfig(site).changed_inputs(epoch.provenance, None, None) == []
+    path.write_text(text)
+    changes = provenance.CurrentConfig(site).changed_inputs(epoch.provenance, None, None)
+    assert changes == ["weather arrived later"]
+    (finding,) = site_check._weather(site)
+    assert finding["level"] == "ok"
 
 
 @pytest.mark.integration

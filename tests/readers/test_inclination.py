@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from station.errors import NotReadyError, ScanError
-from station.readers.inclination import read_inclination
+from station.readers.inclination import align_gps_week, read_inclination
+from station.science.geometry.inclination import clean
 
 
 def write_log(tmp_path, text):
@@ -67,6 +68,25 @@ def test_incomplete_last_line_is_unreadable(tmp_path):
 def test_week_seconds_continue_past_the_end_of_the_week(tmp_path):
     log = read_inclination(write_log(tmp_path, "Time,Roll,Pitch\n604799.5,0,0\n0.5,0,0\n1.5,0,0\n"))
     assert list(log.time_s) == [604_799.5, 604_800.5, 604_801.5]
+
+
+@pytest.mark.parametrize("row", [0, 300, 899, 1799])
+@pytest.mark.parametrize("start_s", [518_500.0, 603_900.0, 3_000.0])
+@pytest.mark.parametrize("wrong_s", [0.0, 604_000.5])
+def test_a_wrong_time_costs_one_row_at_any_time_of_the_week(tmp_path, row, start_s, wrong_s):
+    """On Saturdays zero could be the end of the GPS week; on Sundays the end of the week is garbage."""
+    time_s = (start_s + np.arange(1800)) % 604_800
+    expected = np.delete(start_s + np.arange(1800), row) % 604_800
+    time_s[row] = wrong_s
+    rows = [f"{second:.4f},0.1,0.2" for second in time_s]
+    log = read_inclination(write_log(tmp_path, "\n".join(["Time,Roll,Pitch", *rows, ""])))
+    cleaned, _ = clean(log, np.radians(10.0))
+    assert len(cleaned.time_s) >= 1799  # a wrong time that fits by chance is kept
+    scan_s = start_s + 900
+    aligned = align_gps_week(cleaned, scan_s)
+    assert np.isin(expected, aligned.time_s % 604_800).all()
+    assert 0 <= np.ptp(aligned.time_s) < 1801
+    assert abs(np.median(aligned.time_s) - scan_s) < 10
 
 
 @pytest.mark.parametrize(

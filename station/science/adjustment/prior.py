@@ -7,10 +7,17 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from station.quantities import AzimuthTrack, Floats, SharedParameters, TiltSeries, VarianceComponents
+from station.quantities import (
+    AzimuthTrack,
+    Floats,
+    Ints,
+    SharedParameters,
+    TiltSeries,
+    VarianceComponents,
+)
 from station.science.adjustment.line_tilt import LineTiltPrior
 from station.science.adjustment.normal_equations import LineInclination, StatePrior
-from station.science.geometry.inclination import SENSOR_STEP_RAD, CyclicError, TiltRecord
+from station.science.geometry.inclination import NO_CYCLIC_ERROR, SENSOR_STEP_RAD, CyclicError, TiltRecord
 from station.science.uncertainty.jacobian import sight_tilt_of
 from station.science.uncertainty.parameters import (
     GLOBAL,
@@ -27,6 +34,8 @@ CYCLIC_CHANGE_SHARE = 0.2  # of its amplitude, between scans: equations.md, 2.7
 MAX_CYCLIC_ERROR_RAD = math.radians(0.05)  # a larger wave is the mount's tilt, which does not change
 TILT_DRIFT_S = 300.0
 TILT_JITTER_S = 3.0
+PRIOR_INCREMENTS = 4  # of the drift in a scan's log: as many as a log of ten minutes shows
+CYCLIC_ERROR_RMS_RAD = math.radians(0.04) / math.sqrt(2)  # 0.03° to 0.05° of any phase: equations.md, 2.7
 SENSOR_BIAS_RAD = math.radians(0.0015)
 BIAS_MODES = 2  # first error modes of a `LineInclination`: bias in roll and in pitch
 HEAD_SPEED_RAD_S = math.radians(0.13)  # if the scan has no azimuth track; equations.md, 2.10
@@ -90,13 +99,15 @@ def line_inclination(
 ) -> LineInclination:
     """Return the inclination log per line group, projected on the line of sight, with its error modes.
 
+    Line groups without a sample, as in a gap, have the weight zero.
     Source: adjustment.md, 4; equations.md, 6.3.
     """
     order = np.argsort(lines.time_s)
     times_s = lines.time_s[order]
     edges_s = (times_s[1:] + times_s[:-1]) / 2
     time_s = tilt_record.unfiltered.time_s
-    inside = (time_s >= 2 * times_s[0] - edges_s[0]) & (time_s <= 2 * times_s[-1] - edges_s[-1])
+    inside = tilt_record.is_sampled(time_s)
+    inside &= (time_s >= 2 * times_s[0] - edges_s[0]) & (time_s <= 2 * times_s[-1] - edges_s[-1])
     line = order[np.searchsorted(edges_s, time_s[inside])]
     east, north, _ = tilt_rotation(tilt_record.unfiltered, to_local, time_s[inside])
     azimuth_rad = params.line_azimuth_rad
@@ -243,7 +254,8 @@ def log_only_covariance(
     """Return SharedParameters of a scan corrected by its log and the weather only, with zero estimates.
 
     The covariance holds the errors of the log: bias, change of the cyclic error, noise that passes the filter
-    and motion that the filter removes. Without a log it holds all motion.
+    and motion that the filter removes, and in its gaps and beyond its ends the motion of the mount since the
+    last sample. Without a log it holds all motion.
     """
     assumed = replace(components, tilt_rad=SENSOR_BIAS_RAD) if tilt_record else components
     drift_only = replace(components, tilt_jitter_rad=0.0, line_jitter_rad=0.0)
@@ -290,7 +302,58 @@ def _unfiltered_tilt(
         * _exponential_correlation(time_s, max(tilt_record.correlation_time_s, 1.0))
     )
     unfiltered_rad2[np.diag_indices_from(unfiltered_rad2)] += components.line_jitter_rad**2
+    if not tilt_record.is_constant:
+        unsampled, motion_rad2 = _unsampled_motion(lines, tilt_record, tilt_offset, components)
+        unfiltered_rad2[np.ix_(unsampled, unsampled)] += motion_rad2 * cos_angle[np.ix_(unsampled, unsampled)]
     return np.asarray(unfiltered_rad2)
+
+
+def _unsampled_motion(
+    lines: LineTimes, tilt_record: TiltRecord, tilt_offset: CyclicError, components: VarianceComponents
+) -> tuple[Ints, Floats]:
+    """Return the m lines without samples of the log, and the covariance (m, m) of their tilt per axis [rad²].
+
+    Beyond the log its last tilt is kept, across a gap a line is drawn. The error is the motion of the mount
+    that this omits, by the process of the tilt drift, and the noise of the ends. In an absolute log, whose
+    cyclic error is not subtracted, it is also that wave.
+    Source: equations.md, 2.9.
+    """
+    unsampled = np.flatnonzero(~tilt_record.is_sampled(lines.time_s))
+    time_s, gaps_s = lines.time_s[unsampled], tilt_record.gaps_s
+    gap = np.unique(np.searchsorted(gaps_s[:, 0], time_s) - 1)  # a log may have thousands more
+    ends_s = np.unique([*tilt_record.unfiltered.time_s[[0, -1]], *gaps_s[gap[gap >= 0]].ravel()])
+    interpolation = np.stack([np.interp(time_s, ends_s, end) for end in np.eye(len(ends_s))], axis=-1)
+    error = np.hstack([np.eye(len(time_s)), -interpolation])
+    times_s = np.concatenate([time_s, ends_s])
+    motion_rad2 = observed_drift_rad2(tilt_record, components) * _exponential_correlation(
+        times_s, TILT_DRIFT_S
+    )
+    ends = np.arange(len(time_s), len(times_s))
+    motion_rad2[ends, ends] += tilt_record.end_noise_rad**2 - tilt_record.filtered_noise_rad**2
+    if tilt_offset == NO_CYCLIC_ERROR:
+        order = np.argsort(lines.time_s)
+        azimuth_rad = np.interp(times_s, lines.time_s[order], lines.azimuth_rad[order])
+        waves_cos = np.cos(np.subtract.outer(azimuth_rad, azimuth_rad))
+        motion_rad2 += CYCLIC_ERROR_RMS_RAD**2 * waves_cos
+    return unsampled, np.asarray(error @ motion_rad2 @ error.T)
+
+
+def observed_drift_rad2(tilt_record: TiltRecord, components: VarianceComponents) -> float:
+    """Return the variance of the tilt drift per axis, from the components and the log of the scan [rad²].
+
+    The log shows it by the increments of its filtered tilt over a lag of at most its correlation time;
+    the components count as `PRIOR_INCREMENTS` of them. A scan on a windy day thus has the σ of its own drift.
+    """
+    tilt = tilt_record.tilt
+    step_s = float(tilt.time_s[1] - tilt.time_s[0])
+    lag = max(1, round(min(TILT_DRIFT_S, np.ptp(tilt.time_s) / 2) / step_s))
+    axes = np.stack([tilt.roll_rad, tilt.pitch_rad])
+    increment_rad2 = float(np.mean((axes[:, lag:] - axes[:, :-lag]) ** 2))
+    increment_rad2 = max(increment_rad2 - 2 * tilt_record.filtered_noise_rad**2, 0.0)
+    observed_rad2 = increment_rad2 / (2 * (1 - math.exp(-lag * step_s / TILT_DRIFT_S)))
+    count = float(axes.size / lag)
+    prior_share = PRIOR_INCREMENTS / (PRIOR_INCREMENTS + count)
+    return prior_share * components.tilt_drift_rad**2 + (1 - prior_share) * observed_rad2
 
 
 def cyclic_error_modes(lines: LineTimes, tilt_offset: CyclicError, direction_rad: float = 0.0) -> Floats:

@@ -153,14 +153,15 @@ def assess(
     viewing: ViewingGeometry | None,
     adjustment: Adjustment | None,
     stable_z_std: float | None,
+    faults: Sequence[str] = (),
 ) -> tuple[str, str]:
     """Return the verdict of an epoch and its reasons, the gravest first.
 
-    Unusable: flagged by a person, no usable view, or a sigma that does not cover the error. Degraded: any
-    other warning. `adjustment` is the adjustment of the scan even if it was not used in the end;
-    `stable_z_std` is given only if it was used.
+    Unusable: flagged by a person, a fault of the inputs, no usable view, or a sigma that does not cover the
+    error. Degraded: any other warning. `adjustment` is the adjustment of the scan even if it was not used in
+    the end; `stable_z_std` is given only if it was used. `faults` are those of the inputs.
     """
-    fatal = [f"flagged: {flag}"] if flag else []
+    fatal = [*([f"flagged: {flag}"] if flag else []), *faults]
     reasons = list(warnings)
     if viewing is not None and viewing.params is not None:
         visible = visibility(measurement.count, viewing)

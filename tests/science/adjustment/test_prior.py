@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from station.quantities import AzimuthTrack, TiltSeries, VarianceComponents
+from station.quantities import AzimuthTrack, InclinationLog, TiltSeries, VarianceComponents
 from station.science.adjustment import prior, variance_components
-from station.science.geometry.inclination import NO_CYCLIC_ERROR, CyclicError, TiltRecord
+from station.science.geometry.inclination import NO_CYCLIC_ERROR, CyclicError, TiltRecord, relative_tilt
 from station.science.uncertainty import parameters
 from station.science.uncertainty.jacobian import height_jacobian
 
@@ -100,7 +100,7 @@ def test_line_times_without_a_track_use_the_usual_head_speed():
 
 def tilt_record(time_s, roll_rad, pitch_rad, noise_rad=1e-4):
     tilt = TiltSeries(time_s, roll_rad, pitch_rad)
-    return TiltRecord(tilt, tilt, 0.0, 0.0, noise_rad, noise_rad / 5, 20.0, 0.02, 0.0, 2.5, 1.0)
+    return TiltRecord(tilt, tilt, 0.0, 0.0, noise_rad, noise_rad / 5, 20.0, 0.02, 0.0, 2.5, np.empty((0, 2)))
 
 
 def elevation_change(head_azimuth_rad, roll_rad, pitch_rad):
@@ -316,6 +316,157 @@ def test_log_only_covariance_is_valid_and_smaller_with_a_log():
         assert len(shared.names) == len(shared.estimate) == len(shared.line_tilt_variance)
     assert (jacobian.variance(with_log) < jacobian.variance(without)).all()
     assert jacobian.variance(with_log).mean() < 0.5 * jacobian.variance(without).mean()
+
+
+SCAN_S = 1791.0
+TILT_ONLY = replace(
+    COMPONENTS, heading_rad=1e-9, translation_m=1e-6, range_bias_m=1e-6, range_scale_ppm=1e-6,
+    refraction=1e-6, refraction_by_azimuth=1e-9,
+)  # fmt: skip
+
+
+def true_motion(rng, time_s, scale):
+    """Tilt of the mount (2, n) [°]: a random walk and a sinusoid, not the process that the prior assumes."""
+    walk = np.cumsum(rng.normal(0, 0.0022 / math.sqrt(SCAN_S), (2, len(time_s))), axis=1)
+    period_s, phase = rng.uniform(500, 2500, (2, 1)), rng.uniform(0, 2 * math.pi, (2, 1))
+    return scale * (walk + 0.0015 * np.sin(2 * math.pi * time_s / period_s + phase))
+
+
+def heights_after_a_faulty_log(rng, keep, mode, scale):
+    """Height errors [m] of points on unchanged ground, their sigma, and whether the log has samples there.
+
+    The points are rotated by the true and by the applied tilt with SciPy. In absolute mode the log holds a
+    wave of 0.03° to 0.05° over the turn, which belongs to the tilt.
+    """
+    params = parameters.ParameterLayout(0.0, 120, full_circle=False)
+    track = AzimuthTrack(np.linspace(0, SCAN_S, 400), np.radians(90 - np.linspace(1, 119, 400)))
+    time_s = np.arange(-5.0, SCAN_S + 5)
+    azimuth_rad = np.interp(time_s, track.time_s, track.azimuth_rad)
+    phase_rad, amplitude_deg = rng.uniform(0, 2 * math.pi, 2), rng.uniform(0.03, 0.05, 2)
+    wave_deg = amplitude_deg[:, None] * np.cos(azimuth_rad - phase_rad[:, None])
+    tilt_deg = true_motion(rng, time_s, scale) + rng.normal(0, 0.007, (2, 1))
+    sway_deg = rng.normal(0, 0.001, (2, len(time_s)))
+    sensor_deg = rng.normal(0, 0.008, (2, len(time_s))) + rng.normal(0, 0.0015, (2, 1))
+    if mode == "absolute":
+        tilt_offset, tilt_deg = NO_CYCLIC_ERROR, tilt_deg + wave_deg
+    else:
+        cosine, sine = (
+            np.radians(amplitude_deg) * np.cos(phase_rad),
+            np.radians(amplitude_deg) * np.sin(phase_rad),
+        )
+        tilt_offset = CyclicError((0.0, cosine[0], sine[0]), (0.0, cosine[1], sine[1]))
+        sensor_deg += wave_deg * (1 + 0.2 * rng.standard_normal((2, 1)))
+    roll_rad, pitch_rad = np.radians(tilt_deg + sway_deg + sensor_deg)
+    kept = keep(time_s)
+    log = InclinationLog(time_s[kept], roll_rad[kept], pitch_rad[kept])
+    record = relative_tilt(log, track, tilt_offset, math.radians(0.008)) if kept.any() else None
+
+    north_azimuth_rad, range_m = np.radians(rng.uniform(2, 118, 300)), rng.uniform(500, 3000, 300)
+    offset_m = range_m * np.sin(north_azimuth_rad), range_m * np.cos(north_azimuth_rad), np.full(300, -200.0)
+    shot_s = np.interp(-north_azimuth_rad, -(math.pi / 2 - track.azimuth_rad)[::-1], track.time_s[::-1])
+    true_rad = np.radians([np.interp(shot_s, time_s, axis) for axis in tilt_deg + sway_deg])
+    applied_rad = np.zeros((2, 300))
+    if record is not None:
+        applied_rad = np.array(
+            [
+                np.interp(shot_s, record.tilt.time_s, axis)
+                for axis in (record.tilt.roll_rad, record.tilt.pitch_rad)
+            ]
+        )
+    rotated_m = [
+        Rotation.from_rotvec(np.vstack([tilt_rad, np.zeros(300)]).T).apply(np.array(offset_m).T)[:, 2]
+        for tilt_rad in (true_rad, applied_rad)
+    ]
+    line = (np.degrees(north_azimuth_rad) * 5).astype(int)
+    constant, cosine, sine = np.radians(0.002) * rng.standard_normal(3)
+    sensor_rad = (
+        constant + cosine * np.cos(2 * north_azimuth_rad) + sine * np.sin(2 * north_azimuth_rad)
+    ) / 2**0.5
+    line_rad = np.radians(0.0008) * rng.standard_normal(600)[line] + (
+        sensor_rad if record is not None else 0.0
+    )
+    lines = prior.line_times(params, np.eye(3), track)
+    shared = prior.log_only_covariance(params, lines, record, tilt_offset, TILT_ONLY, weather_known=True)
+    sigma_m = np.sqrt(height_jacobian(params, offset_m, np.zeros(300), np.zeros(300)).variance(shared))
+    return rotated_m[0] - rotated_m[1] + range_m * line_rad, sigma_m, keep(shot_s)
+
+
+LOG_FAULTS = {
+    "ends early": lambda time_s: time_s < 299,
+    "begins late": lambda time_s: time_s > 1200,
+    "gap": lambda time_s: (time_s < 500) | (time_s > 1300),
+    "missing": lambda time_s: np.zeros(len(time_s), bool),
+}
+
+
+@pytest.mark.integration
+@pytest.mark.parametrize("scale", [1.0, 2.0])
+@pytest.mark.parametrize(
+    ("mode", "fault"),
+    [*(("relative", fault) for fault in LOG_FAULTS), ("absolute", "ends early"), ("absolute", "begins late")],
+)
+def test_sigma_covers_the_motion_that_a_faulty_log_misses(mode, fault, scale):
+    """Change over sigma where the log has no samples; twice the motion that the components expect, too."""
+    rng = np.random.default_rng(11)
+    z = []
+    for _ in range(60):
+        error_m, sigma_m, sampled = heights_after_a_faulty_log(rng, LOG_FAULTS[fault], mode, scale)
+        z.append((error_m / sigma_m)[~sampled])
+    assert 0.8 < np.sqrt(np.mean(np.square(np.concatenate(z)))) < 1.25
+
+
+@pytest.mark.parametrize(
+    ("mode", "fault", "factor"),
+    [
+        ("relative", "ends early", 1.1),
+        ("relative", "gap", 1.04),
+        ("absolute", "ends early", 5.0),
+        ("absolute", "gap", 2.0),
+    ],
+)
+def test_sigma_is_wider_where_the_log_has_no_samples(mode, fault, factor):
+    """Little in relative mode, where a fifth of the cyclic error is unknown in any case."""
+    _, full_m, _ = heights_after_a_faulty_log(np.random.default_rng(3), lambda t: t < 1e9, mode, 1.0)
+    _, faulty_m, sampled = heights_after_a_faulty_log(np.random.default_rng(3), LOG_FAULTS[fault], mode, 1.0)
+    ratio = faulty_m / full_m
+    assert np.median(ratio[sampled]) == pytest.approx(1.0, abs=0.1)
+    assert factor < np.median(ratio[~sampled]) < 2 * factor
+
+
+@pytest.mark.parametrize("ends_early_s", [37.5, 307.5, 1102.5])
+def test_variance_grows_with_the_time_since_the_last_sample(ends_early_s):
+    """By 2 σ² (1 - e^(-Δt / 300 s)); the log of 600 s saw no drift and counts as much as the component."""
+    params = parameters.ParameterLayout(0.0, 120, full_circle=False)
+    track = AzimuthTrack(np.linspace(0, 1800, 400), np.radians(np.linspace(90, -30, 400)))
+    time_s = np.arange(0.0, 601.0)
+    log = tilt_record(time_s, 0 * time_s, 0 * time_s, noise_rad=1e-8)
+    lines = prior.line_times(params, np.eye(3), track)
+    shared = prior.log_only_covariance(
+        params, lines, log, CyclicError((1e-9, 0.0, 0.0), (0.0, 0.0, 0.0)), TILT_ONLY, weather_known=True
+    )
+    azimuth_rad = np.radians(np.array([307.5, 600.0 + ends_early_s]) * 120 / 1800)  # between knots
+    offset_m = 1000 * np.sin(azimuth_rad), 1000 * np.cos(azimuth_rad), np.zeros(2)
+    within_m2, beyond_m2 = height_jacobian(params, offset_m, np.zeros(2), np.zeros(2)).variance(shared)
+    drift_rad2 = math.radians(0.0018) ** 2 / 2
+    expected_m2 = 1000**2 * 2 * drift_rad2 * (1 - math.exp(-ends_early_s / 300))
+    assert beyond_m2 - within_m2 == pytest.approx(expected_m2, rel=0.06)
+
+
+@pytest.mark.parametrize("keep", [lambda t: (t < 100) | (t > 160), lambda t: t < 100, lambda t: t > 100])
+def test_lines_without_samples_have_no_weight_in_the_adjustment(keep):
+    """A bridged gap is no observation."""
+    params = parameters.ParameterLayout(0.0, 30, full_circle=False)
+    track = AzimuthTrack(np.linspace(0, 230, 100), np.radians(np.linspace(90, 60, 100)))
+    time_s = np.arange(-5.0, 235.0)
+    time_s = time_s[keep(time_s)]
+    record = relative_tilt(InclinationLog(time_s, 0 * time_s, 0 * time_s), track, NO_CYCLIC_ERROR, 1e-4)
+    lines = prior.line_times(params, np.eye(3), track)
+    log = prior.line_inclination(params, lines, record, NO_CYCLIC_ERROR, np.eye(3))
+    sampled = keep(lines.time_s + 1) & keep(lines.time_s - 1)  # line groups last 1.5 s
+    unsampled = ~keep(lines.time_s + 1) & ~keep(lines.time_s - 1)
+    assert (log.weight[sampled] > 0).all()
+    assert not log.weight[unsampled].any()
+    assert unsampled.sum() > 20
 
 
 def test_cross_tilt_is_correlated_like_tilt_drift():

@@ -1,10 +1,12 @@
-"""Inclination log: cleaning, cyclic error, clock offset, low-pass filter and relative tilt."""
+"""Inclination log: cleaning, axes, cyclic error, clock offset, low-pass filter, gaps and relative tilt."""
 
 import math
+from itertools import combinations
 
 import numpy as np
 import pytest
 from scipy import signal
+from scipy.spatial.transform import Rotation
 
 from station.quantities import AzimuthTrack, InclinationLog
 from station.science.geometry import inclination
@@ -34,6 +36,97 @@ def test_clean_removes_spikes_invalid_values_and_times_that_do_not_increase():
     assert dropped == 5
     assert np.all(np.diff(cleaned.time_s) > 0)
     assert np.all(cleaned.roll_rad == 0.01)
+
+
+@pytest.mark.parametrize(
+    ("rows", "wrong_s"),
+    [
+        ([300], 5300.0),
+        ([10], 5010.0),
+        ([0], 0.0),
+        ([1799], 7000.0),
+        ([900], 0.0),
+        ([5, 700, 701, 702, 1500], 9e4),
+    ],
+    ids=["ahead", "ahead near the start", "first", "last", "zero", "several"],
+)
+def test_a_wrong_time_costs_its_own_row_only(rows, wrong_s):
+    time_s = 1000.0 + np.arange(1800)
+    time_s[rows] = wrong_s
+    cleaned, dropped = inclination.clean(inclination_log(*np.zeros((2, 1800)), time_s), RANGE)
+    assert dropped == len(rows)
+    assert np.array_equal(cleaned.time_s, np.delete(1000.0 + np.arange(1800), rows))
+
+
+@pytest.mark.parametrize(("back_s", "kept"), [(100, 1700), (1000, 900)])
+def test_a_clock_that_is_set_back_costs_the_repeated_time_only(back_s, kept):
+    time_s = np.arange(1800.0) - back_s * (np.arange(1800) >= 900)
+    cleaned, _ = inclination.clean(inclination_log(*np.zeros((2, 1800)), time_s), RANGE)
+    assert len(cleaned.time_s) == kept
+    assert np.all(np.diff(cleaned.time_s) > 0)
+
+
+def test_as_many_rows_as_possible_are_kept():
+    """Against all subsets of nine rows."""
+    rng = np.random.default_rng(1)
+    for _ in range(100):
+        time_s = rng.integers(0, 9, 9).astype(float)
+        cleaned, _ = inclination.clean(inclination_log(*np.zeros((2, 9)), time_s), RANGE)
+        largest = max(
+            size
+            for size in range(1, 10)
+            if any(np.all(np.diff(time_s[list(rows)]) > 0) for rows in combinations(range(9), size))
+        )
+        assert len(cleaned.time_s) == largest
+        assert np.all(np.diff(cleaned.time_s) > 0)
+
+
+MOUNT = (
+    Rotation.from_euler("z", -75, degrees=True)
+    * Rotation.from_euler("y", -1.3, degrees=True)
+    * Rotation.from_euler("x", 2.1, degrees=True)
+).as_matrix()  # heading, pitch, roll: equations.md, 2.5
+
+
+@pytest.mark.parametrize(
+    ("roll_deg", "pitch_deg", "fault"),
+    [
+        (2.1, -1.3, None),
+        (-2.1, -1.3, "roll has the opposite sign"),
+        (2.1, 1.3, "pitch has the opposite sign"),
+        (-2.1, 1.3, "roll and pitch have the opposite sign"),
+        (-1.3, 2.1, "roll and pitch are swapped"),
+        (1.3, -2.1, "roll and pitch are swapped and have the opposite sign"),
+        (-1.3, -2.1, "roll and pitch are swapped and the true roll has the opposite sign"),
+        (1.3, 2.1, "roll and pitch are swapped and the true pitch has the opposite sign"),
+        (3.4, 0.2, None),  # moved by degrees
+        (0.0, 0.0, None),
+    ],
+)
+def test_wrong_axes_of_a_log_are_named(roll_deg, pitch_deg, fault):
+    """The sensor is off by its constant and its wave, up to 0.05° each: equations.md, 2.7."""
+    rng = np.random.default_rng(5)
+    wave = np.radians(0.05) * np.sin(np.linspace(0, 3, 900))
+    noise = rng.normal(0, NOISE, (2, 900))
+    bias = np.radians(0.03)
+    log = inclination_log(
+        np.radians(roll_deg) + bias + wave + noise[0], np.radians(pitch_deg) - bias - wave + noise[1]
+    )
+    actual = inclination.axes_warnings(log, MOUNT)
+    if fault is None:
+        assert actual == []
+    else:
+        (message,) = actual
+        assert f"are wrong: {fault} (" in message
+        assert "in the SOP 2.10, -1.30" in message
+
+
+@pytest.mark.parametrize("roll_deg", [0.0, 0.06])
+def test_axes_of_a_level_mount_cannot_be_told(roll_deg):
+    mount = Rotation.from_euler("x", roll_deg, degrees=True).as_matrix()
+    noise = np.random.default_rng(6).normal(0, NOISE, (2, 900))
+    log = inclination_log(noise[0] - np.radians(roll_deg + 0.03), noise[1] + np.radians(0.03))
+    assert inclination.axes_warnings(log, mount) == []
 
 
 def test_clean_of_a_log_without_valid_rows():
@@ -178,6 +271,30 @@ def test_relative_tilt_passes_drift_and_removes_noise():
     assert np.degrees(record.noise_rad) == pytest.approx(0.008, abs=0.001)
     error = np.degrees(np.concatenate([record.tilt.roll_rad - drift, record.tilt.pitch_rad]))
     assert error.std() == pytest.approx(np.degrees(record.filtered_noise_rad), rel=0.5)
+
+
+def test_a_gap_is_bridged_without_the_noise_of_single_samples():
+    """Means of ten samples: noise of 0.008° / √10 at both sides, against 0.008° of the nearest sample."""
+    rng = np.random.default_rng(9)
+    time_s = np.r_[np.arange(0.0, 300.0), np.arange(600.0, 900.0)]
+    errors = []
+    for _ in range(200):
+        noise = rng.normal(0, NOISE, (2, len(time_s)))
+        record = inclination.relative_tilt(
+            inclination_log(*noise, time_s), None, NO_CYCLIC_ERROR, NOISE, cutoff_hz=0.82 / 61
+        )
+        errors.append(np.interp([345.0, 555.0], record.tilt.time_s, record.tilt.roll_rad))
+    assert record.gaps_s.tolist() == [[299.0, 600.0]]
+    # 45 of 301 s into the gap: the means have the weights 0.85 and 0.15
+    assert np.std(errors) == pytest.approx(NOISE / math.sqrt(10) * math.hypot(0.85, 0.15), rel=0.15)
+    assert record.end_noise_rad == pytest.approx(NOISE / math.sqrt(10), rel=0.15)
+    sampled = record.is_sampled(np.array([-1.0, 0.0, 299.0, 300.0, 599.0, 600.0, 899.0, 900.0]))
+    assert sampled.tolist() == [False, True, True, False, False, True, True, False]
+
+
+def test_a_slow_log_has_no_gaps():
+    log = inclination_log(*np.zeros((2, 100)), np.arange(0.0, 1200.0, 12.0))
+    assert len(inclination.relative_tilt(log, None, NO_CYCLIC_ERROR, NOISE, filtered=False).gaps_s) == 0
 
 
 def test_mean_tilt_of_a_real_log(shared_data):
