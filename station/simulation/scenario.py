@@ -253,7 +253,7 @@ def named(name: str, hours: int = 24, seed: int = 1) -> Scenario:
             "range_max_m": 4000.0,
         },
         "snow-no-brightness": {**snow, "brightness": "none"},
-        "ice-refraction": {"refraction_ice_sigma": 0.1, "ice_layer_k": 5.0},
+        "ice-refraction": {"refraction_ice_sigma": 0.1},
         "settling": {
             "settling_m_per_h": 0.05 / later_hours,
             "settling_from_hour": after,

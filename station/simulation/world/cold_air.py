@@ -59,6 +59,9 @@ def added_coefficient(
     constant coefficient of 2/L² ∫ k(u) u du gives the same.
     """
     bearing_rad, slope, coefficient = ray
+    if not cold_air.at_ice:
+        end_m = eye_m[0] + along_m * np.cos(bearing_rad), eye_m[1] + along_m * np.sin(bearing_rad)
+        return cold_air.whole_path * ice.at(*end_m)
     share = 1 - (np.arange(QUADRATURE_POINTS)[:, None] + 0.5) / QUADRATURE_POINTS
     from_end = share**QUADRATURE_POWER
     width = QUADRATURE_POWER * share ** (QUADRATURE_POWER - 1) / QUADRATURE_POINTS
