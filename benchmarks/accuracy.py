@@ -20,6 +20,7 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks.accuracy_stations import (  # isort: skip - sets the number of BLAS threads before numpy loads
+    FIELD_NAMES,
     METHODS,
     NAMES,
     processed,
@@ -313,7 +314,7 @@ def _table(title: str, heads: tuple[str, ...], rows: Iterable[tuple[str, ...]]) 
 
 def _arguments() -> argparse.Namespace:
     parser = argparse.ArgumentParser(description="Accuracy of the station against simulated truth.")
-    parser.add_argument("--scenario", nargs="+", choices=NAMES, default=list(NAMES))
+    parser.add_argument("--scenario", nargs="+", choices=(*NAMES, *FIELD_NAMES), default=list(NAMES))
     parser.add_argument("--method", nargs="+", choices=list(METHODS), default=list(METHODS))
     parser.add_argument("--only", nargs="+", choices=PARTS, default=list(PARTS))
     parser.add_argument("--seed", type=int, default=1)

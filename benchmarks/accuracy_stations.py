@@ -16,6 +16,7 @@ from station.config import Site, read_site
 from station.inbox.inbox import ScanFile
 from station.processing import reference_tasks, scan_tasks, store_tasks
 from station.simulation import files
+from station.simulation.scenario import NAMES as SIMULATED_NAMES
 from station.simulation.scenario import Scenario, full_resolution, named
 from station.simulation.station import Station, simulate
 
@@ -24,6 +25,7 @@ REFERENCE_SCANS, SMALL_REFERENCE_SCANS = 8, 5
 SNOW_HOURS, SMALL_SNOW_HOURS = (14.0, 24.0), (8.0, 13.0)
 AVALANCHE_HOUR, SMALL_AVALANCHE_HOUR = 24.0, 14.0
 NAMES = ("calm", "snow", "melt", "avalanche")
+FIELD_NAMES = tuple(name for name in SIMULATED_NAMES if name not in NAMES)  # on request
 LATE_S = 5.0
 SHIFT_M = 100_000.0
 
@@ -51,7 +53,7 @@ METHODS = {
 
 
 def scenario_of(name: str, seed: int, *, small: bool) -> Scenario:
-    """Return the scenario of a station.
+    """Return the scenario of a station: one of NAMES with its own hours, or one of the simulation's.
 
     The roof of the hut stays free of snow. The method chooses the stable polygons.
     """
@@ -68,9 +70,9 @@ def scenario_of(name: str, seed: int, *, small: bool) -> Scenario:
             "avalanche_hour": SMALL_AVALANCHE_HOUR if small else AVALANCHE_HOUR,
         },
     }
-    scenario = named("poor", hours, seed)
+    scenario = replace(named("poor" if name in events else name, hours, seed), stable_ground="poor")
     scenario = scenario if small else full_resolution(scenario)
-    return replace(scenario, reference_scans=reference, **events[name])
+    return replace(scenario, reference_scans=reference, **events.get(name, {}))
 
 
 def simulated(folder: Path, scenario: Scenario, name: str) -> Path:

@@ -8,15 +8,19 @@ from pathlib import Path
 
 import laspy
 import numpy as np
+from numpy.typing import NDArray
 
 from station.quantities import Floats, Grid, InclinationLog, WeatherLog
 from station.simulation.instrument.scan import SimulatedScan
-from station.simulation.scenario import Scenario
+from station.simulation.scenario import SCANNER_MODELS, Scenario
 from station.simulation.truth import CRS, HEIGHT_M, LATITUDE_DEG, LONGITUDE_DEG
 from station.simulation.world.air import SCANNER_SETTING
 
 NAME_FORMAT = "%y%m%d_%H%M%S"  # RIEGL's convention: start of the scan in UTC
 SCALE_M = 0.00025  # RIEGL's convention
+DECIBEL_STEP = 0.01  # of RIEGL's extra bytes
+DECIBEL_LIMITS = (-25.0, 5.0)  # scaled to 16 bit, as PDAL's readers.rxp does
+FAINTEST = 1e-4  # reflectance that is recorded for less
 
 
 def stem(scenario: Scenario, scan: int) -> str:
@@ -24,9 +28,15 @@ def stem(scenario: Scenario, scan: int) -> str:
     return f"{datetime.fromtimestamp(scenario.scan_start_utc_s(scan), UTC):{NAME_FORMAT}}"
 
 
-def write_scan(path: Path, scan: SimulatedScan, start_utc_s: float) -> None:
+def write_scan(path: Path, scan: SimulatedScan, start_utc_s: float, scenario: Scenario) -> None:
     """Write LAZ 1.4, point format 6: scanner's frame, scanner's seconds, one echo per shot."""
     header = laspy.LasHeader(point_format=6, version="1.4")
+    if scenario.brightness == "reflectance":
+        header.add_extra_dim(
+            laspy.ExtraBytesParams(
+                "Reflectance", np.int16, "Echo signal reflectance [dB]", [0.0], [DECIBEL_STEP]
+            )
+        )
     header.scales = np.full(3, SCALE_M)
     header.offsets = np.zeros(3)
     header.system_identifier = "station simulate"
@@ -35,10 +45,31 @@ def write_scan(path: Path, scan: SimulatedScan, start_utc_s: float) -> None:
     las = laspy.LasData(header)
     las.x, las.y, las.z = scan.x_m, scan.y_m, scan.z_m
     las.gps_time = scan.time_s
-    las.intensity = np.rint(65535 * scan.intensity).astype(np.uint16)
+    las.intensity = _recorded_brightness(scan, scenario)
+    if scenario.brightness == "reflectance":
+        las["Reflectance"] = _decibel(scan)
     las.return_number = np.ones(len(scan.x_m), dtype=np.uint8)
     las.number_of_returns = np.ones(len(scan.x_m), dtype=np.uint8)
     las.write(path)
+
+
+def _recorded_brightness(scan: SimulatedScan, scenario: Scenario) -> NDArray[np.uint16]:
+    """Return the field `intensity` of each echo (n,)."""
+    if scenario.brightness == "none":
+        return np.zeros(len(scan.intensity), dtype=np.uint16)
+    if scenario.brightness == "decibel":
+        low, high = DECIBEL_LIMITS
+        return np.rint(65535 * np.clip((_decibel(scan) - low) / (high - low), 0, 1)).astype(np.uint16)
+    intensity = scan.intensity
+    if scenario.intensity_reference_m:
+        square_m = scan.x_m**2 + scan.y_m**2 + scan.z_m**2
+        intensity = np.clip(intensity * scenario.intensity_reference_m**2 / square_m, 0, 1)
+    return np.rint((255 if scenario.brightness == "8bit" else 65535) * intensity).astype(np.uint16)
+
+
+def _decibel(scan: SimulatedScan) -> Floats:
+    """Return the reflectance of each echo relative to a white target square to the beam (n,) [dB]."""
+    return np.asarray(10 * np.log10(np.maximum(scan.intensity, FAINTEST)))
 
 
 def write_inclination(path: Path, log: InclinationLog) -> None:
@@ -103,6 +134,7 @@ def write_site(path: Path, scenario: Scenario, grid: Grid) -> None:
         east=grid.west_m + grid.nx * grid.cell_m,
         north=grid.north_m,
         cell=grid.cell_m,
+        model=f'"{SCANNER_MODELS[scenario.wavelength_nm]}"'.ljust(27),
         divergence=scenario.beam_divergence_mrad,
         range_sigma=max(scenario.range_noise_m, 0.001),
         sensor_sigma=max(scenario.log_noise_deg, 0.0005),
@@ -130,7 +162,7 @@ settle_s = 2                       # a file that has not grown for this long is 
 expected_every_s = 3600
 
 [scanner]
-model = "riegl-vz-6000"            # the other specifications follow from the model
+model = {model}# the other specifications follow from the model
 beam_divergence_mrad = {divergence}
 range_sigma_m = {range_sigma}
 inclination_sigma_deg = {sensor_sigma}

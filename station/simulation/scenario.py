@@ -9,17 +9,26 @@ from typing import Any, Literal
 
 from station.errors import ConfigError
 
-NAMES = ("quiet", "drift", "wind", "snowfall", "melt", "avalanche", "poor", "fog", "moved")  # for `named`
+NAMES = (  # for `named`
+    "quiet", "drift", "wind", "snowfall", "melt", "avalanche", "poor", "fog", "moved",
+    "rough", "rough-poor", "airborne", "airborne-heavy", "snow-db", "snow-1550", "snow-no-brightness",
+    "ice-refraction", "settling", "melt-height", "winter", "summer", "disturbed", "log-cut", "log-missing",
+    "log-time", "log-swapped", "breathing",
+)  # fmt: skip
+
+SCANNER_MODELS = {1064: "riegl-vz-6000", 1550: "riegl-vz-4000"}  # by wavelength [nm]
 
 # Fields set to zero by without_errors(): every difference between a shot and its ideal point.
 ERRORS = (
     "air", "refraction_sigma", "refraction_azimuth_sigma", "lapse_sigma_k_per_m", "path_temperature_sigma_k",
-    "refraction_patch_sigma", "fog_visibility_m",
+    "refraction_patch_sigma", "refraction_ice_sigma", "ice_layer_k", "fog_visibility_m",
     "tilt_drift_deg", "tilt_within_scan_deg", "sway_deg", "wind_sway_deg", "tilt_jerk_deg",
+    "tilt_daily_deg", "tilt_walk_deg", "season_deg",
     "line_jitter_deg", "mirror_wobble_deg", "heading_deg", "position_m", "moved_hour", "moved_deg", "moved_m",
-    "range_bias_m", "range_noise_m", "beam_divergence_mrad", "echo_loss",
-    "log_noise_deg", "log_bias_deg", "log_cyclic_deg", "log_cyclic_change", "log_clock_s",
-    "melt_m_per_h", "snowfall_m", "avalanche_m",
+    "range_bias_m", "range_noise_m", "beam_divergence_mrad", "echo_loss", "airborne_share", "airborne_clouds",
+    "log_noise_deg", "log_bias_deg", "log_cyclic_deg", "log_cyclic_change", "log_clock_s", "log_fault",
+    "melt_m_per_h", "snowfall_m", "avalanche_m", "settling_m_per_h", "winter_m", "summer_melt_m",
+    "heave_m", "creep_m",
 )  # fmt: skip
 
 
@@ -39,6 +48,7 @@ class Scenario:
     terrain_step_m: float = 2.0
     roughness_m: float = 0.10
     roughness_length_m: float = 80.0  # shortest wavelength of the roughness
+    rough_rock_m: float = 0.0  # relief of the rock between 6 and 400 m of wavelength, times size
     cell_m: float = 5.0
     extent_m: tuple[float, float, float, float] = (-3700.0, 350.0, 1100.0, 2650.0)  # W S E N, times size
 
@@ -63,6 +73,9 @@ class Scenario:
     refraction_sigma: float = 0.07  # of k from scan to scan, about the value from temperature and pressure
     refraction_azimuth_sigma: float = 0.02  # of k over azimuth within a scan
     refraction_patch_sigma: float = 0.0  # of k in patches of azimuth with sharp edges, new in each scan
+    refraction_ice_sigma: float = 0.0  # of k from scan to scan, for the whole path of rays that end on ice
+    ice_layer_k: float = 0.0  # added to k at the ice by a layer of cold air, on average
+    ice_layer_m: float = 3.0  # height over the ice at which that is down to 1/e
     lapse_sigma_k_per_m: float = 0.0015
     path_temperature_sigma_k: float = 0.7  # of the air over the glacier relative to the thermometer
     fog_visibility_m: float = 0.0  # during fog_hours; 0 is no fog
@@ -74,7 +87,10 @@ class Scenario:
     sway_deg: float = 0.0010  # over seconds
     wind_sway_deg: float = 0.0  # over seconds within gusts, zero between them
     tilt_jerk_deg: float = 0.0  # of sudden steps, about two per scan, that decay within minutes
+    tilt_daily_deg: float = 0.0  # amplitude of a wave of 24 h
+    tilt_walk_deg: float = 0.0  # random walk: standard deviation after a day
     line_jitter_deg: float = 0.0008  # of each line's elevation; not observed by the sensor
+    line_jitter_freedom: float = 0.0  # Student's t with these degrees of freedom, above 2; 0 is normal
     mirror_wobble_deg: float = 0.0  # the same, but periodic over a few lines
     heading_deg: float = 0.0010  # of each scan
     position_m: float = 0.002  # of each scan, each axis
@@ -88,12 +104,27 @@ class Scenario:
     beam_divergence_mrad: float = 0.12
     echo_loss: float = 0.02  # share of shots without an echo
 
+    # snow, rain, dust and birds: echoes from the air instead of the ground
+    airborne_share: float = 0.0  # of all shots
+    airborne: Literal["near", "along"] = "near"  # density along the way: inverse to the range, or even
+    airborne_clouds: float = 0.0  # share of the scans with a dense cloud within 150 m
+
+    # brightness in the files: linear in 16 bit; the same with RIEGL's extra bytes "Reflectance" in dB; -25 to
+    # 5 dB in 16 bit; linear in 8 bit; none
+    brightness: Literal["linear", "reflectance", "decibel", "8bit", "none"] = "linear"
+    wavelength_nm: Literal[1064, 1550] = 1064
+    intensity_reference_m: float = (
+        0.0  # raw intensity falls with the square of the range over this; 0: corrected
+    )
+
     # the inclination sensor
     log_noise_deg: float = 0.008
     log_bias_deg: float = 0.0015  # of each scan
     log_cyclic_deg: float = 0.035  # amplitude of the cyclic error over one turn
     log_cyclic_change: float = 0.15  # relative change of the amplitude from scan to scan
     log_clock_s: float = 2.0  # clock offset of each scan's log, clipped at 5 s
+    log_fault: Literal["", "cut", "missing", "time", "swapped", "flipped"] = ""
+    log_fault_hour: float = 0.0  # of the first scan with that fault
 
     # surface change
     melt_m_per_h: float = 0.0  # of ice at the end of the tongue; zero 450 m (times size) higher
@@ -103,6 +134,14 @@ class Scenario:
     avalanche_m: float = 0.0  # height of the deposit
     avalanche_hour: float = 15.0
     avalanche_size: float = 1.0  # of release and deposit; at 1 the deposit is 300 m long
+    settling_m_per_h: float = 0.0  # of ice at 3 km (times size), in proportion to its distance
+    settling_from_hour: float = 0.0
+    season_hour: float = 0.0  # as if months had passed before this hour; 0 is never
+    season_deg: float = 0.0  # tilt and rotation of the scanner in these months
+    winter_m: float = 0.0  # mean depth of the snow that fell in them, with drifts
+    summer_melt_m: float = 0.0  # what melted in them at the end of the tongue; zero 450 m (times size) higher
+    heave_m: float = 0.0  # of rock: half of its variance over the day, half random from scan to scan
+    creep_m: float = 0.0  # displacement of part of the rock over the whole series
 
     # known stable ground: rock all round, or only a far ridge and a hut that snow never covers
     stable_ground: Literal["good", "poor"] = "good"
@@ -115,10 +154,16 @@ class Scenario:
             raise ConfigError("scan_s must be above 0 and at most 3000, to end before the next hour")
         if self.start.tzinfo is None:
             raise ConfigError("start has no time zone: use datetime(..., tzinfo=UTC)")
+        if not 0 <= self.airborne_share <= 1 or not 0 <= self.airborne_clouds <= 1:
+            raise ConfigError("airborne_share and airborne_clouds are shares: use values from 0 to 1")
+        if self.line_jitter_freedom and self.line_jitter_freedom <= 2:
+            raise ConfigError("line_jitter_freedom must be above 2, or 0 for a normal distribution")
+        if self.wavelength_nm not in SCANNER_MODELS:
+            raise ConfigError(f"wavelength_nm must be one of {', '.join(map(str, SCANNER_MODELS))}")
 
     def without_errors(self) -> Scenario:
         """Return the same station with every error and every change switched off."""
-        return replace(self, **{name: type(getattr(self, name))(0) for name in ERRORS})
+        return replace(self, **{name: type(getattr(self, name))() for name in ERRORS})
 
     @property
     def start_utc_s(self) -> float:
@@ -166,13 +211,21 @@ def demo(hours: int = 24, seed: int = 1) -> Scenario:
     )
 
 
+DAILY_TILT = {"tilt_daily_deg": 0.005, "tilt_walk_deg": 0.003}
+ROUGH = {"rough_rock_m": 7.0, "terrain_step_m": 2.0, **DAILY_TILT}
+
+
 def named(name: str, hours: int = 24, seed: int = 1) -> Scenario:
     """Return the demo's valley with all usual errors and one special condition.
 
-    It sets in after the scans of the reference. Raises ConfigError if the name is not in NAMES.
+    Events set in after the scans of the reference; terrain, air, motion and breathing rock are there from the
+    start. Raises ConfigError if the name is not in NAMES.
     """
     reference_scans = min(8, max(1, hours // 3))
+    after = float(reference_scans)
     base = replace(demo(hours, seed), melt_m_per_h=0.0, avalanche_m=0.0)
+    later_hours = max(1.0, hours - after)
+    snow = {"snowfall_m": 0.4, "snow_hours": (hours / 2, float(hours))}
     overrides: dict[str, dict[str, Any]] = {
         "quiet": {},
         "drift": {
@@ -181,12 +234,51 @@ def named(name: str, hours: int = 24, seed: int = 1) -> Scenario:
             "tilt_jerk_deg": 0.002,
         },
         "wind": {"wind_sway_deg": 0.002, "mirror_wobble_deg": 0.0005},
-        "snowfall": {"snowfall_m": 0.4, "snow_hours": (hours / 2, float(hours))},
-        "melt": {"melt_m_per_h": 0.005, "melt_from_hour": float(reference_scans)},
+        "snowfall": snow,
+        "melt": {"melt_m_per_h": 0.005, "melt_from_hour": after},
         "avalanche": {"avalanche_m": 2.0, "avalanche_hour": 2 * hours / 3, "avalanche_size": 0.11},
         "poor": {"stable_ground": "poor"},
         "fog": {"fog_visibility_m": 1500.0, "fog_hours": (hours / 3, 2 * hours / 3)},
         "moved": {"moved_hour": hours / 2, "moved_deg": 0.02, "moved_m": 0.005},
+        "rough": ROUGH,
+        "rough-poor": {**ROUGH, "stable_ground": "poor"},
+        "airborne": {"airborne_share": 0.001},
+        "airborne-heavy": {"airborne_share": 0.01, "airborne_clouds": 0.3},
+        "snow-db": {**snow, "brightness": "decibel"},
+        "snow-1550": {
+            **snow,
+            "brightness": "reflectance",
+            "wavelength_nm": 1550,
+            "beam_divergence_mrad": 0.15,
+            "range_max_m": 4000.0,
+        },
+        "snow-no-brightness": {**snow, "brightness": "none"},
+        "ice-refraction": {"refraction_ice_sigma": 0.1},
+        "settling": {
+            "settling_m_per_h": 0.05 / later_hours,
+            "settling_from_hour": after,
+            "stable_ground": "poor",
+        },
+        "melt-height": {
+            "melt_m_per_h": 0.05 / later_hours,
+            "melt_from_hour": after,
+            "stable_ground": "poor",
+        },
+        "winter": {"winter_m": 2.0, "season_hour": after, "season_deg": 0.05},
+        "summer": {"summer_melt_m": 3.0, "season_hour": after, "season_deg": 0.05},
+        "disturbed": {
+            **DAILY_TILT,
+            "tilt_jerk_deg": 0.002,
+            "wind_sway_deg": 0.002,
+            "mirror_wobble_deg": 0.0005,
+            "line_jitter_freedom": 3.0,
+            "refraction_patch_sigma": 0.05,
+        },
+        **{
+            f"log-{fault}": {"log_fault": fault, "log_fault_hour": hours / 2}
+            for fault in ("cut", "missing", "time", "swapped")
+        },
+        "breathing": {"heave_m": 0.003, "creep_m": 0.02},
     }
     if name not in overrides:
         raise ConfigError(f"unknown scenario {name}: choose from {', '.join(NAMES)}")

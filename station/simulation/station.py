@@ -17,7 +17,8 @@ from station.simulation.scenario import Scenario, demo, full_resolution, named, 
 from station.simulation.true_errors import CONVENTIONS, true_errors
 from station.simulation.truth import CRS, TrueSurface, grid_of, true_surface
 from station.simulation.world.air import weather
-from station.simulation.world.change import SurfaceChange, ground_at, snow_cover, surface_changes
+from station.simulation.world.change import BREATHING, SurfaceChange, ground_at, snow_cover, surface_changes
+from station.simulation.world.relief import with_rock_relief
 from station.simulation.world.stable import Rectangle, areas, inside_rectangles, stable_ground
 from station.simulation.world.terrain import NodeField, Valley, build_valley
 
@@ -38,13 +39,16 @@ class Station:
     def valley(self) -> Valley:
         """The valley before any surface change."""
         scenario = self.scenario
-        return build_valley(
+        valley = build_valley(
             scenario.seed,
             scenario.size,
             scenario.terrain_step_m,
             scenario.roughness_m,
             scenario.roughness_length_m,
         )
+        if scenario.rough_rock_m:
+            valley = with_rock_relief(valley, scenario.seed, scenario.rough_rock_m)
+        return valley
 
     @cached_property
     def changes(self) -> tuple[SurfaceChange, ...]:
@@ -79,11 +83,13 @@ class Station:
     def scan(self, scan: int) -> SimulatedScan:
         """Simulate one scan."""
         cover = snow_cover(self.valley, self.changes, self.scenario.hours_at(scan))
-        return simulate_scan(self.scenario, self.ground(scan), cover, self.conditions(scan))
+        ground, conditions = self.ground(scan), self.conditions(scan)
+        return simulate_scan(self.scenario, ground, cover, conditions, self.valley.ice)
 
-    def log(self, scan: int) -> InclinationLog:
-        """Return the inclination log of one scan."""
-        return motion.sensor_log(self.scenario, scan, self.tilt, self.conditions(scan).scanner_start_s)
+    def log(self, scan: int) -> InclinationLog | None:
+        """Return the inclination log of one scan, with its fault if there is one; None if it is missing."""
+        log = motion.sensor_log(self.scenario, scan, self.tilt, self.conditions(scan).scanner_start_s)
+        return motion.faulty_log(self.scenario, scan, log)
 
     def truth(self) -> xr.Dataset:
         """Return all true values, scan by scan, at the middle of each."""
@@ -104,7 +110,7 @@ class Station:
         surface, scans = self.surface, range(self.scenario.hours)
         change_m = np.stack([surface.change_m(self.changes, self.scenario.hours_at(scan)) for scan in scans])
         plane, cube = ("y", "x"), ("time", "y", "x")
-        return xr.Dataset(
+        dataset = xr.Dataset(
             {
                 "elevation": (cube, surface.elevation_m + change_m, {"units": "m"}),
                 "change": (cube, change_m, {"units": "m", "long_name": "relative to the initial ground"}),
@@ -119,6 +125,13 @@ class Station:
             },
             coords={"x": surface.grid.x_m, "y": surface.grid.y_m},
         )
+        if any(change.name in BREATHING for change in self.changes):
+            heave_m = np.stack(
+                [surface.change_m(self.changes, self.scenario.hours_at(scan), BREATHING) for scan in scans]
+            )
+            attributes = {"units": "m", "long_name": "heave and creep of rock, contained in change"}
+            dataset["stable_heave"] = (cube, heave_m, attributes)
+        return dataset
 
 
 def simulate(folder: Path, scenario: Scenario) -> None:
@@ -145,8 +158,9 @@ def simulate(folder: Path, scenario: Scenario) -> None:
         for scan in range(scenario.hours):
             stem = files.stem(scenario, scan)
             start_utc_s = scenario.scan_start_utc_s(scan)
-            files.write_scan(inbox / f"{stem}.laz", station.scan(scan), start_utc_s)
-            files.write_inclination(inbox / f"{stem}-incl.txt", station.log(scan))
+            files.write_scan(inbox / f"{stem}.laz", station.scan(scan), start_utc_s, scenario)
+            if (log := station.log(scan)) is not None:
+                files.write_inclination(inbox / f"{stem}-incl.txt", log)
         _write_truth(folder / "truth.nc", station.truth())
     except OSError as error:
         raise StoreError(f"{folder}: cannot be written: {error.strerror or error}") from error
@@ -166,5 +180,6 @@ def _write_truth(path: Path, truth: xr.Dataset) -> None:
         "zlib": True,
         "complevel": 1,
     }
-    encoding = dict.fromkeys(("elevation", "change", "unchanged_elevation"), packed)
+    surfaces = {"elevation", "change", "unchanged_elevation", "stable_heave"} & set(truth.data_vars)
+    encoding = dict.fromkeys(sorted(surfaces), packed)
     truth.to_netcdf(path, engine="netcdf4", encoding=encoding)

@@ -107,6 +107,7 @@ def _air(scenario: Scenario, conditions: list[ScanConditions]) -> xr.Dataset:
             "fog_visibility": _per_scan(
                 [condition.visibility_m for condition in conditions], "m", "visibility, infinite without fog"
             ),
+            **_cold_air(conditions),
             **{
                 name: _per_scan([row[column] for row in rows], units, long_name)
                 for column, (name, units, long_name) in enumerate(names)
@@ -120,6 +121,17 @@ def _air(scenario: Scenario, conditions: list[ScanConditions]) -> xr.Dataset:
             )
         },
     )
+
+
+def _cold_air(conditions: list[ScanConditions]) -> dict[str, tuple[Any, ...]]:
+    """Return what cold air adds to the refraction over ice; nothing if it is switched off."""
+    layers = [condition.cold_air for condition in conditions if condition.cold_air]
+    if not layers:
+        return {}
+    return {
+        "ice_refraction": _per_scan([layer.whole_path for layer in layers], "1", "added on rays to ice"),
+        "ice_layer": _per_scan([layer.at_ice for layer in layers], "1", "added to refraction at the ice"),
+    }
 
 
 def _air_values(air: AirOfScan | None) -> tuple[float, ...]:

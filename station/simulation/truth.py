@@ -6,6 +6,7 @@ straight line in that frame, meets the ground. The verticals come from pyproj.
 
 from __future__ import annotations
 
+from collections.abc import Container
 from dataclasses import dataclass
 
 import numpy as np
@@ -107,11 +108,17 @@ class TrueSurface:
     pattern_m: tuple[Floats, ...]  # each (ny, nx), metres of height for a unit amount
     ice: Floats  # (ny, nx) share
 
-    def change_m(self, changes: tuple[SurfaceChange, ...], hours: float) -> Floats:
-        """Return the height of the surface relative to the initial ground (ny, nx) [m]."""
+    def change_m(
+        self, changes: tuple[SurfaceChange, ...], hours: float, names: Container[str] | None = None
+    ) -> Floats:
+        """Return the height of the surface relative to the initial ground (ny, nx) [m].
+
+        With `names`, by the changes of these names alone.
+        """
         change = np.zeros(self.grid.shape)
         for surface_change, pattern_m in zip(changes, self.pattern_m, strict=True):
-            change += surface_change.amount(hours) * pattern_m
+            if names is None or surface_change.name in names:
+                change += surface_change.amount(hours) * pattern_m
         return change
 
     def stable(self) -> Bools:

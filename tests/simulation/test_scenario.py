@@ -19,6 +19,10 @@ from station.errors import ConfigError
 from station.simulation.scenario import NAMES
 from station.simulation.station import Scenario, Station, demo, full_resolution, named, simulate, small
 
+FROM_THE_START = {
+    "quiet", "drift", "wind", "poor", "rough", "rough-poor", "airborne", "airborne-heavy", "ice-refraction",
+    "disturbed", "breathing",
+}  # fmt: skip
 MARK = pyproj.Transformer.from_crs("EPSG:4326", "EPSG:32632", always_xy=True)
 
 
@@ -172,11 +176,14 @@ def test_special_conditions_begin_after_the_reference_scans(name):
                 (scenario.avalanche_m, scenario.avalanche_hour),
                 (scenario.fog_visibility_m, scenario.fog_hours[0]),
                 (scenario.moved_hour, scenario.moved_hour),
+                (scenario.settling_m_per_h, scenario.settling_from_hour),
+                (scenario.winter_m or scenario.summer_melt_m, scenario.season_hour),
+                (scenario.log_fault, scenario.log_fault_hour),
             )
             if size and hours > 1
         ]
         assert all(begin >= scenario.reference_scans for begin in begins)
-        assert len(begins) == (name in {"snowfall", "melt", "avalanche", "fog", "moved"} and hours > 1)
+        assert len(begins) == (name not in FROM_THE_START and hours > 1)
 
 
 @pytest.mark.integration
@@ -191,6 +198,41 @@ def test_melt_and_avalanche_have_their_magnitude():
     spans_m = [np.ptp(columns) * 5, np.ptp(rows) * 5]
     assert all(15 <= span_m <= 35 for span_m in spans_m)
     assert np.abs(avalanche.ground(15).node - avalanche.valley.ground.node).max() == 0
+
+
+@pytest.mark.parametrize("name", ["settling", "melt-height"])
+def test_ice_lowers_by_five_centimetres_after_the_reference(name):
+    """At 3 km from the scanner, or at the end of the tongue, until the end of the series."""
+    scenario = replace(named(name, hours=20), terrain_step_m=20.0)
+    station = Station(scenario)
+    (change,) = station.changes
+    assert (change.amount(6.0), change.amount(20.0)) == (0.0, pytest.approx(0.05))
+    ice = station.valley.ice.node > 0.99
+    assert ice.sum() > 1000
+    lowered_m = -0.05 * change.pattern.node[ice]
+    ground = station.valley.ground
+    row, column = np.nonzero(ice)
+    east_m, north_m = ground.west_m + 20.0 * column, ground.south_m + 20.0 * row
+    if name == "settling":
+        np.testing.assert_allclose(lowered_m, 0.05 * np.hypot(east_m, north_m) / 3000, rtol=0.011)
+    else:
+        slope, _ = np.polyfit(ground.node[ice][lowered_m > 1e-4], lowered_m[lowered_m > 1e-4], 1)
+        assert slope == pytest.approx(-0.05 / 450, rel=0.02)
+        assert lowered_m.max() == pytest.approx(0.05, rel=0.1)
+
+
+def test_snow_that_falls_unseen_is_the_same_snow():
+    """Only the record of the brightness and the scanner differ."""
+    fields = ("snowfall_m", "snow_hours", "seed", "hours", "stable_ground", "line_jitter_deg")
+    for name, brightness in (
+        ("snow-db", "decibel"),
+        ("snow-1550", "reflectance"),
+        ("snow-no-brightness", "none"),
+    ):
+        scenario = named(name, hours=12, seed=5)
+        assert scenario.brightness == brightness
+        for field in fields:
+            assert getattr(scenario, field) == getattr(named("snowfall", hours=12, seed=5), field)
 
 
 @pytest.mark.integration

@@ -1,4 +1,4 @@
-"""Disturbances of the mount: gusts, steps that decay, and a permanent tilt.
+"""Disturbances of the mount: gusts, steps that decay, a permanent tilt, a wave over the day, a random walk.
 
 Each is a function of seconds since the start of the first scan, drawn hour by hour, so that a longer series
 starts like a shorter one.
@@ -13,7 +13,8 @@ import numpy as np
 from station.quantities import Floats, Ints
 from station.simulation.randomness import RandomFourierSeries, random_fourier, rng_for
 
-HOUR_S = 3600.0
+HOUR_S, DAY_S = 3600.0, 86_400.0
+WALK_STEP_S = 60.0
 GUST_S = (20.0, 120.0)
 LULL_S = (20.0, 200.0)
 GUST_PERIOD_S = (1.5, 12.0)
@@ -91,6 +92,35 @@ class PermanentTilt:
     def __call__(self, series_s: Floats) -> Floats:
         """Return the permanent tilt [rad]."""
         return np.where(np.asarray(series_s) >= self.from_s, self.size_rad, 0.0)
+
+
+@dataclass(frozen=True)
+class DailyWave:
+    """A wave of 24 hours."""
+
+    amplitude_rad: float
+    phase_rad: float
+
+    def __call__(self, series_s: Floats) -> Floats:
+        """Return the tilt of the wave [rad]."""
+        return np.asarray(self.amplitude_rad * np.sin(2 * np.pi * series_s / DAY_S + self.phase_rad))
+
+
+@dataclass(frozen=True)
+class RandomWalk:
+    """A random walk of one axis from the start of the series on, zero before."""
+
+    seed: int
+    axis: int
+    sigma_rad: float  # after a day
+
+    def __call__(self, series_s: Floats) -> Floats:
+        """Return the walk, linear between its steps [rad]."""
+        series_s = np.asarray(series_s, dtype=np.float64)
+        count = max(1, int(np.ceil(series_s.max() / WALK_STEP_S)))
+        step = rng_for(self.seed, 43, self.axis).standard_normal(count)  # a longer walk begins like a shorter
+        walk = np.concatenate(([0.0], np.cumsum(step))) * np.sqrt(WALK_STEP_S / DAY_S)
+        return np.asarray(self.sigma_rad * np.interp(series_s, WALK_STEP_S * np.arange(count + 1.0), walk))
 
 
 def gusty_sway(seed: int, axis: int, sigma_rad: float) -> GustSway:

@@ -14,7 +14,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from station.quantities import Floats, InclinationLog
-from station.simulation.instrument.disturbances import PermanentTilt, StepDisturbance, gusty_sway
+from station.simulation.instrument.disturbances import (
+    DailyWave,
+    PermanentTilt,
+    RandomWalk,
+    StepDisturbance,
+    gusty_sway,
+)
 from station.simulation.randomness import random_fourier, rng_for
 from station.simulation.scenario import Scenario
 
@@ -76,7 +82,7 @@ def tilt_axes(scenario: Scenario) -> tuple[TiltAxis, TiltAxis]:
 
 
 def _disturbances(scenario: Scenario, axis: int) -> list[TiltFunction]:
-    """Return gusts, steps and permanent tilt of one axis, without those that are switched off."""
+    """Return gusts, steps, slow and permanent tilt of one axis, without those that are switched off."""
     parts: list[TiltFunction] = []
     if scenario.wind_sway_deg:
         parts.append(gusty_sway(scenario.seed, axis, np.radians(scenario.wind_sway_deg)))
@@ -87,6 +93,15 @@ def _disturbances(scenario: Scenario, axis: int) -> list[TiltFunction]:
         direction_rad = rng_for(scenario.seed, 39, 0).uniform(0, 2 * np.pi)
         share = (np.cos(direction_rad), np.sin(direction_rad))[axis]
         parts.append(PermanentTilt(3600 * scenario.moved_hour, np.radians(scenario.moved_deg) * share))
+    if scenario.tilt_daily_deg:
+        phase_rad = rng_for(scenario.seed, 44, axis).uniform(0, 2 * np.pi)
+        parts.append(DailyWave(np.radians(scenario.tilt_daily_deg), phase_rad))
+    if scenario.tilt_walk_deg:
+        parts.append(RandomWalk(scenario.seed, axis, np.radians(scenario.tilt_walk_deg)))
+    if scenario.season_hour and scenario.season_deg:
+        direction_rad = rng_for(scenario.seed, 46, 0).uniform(0, 2 * np.pi)
+        share = (np.cos(direction_rad), np.sin(direction_rad))[axis]
+        parts.append(PermanentTilt(3600 * scenario.season_hour, np.radians(scenario.season_deg) * share))
     return parts
 
 
@@ -98,7 +113,8 @@ def has_moved(scenario: Scenario, scan: int) -> bool:
 def pose_offset(scenario: Scenario, scan: int) -> PoseOffset:
     """Return rotation and shift of the scanner in one scan; zero in the first, from which the SOP was solved.
 
-    A permanent tilt comes with a rotation of half its size, to either side, and a shift.
+    A permanent tilt comes with a rotation of half its size, to either side, and a shift; the tilt of a season
+    comes with a rotation of the same size.
     """
     rng = rng_for(scenario.seed, 31, scan)
     factor = 1.0 if scan else 0.0
@@ -109,6 +125,9 @@ def pose_offset(scenario: Scenario, scan: int) -> PoseOffset:
         heading_rad += float(np.radians(scenario.moved_deg / 2) * rng.choice((-1, 1)))
         direction = rng.standard_normal(3)
         position_m = position_m + scenario.moved_m * direction / np.linalg.norm(direction)
+    if 0 < 3600 * scenario.season_hour <= scenario.scan_start_s(scan):
+        side = rng_for(scenario.seed, 46, 1).choice((-1, 1))
+        heading_rad += float(np.radians(scenario.season_deg) * side)
     return PoseOffset(heading_rad, position_m)
 
 
@@ -116,6 +135,9 @@ def line_jitter(scenario: Scenario, scan: int) -> Floats:
     """Return the elevation error of each line [rad] (lines,)."""
     rng = rng_for(scenario.seed, 32, scan)
     white = np.radians(scenario.line_jitter_deg) * rng.standard_normal(scenario.lines)
+    if freedom := scenario.line_jitter_freedom:
+        draws = rng_for(scenario.seed, 45, scan).standard_t(freedom, scenario.lines)
+        white = np.radians(scenario.line_jitter_deg) * np.sqrt((freedom - 2) / freedom) * draws
     return np.asarray(white + _wobble(scenario, scan))
 
 
@@ -167,6 +189,30 @@ def sensor_log(
         for index, axis in enumerate(tilt)
     ]
     return InclinationLog(scanner_start_s + elapsed_s + faults.clock_s, readings[0], readings[1])
+
+
+def faulty_log(scenario: Scenario, scan: int, log: InclinationLog) -> InclinationLog | None:
+    """Return the log as the file will have it: with the scenario's fault, None if there is no file.
+
+    "cut": it ends at 30-70 % of the scan. "time": one row is an hour late. "swapped": roll and pitch are in
+    each other's column. "flipped": pitch has the other sign.
+    """
+    if not scenario.log_fault or scan < scenario.log_fault_hour:
+        return log
+    time_s, roll_rad, pitch_rad = log.time_s, log.roll_rad, log.pitch_rad
+    rng = rng_for(scenario.seed, 47, scan)
+    if scenario.log_fault == "missing":
+        return None
+    if scenario.log_fault == "cut":
+        count = int(rng.uniform(0.3, 0.7) * len(time_s))
+        return InclinationLog(time_s[:count], roll_rad[:count], pitch_rad[:count])
+    if scenario.log_fault == "time":
+        wrong_s = time_s.copy()
+        wrong_s[int(rng.uniform(0.2, 0.8) * len(time_s))] += 3600.0
+        return InclinationLog(wrong_s, roll_rad, pitch_rad)
+    if scenario.log_fault == "swapped":
+        return InclinationLog(time_s, pitch_rad, roll_rad)
+    return InclinationLog(time_s, roll_rad, -pitch_rad)
 
 
 def rotation_x(angle_rad: float) -> Floats:

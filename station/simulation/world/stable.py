@@ -11,7 +11,7 @@ import numpy as np
 from station.quantities import Bools, Floats, Grid
 from station.simulation.scenario import Scenario
 from station.simulation.truth import TrueSurface, map_from_enu
-from station.simulation.world.change import DEPOSIT, SurfaceChange
+from station.simulation.world.change import DEPOSIT, ON_STABLE_GROUND, SurfaceChange
 from station.simulation.world.places import RIDGE_DEG, RIDGE_FROM_M, ROCK_ICE, hut_cells, hut_m
 from station.simulation.world.terrain import Valley
 
@@ -40,7 +40,7 @@ class Rectangle:
 def stable_ground(
     scenario: Scenario, valley: Valley, changes: tuple[SurfaceChange, ...], surface: TrueSurface
 ) -> list[Rectangle]:
-    """Return the stable ground: rock that neither melts nor is overrun; snow may fall on it.
+    """Return the stable ground: rock that neither melts nor is overrun, though snow may fall on it.
 
     "good": blocks all round. "poor": the blocks of a far ridge, and a hut.
     """
@@ -75,7 +75,7 @@ def areas(scenario: Scenario, valley: Valley) -> dict[str, Floats]:
 def _bare_rock(changes: tuple[SurfaceChange, ...], surface: TrueSurface) -> Bools:
     touched = np.zeros(surface.grid.shape, dtype=np.bool_)
     for change, pattern_m in zip(changes, surface.pattern_m, strict=True):
-        if change.name != "snowfall":
+        if change.name not in ON_STABLE_GROUND:
             touched |= pattern_m != 0
     return (surface.ice < ROCK_ICE) & ~touched
 

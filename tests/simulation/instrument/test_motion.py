@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from station.simulation.instrument.motion import (
+    faulty_log,
     line_jitter,
     pose_offset,
     sensor_faults,
@@ -112,3 +113,70 @@ def test_sop_contains_the_tilt_of_the_mount():
     assert np.linalg.det(matrix[:3, :3]) == pytest.approx(1.0)
     np.testing.assert_allclose(matrix[:3, 0], [0, 1, 0], atol=1e-15)  # x to the north
     assert np.degrees(np.arcsin(matrix[2, 1])) == pytest.approx(3.0)  # roll lifts y
+
+
+def test_daily_wave_and_random_walk_have_their_magnitudes():
+    day_s = np.arange(0, 5 * 86_400, 600.0)
+    wave = [axis.tilt(day_s) + axis.mean_rad for axis in tilt_axes(single_error(tilt_daily_deg=0.005))]
+    for tilt in np.degrees(wave):
+        assert np.ptp(tilt) == pytest.approx(0.010, rel=1e-4)
+        np.testing.assert_allclose(tilt[:144], tilt[144:288], atol=1e-12)
+    walks_deg = np.degrees(
+        [
+            axis.tilt(day_s) + axis.mean_rad
+            for seed in range(150)
+            for axis in tilt_axes(single_error(seed=seed, tilt_walk_deg=0.004))
+        ]
+    )
+    assert walks_deg[:, 144].std() == pytest.approx(0.004, rel=0.12)
+    assert walks_deg[:, 576].std() == pytest.approx(0.008, rel=0.12)  # after four days twice as much
+    assert abs(np.corrcoef(np.diff(walks_deg[:, ::36], axis=1)[:, :2].T)[0, 1]) < 0.2
+
+
+def test_random_walk_does_not_depend_on_the_length_of_the_series():
+    walk = tilt_axes(single_error(tilt_walk_deg=0.004))[0]
+    long = walk.tilt(np.arange(0, 1e6, 30.0))
+    np.testing.assert_array_equal(walk.tilt(np.arange(0, 1e4, 30.0)), long[:334])
+    assert walk.tilt(np.array([-6.0]))[0] == pytest.approx(-walk.mean_rad)
+
+
+def test_heavy_tails_of_the_line_jitter():
+    """Student's t with 5 degrees of freedom has kurtosis 9; 2.5 % lie beyond 2.571 · √(3/5) σ."""
+    scenario = single_error(line_jitter_deg=0.001, lines=2000)
+    jitters = {
+        freedom: np.concatenate(
+            [line_jitter(replace(scenario, line_jitter_freedom=freedom), scan) for scan in range(200)]
+        )
+        for freedom in (0.0, 5.0)
+    }
+    for jitter in jitters.values():
+        assert np.degrees(jitter.std()) == pytest.approx(0.001, rel=0.02)
+    kurtosis = {freedom: (jitter**4).mean() / jitter.var() ** 2 for freedom, jitter in jitters.items()}
+    assert kurtosis[0.0] == pytest.approx(3.0, rel=0.03)
+    assert 6.5 < kurtosis[5.0] < 12
+    limit = np.radians(0.001) * 2.571 * np.sqrt(3 / 5)
+    assert (jitters[5.0] > limit).mean() == pytest.approx(0.025, rel=0.05)
+
+
+def test_logs_have_the_scenarios_fault_from_its_hour_on():
+    scenario = replace(Scenario(), log_fault_hour=3.0)
+    tilt = tilt_axes(scenario)
+    sound = [sensor_log(scenario, scan, tilt, 50.0) for scan in (2, 3)]
+    faulty = {
+        fault: [
+            faulty_log(replace(scenario, log_fault=fault), scan, log)
+            for scan, log in zip((2, 3), sound, strict=True)
+        ]
+        for fault in ("cut", "missing", "time", "swapped", "flipped")
+    }
+    assert all(before is sound[0] for before, _ in faulty.values())
+    assert faulty["missing"][1] is None
+    cut, wrong, swapped, flipped = (faulty[name][1] for name in ("cut", "time", "swapped", "flipped"))
+    assert 0.25 < (cut.time_s[-1] - 50.0) / scenario.scan_s < 0.75
+    np.testing.assert_array_equal(cut.roll_rad, sound[1].roll_rad[: len(cut.roll_rad)])
+    late_s = wrong.time_s - sound[1].time_s
+    assert np.sort(late_s)[-2:].tolist() == [0.0, pytest.approx(3600.0)]
+    np.testing.assert_array_equal(swapped.roll_rad, sound[1].pitch_rad)
+    np.testing.assert_array_equal(swapped.pitch_rad, sound[1].roll_rad)
+    assert np.degrees(flipped.pitch_rad.mean()) == pytest.approx(1.3, abs=0.05)  # the mount's is -1.3°
+    np.testing.assert_array_equal(flipped.roll_rad, sound[1].roll_rad)
