@@ -36,6 +36,7 @@ LOG_KEYS = {
     "verdict": "what became of the scan: good, degraded, unusable, set_aside, later, same, gone",
     "reason": "why, in a sentence",
     "points": "points read",
+    "discarded_pct": "share of the points that are not the last return, withheld, or classified as noise [%]",
     "cells": "cells of the grid with a value",
     "sigma_median_m": "median of the uncertainty of a cell's change [m]",
     "change_median_m": "median change against the reference [m]",

@@ -53,7 +53,7 @@ class Site(SiteFile):
         settings = self.model_dump(
             mode="json",
             include={
-                "scans": {"frame", "point_time"},
+                "scans": {"frame", "point_time", "intensity"},
                 "scanner": True,
                 "map": {"crs", "origin", "vertical_datum"},
                 "grid": True,

@@ -10,7 +10,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from enum import IntFlag
 from math import radians
-from typing import Any, TypeVar
+from typing import Any, Literal, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,6 +23,8 @@ Ints32 = NDArray[np.int32]
 Numbers = TypeVar("Numbers", Ints, Ints32)
 Bools = NDArray[np.bool_]
 
+IntensityScale = Literal["auto", "reflectance", "linear", "decibel", "none"]  # how a file tells brightness
+
 VERTICAL_AXIS = (0.0, 0.0, 1.0)  # east, north, up
 
 
@@ -31,11 +33,12 @@ class Shots:
     """A block of laser echoes, in the frame of the scan (the scanner's or the map).
 
     `time_s` is in the time base of the scan, which its inclination log shares; None if the scan has no times.
+    `intensity` is linear in the reflectance of the ground, at least for echoes from the same place.
     """
 
     xyz_m: Floats  # (3, n)
     time_s: Floats | None  # (n,)
-    intensity: Floats | None = None  # (n,) 0-1; None if the scan has none
+    intensity: Floats | None = None  # (n,) 0-1, 0 if unknown; None if the scan has none
 
     def __len__(self) -> int:
         """Return the number of echoes."""

@@ -13,7 +13,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import AfterValidator, AwareDatetime, BaseModel, ConfigDict, Field, model_validator
 
-from station.quantities import Air, Scanner
+from station.quantities import Air, IntensityScale, Scanner
 from station.scanners import SCANNERS
 
 Positive = Annotated[float, Field(gt=0)]
@@ -56,6 +56,7 @@ class ScansSection(Section):
     name: str = "%y%m%d_%H%M%S"
     frame: Literal["scanner", "map"] = "scanner"
     point_time: Literal["auto", "none"] = "auto"
+    intensity: IntensityScale = "auto"
     settle_s: NotNegative = 60.0
     expected_every_s: Positive = 3600.0
     polling: bool = False

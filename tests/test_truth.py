@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 
+import laspy
 import numpy as np
 import pytest
 import xarray as xr
@@ -180,6 +181,21 @@ def test_snow_on_stable_ground_is_not_adjusted_as_tilt(tmp_path):
     assert processed.series.change_step.values[-1] > 0.05
     fixed, _, _ = ProcessedStation(tmp_path / "station", FILTERED).boxes()
     assert np.sqrt(np.mean(error**2)) < 0.7 * np.sqrt(np.mean(fixed**2))
+
+
+@pytest.mark.slow
+def test_snow_on_stable_ground_without_brightness_is_within_sigma(tmp_path):
+    """The same snowfall in scans whose intensity is zero: only steep rock is stable."""
+    simulate(tmp_path / "station", replace(CALM, snowfall_m=0.4, snow_hours=(2.5, 4.0)))
+    for path in (tmp_path / "station" / "inbox").glob("*.laz"):
+        las = laspy.read(path)
+        las.intensity[:] = 0
+        las.write(path)
+    processed = ProcessedStation(tmp_path / "station")
+    error, sigma, _ = processed.boxes()
+    assert np.sqrt(np.mean(error**2)) < 0.05
+    assert 0.6 < np.sqrt(np.mean((error / sigma) ** 2)) < 1.4
+    assert all("no brightness" in result.reason for result in processed.results)
 
 
 @pytest.mark.slow

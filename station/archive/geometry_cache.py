@@ -29,6 +29,7 @@ from station.quantities import Reference
 from station.science.gridding.viewing_geometry import (
     CELL_ARRAYS,
     MAX_VISIBILITY_CELLS,
+    CellClass,
     Position,
     ViewingGeometry,
 )
@@ -62,6 +63,7 @@ def cached_viewing_geometry(
         (SMALL_ARRAYS, GRID_ARRAYS),
         [(name, np.dtype(dtype).str) for name, dtype in CELL_ARRAYS.items()],
         MAX_VISIBILITY_CELLS,
+        list(CellClass),
         reference.version,
         status.st_size,
         status.st_mtime_ns,

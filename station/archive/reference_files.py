@@ -49,7 +49,7 @@ _VARIABLES = (
         3,
     ),
     Variable(
-        "reference_intensity", ("y", "x"), "f4", "mean echo intensity of the cell, 0 to 1", "1", None, 4
+        "reference_intensity", ("y", "x"), "f4", "mean echo intensity of the cell, 0 to 1", "1", None, 6
     ),
     Variable(
         "reference_stable", ("y", "x"), "i1", "stable ground: steep and without change", None, None,

@@ -225,6 +225,13 @@ VARIABLES: tuple[Variable, ...] = (
         "relative_humidity",
     ),
     Variable("point_total", ("time",), "f8", "number of points in the scan", "1"),
+    Variable(
+        "discarded_share",
+        ("time",),
+        "f8",
+        "share of the points that are not used: not the last return, withheld, or classified as noise",
+        "1",
+    ),
     Variable("coverage", ("time",), "f8", "share of the grid's cells with points", "1"),
     Variable("stable_count", ("time",), "f8", "number of hold-out cells of stable ground", "1"),
     Variable("stable_median", ("time",), "f8", "median change on hold-out stable ground", "m"),

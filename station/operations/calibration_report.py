@@ -115,7 +115,7 @@ def _read_shots(site: Site, path: Path) -> tuple[Floats, Floats]:
     intensity: list[Floats] = []
     count = 0
     with open_scan(path, range_max_m=site.scanner.range_max_m) as reader:
-        for block in reader.blocks():
+        for block in reader.blocks(intensity=site.scans.intensity):
             points.append(block.xyz_m.T)
             intensity.append(np.ones(len(block)) if block.intensity is None else block.intensity)
             count += len(block)

@@ -22,6 +22,7 @@ from station.processing.scan_tasks import dry_run, load_areas, polygon_cells, se
 from station.readers.flags import read_flags
 from station.readers.scan import suffixes
 from station.readers.weather import interpolate_air, read_weather
+from station.science.analysis.verdict import NO_BRIGHTNESS
 
 Finding = dict[str, str]  # level (ok, warning, fault), what, message
 EPOCH_BYTES_PER_CELL = 16  # typical, uncompressed
@@ -209,3 +210,10 @@ def _newest_scan(site: Site) -> Iterator[Finding]:
     text = " ".join(f"{key}={value}" for key, value in metrics.items())
     message = f"{scan.name}: {verdict}{f' ({reason})' if reason else ''} {text}"
     yield _finding("ok" if verdict == "good" else "warning", "scan", message)
+    if NO_BRIGHTNESS in reason:
+        yield _finding(
+            "warning",
+            "brightness",
+            "no brightness: snow on stable ground is recognised by slope only, and none below 50° is used:"
+            " export reflectance or intensity, and see scans.intensity",
+        )

@@ -22,6 +22,7 @@ from station.quantities import (
     TiltSeries,
 )
 from station.science.adjustment import ground_classes, prior
+from station.science.adjustment.ground_classes import SnowTest
 from station.science.adjustment.joint import Adjustment, adjust_scan, tilt_effect
 from station.science.adjustment.normal_equations import LineInclination
 from station.science.adjustment.patches import CellObservations, aggregate_patches
@@ -35,6 +36,8 @@ from station.science.uncertainty.jacobian import HeightJacobian
 from station.science.uncertainty.parameters import ParameterLayout
 
 MIN_STABLE_CELLS = 20  # fewer cells give no meaningful statistics
+MIN_BRIGHTNESS_SHARE = 0.5  # of the stable cells; less counts as no brightness
+MAX_BRIGHTNESS_CELLS = 100_000  # of more stable cells a sample tells the gain and whether there is brightness
 
 
 @dataclass(frozen=True)
@@ -72,12 +75,15 @@ def new_gridder(scan_geometry: ScanGeometry, viewing: ViewingGeometry | None) ->
     )
 
 
-def grid_scan(gridder: Gridder, blocks: Iterable[Shots], pose: Pose, progress: Callable[[], None]) -> None:
-    """Add all shots of a scan to the grid."""
+def grid_scan(gridder: Gridder, blocks: Iterable[Shots], pose: Pose, progress: Callable[[], None]) -> int:
+    """Add all shots of a scan to the grid; return their number."""
+    count = 0
     for shots in blocks:
         add_shots(gridder, to_map(shots, pose), shots.intensity)
+        count += len(shots)
         progress()
     gridder.finish()
+    return count
 
 
 def to_map(shots: Shots, pose: Pose) -> Floats:
@@ -119,14 +125,47 @@ def adjust_to_reference(
     state_prior = prior.state_prior(
         inputs.params, inputs.lines, components, weather_known=inputs.weather_known
     )
-    patches = aggregate_patches(inputs.params, _cells(gridder, viewing), scan_geometry.scanner.range_max_m)
+    cells = _cells(gridder, viewing, snow_test(gridder, scan_geometry, viewing))
+    patches = aggregate_patches(inputs.params, cells, scan_geometry.scanner.range_max_m)
     log = inputs.log
     if log is not None and reference_state is not None:
         log = log.relative_to(inputs.params, state_prior.reference_covariance(reference_state))
     return adjust_scan(patches, inputs.assumed_rad, state_prior.relative_to(reference_state), log)
 
 
-def _cells(gridder: Gridder, viewing: ViewingGeometry) -> Iterator[CellObservations]:
+def snow_test(gridder: Gridder, scan_geometry: ScanGeometry, viewing: ViewingGeometry) -> SnowTest:
+    """Return the test of a gridded scan for snow on stable ground."""
+    intensity, reference = _stable_intensity(gridder, viewing, CellClass.STEEP)
+    return ground_classes.snow_test(intensity, reference, scan_geometry.scanner.wavelength_um)
+
+
+def has_brightness(gridder: Gridder, viewing: ViewingGeometry | None) -> bool:
+    """Return True if brightness can tell whether snow lies on stable ground.
+
+    For that it must be known, in scan and reference, for most of the stable cells that the scan observed.
+    """
+    if viewing is None:
+        return gridder.has_intensity
+    intensity, reference = _stable_intensity(gridder, viewing)
+    if not len(intensity):
+        return gridder.has_intensity
+    return bool(np.mean(np.isfinite(intensity) & np.isfinite(reference)) > MIN_BRIGHTNESS_SHARE)
+
+
+def _stable_intensity(
+    gridder: Gridder, viewing: ViewingGeometry, *classes: CellClass
+) -> tuple[Floats32, Floats32]:
+    """Return the intensity (m,) of stable cells of the given classes in a scan and in its reference.
+
+    Only cells that the scan observed; of very many a sample.
+    """
+    cell_index = viewing.select(CellClass.STABLE, *classes)
+    cell_index = cell_index[:: 1 + len(cell_index) // MAX_BRIGHTNESS_CELLS]
+    cell_index = cell_index[gridder.count[cell_index] > 0]
+    return gridder.intensity(cell_index), viewing.cells["intensity"][:].take(cell_index)
+
+
+def _cells(gridder: Gridder, viewing: ViewingGeometry, test: SnowTest) -> Iterator[CellObservations]:
     """Yield the cells that an adjustment uses, in the order of the head's azimuth."""
     for first, all_cells in viewing.sectors(sampled=True):
         sums = gridder.sums(first, first + len(all_cells))
@@ -143,7 +182,9 @@ def _cells(gridder: Gridder, viewing: ViewingGeometry) -> Iterator[CellObservati
                 sector.in_class(CellClass.STABLE),
                 sector.in_class(CellClass.HOLDOUT),
                 sector.in_class(CellClass.SMOOTH),
-                ground_classes.brightness_changed(sums.intensity(), viewing.intensity(first + observed)),
+                test.changed(
+                    sums.intensity(), viewing.intensity(first + observed), sector.in_class(CellClass.STEEP)
+                ),
             ),
             sums.mean_residual(),
             sector.point_variance_m2 / sums.count + sector.reference_variance_m2,
@@ -189,7 +230,9 @@ def measure(
     if adjustment is None and posterior is not None and viewing is not None:
         posterior = propagation.difference_to_reference(posterior, viewing.reference.shared)
     correction = None if adjustment is None else partial(_correction, adjustment)
-    return estimate_cells(gridder, viewing, CellEstimator(scan_geometry, posterior, independent, correction))
+    test = None if adjustment is None or viewing is None else snow_test(gridder, scan_geometry, viewing)
+    estimator = CellEstimator(scan_geometry, posterior, independent, correction, test)
+    return estimate_cells(gridder, viewing, estimator)
 
 
 def holdout_statistics(measurement: Measurement, viewing: ViewingGeometry) -> dict[str, float]:

@@ -223,7 +223,7 @@ def _add_scan(
         inputs = load_scan_inputs(site, reader, scan.log, start, end)
         viewing = geometry_cache(inputs.geometry)
         gridder = new_gridder(inputs.geometry, viewing)
-        grid_scan(gridder, reader.blocks(), inputs.pose, progress)
+        grid_scan(gridder, reader.blocks(intensity=site.scans.intensity), inputs.pose, progress)
     adjustment = adjust_scan(site, gridder, inputs, viewing)
     if viewing is None:
         stack.add(gridder)

@@ -29,6 +29,7 @@ from station.processing.pipeline import (
     AdjustmentInputs,
     adjust_to_reference,
     grid_scan,
+    has_brightness,
     holdout_statistics,
     measure,
     new_gridder,
@@ -227,12 +228,14 @@ def _compute_epoch(
         )
         viewing = load_viewing_geometry(site, inputs.geometry, reference) if reference else None
         progress()
-        blocks = reader.blocks(with_intensity=site.adjusts)  # decoding starts here
+        # Decoding starts here.
+        blocks = reader.blocks(intensity=site.scans.intensity if site.adjusts else "none")
         gridder = new_gridder(inputs.geometry, viewing)
-        grid_scan(gridder, blocks, inputs.pose, progress)
+        point_counts = reader.header.point_count, grid_scan(gridder, blocks, inputs.pose, progress)
     if gridder.is_empty():
         raise ScanError("no point falls on the grid: wrong scans.frame, SOP, CRS or units?")
     progress()
+    brightness_known = not site.adjusts or has_brightness(gridder, viewing)
     adjustment = adjust_scan(site, gridder, inputs, viewing)
     flag = exclusion_reason(site, start.timestamp(), end.timestamp())
     attempt = adjustment[1] if adjustment else None
@@ -242,7 +245,7 @@ def _compute_epoch(
     log_warnings, clock_scalars = _check_log(adjustment, reference)
     measurement = measure(gridder, inputs.geometry, shared, viewing, adjustment)
     progress()
-    scalars = _scalar_variables(measurement, inputs, reader.header.point_count)
+    scalars = _scalar_variables(measurement, inputs, *point_counts)
     if adjustment is not None and viewing is not None:
         scalars |= holdout_statistics(measurement, viewing) | {"change_step": adjustment[1].change_step_m}
         scalars |= dict(zip(LEVERAGE_VARIABLES, adjustment[1].leverage_m2, strict=True))
@@ -254,6 +257,7 @@ def _compute_epoch(
         attempt,
         scalars.get("stable_z_std", 0.0) if adjustment else None,
         inputs.faults,
+        has_brightness=brightness_known,
     )
     return epochs.Epoch(
         start_s=start.timestamp(),
@@ -417,11 +421,17 @@ def sha256_log(scan: ScanFile) -> str:
     return sha256_file(scan.log) if scan.log else ""
 
 
-def _scalar_variables(measurement: Measurement, inputs: ScanInputs, point_total: int) -> dict[str, float]:
-    """Return the scalar variables of an epoch by their name in the store."""
+def _scalar_variables(
+    measurement: Measurement, inputs: ScanInputs, point_total: int, ground_total: int
+) -> dict[str, float]:
+    """Return the scalar variables of an epoch by their name in the store.
+
+    The scan has `point_total` points, `ground_total` of which were used.
+    """
     tilt_record, geometry = inputs.tilt_record, inputs.geometry
     scalars = {
         "point_total": float(point_total),
+        "discarded_share": 1.0 - ground_total / point_total,
         "coverage": float(np.count_nonzero(measurement.count) / measurement.cell_index.size),
     }
     if geometry.position_m is not None:
@@ -454,6 +464,8 @@ def _log_metrics(epoch: epochs.Epoch, seconds: float) -> dict[str, float | str]:
         "points": int(epoch.scalars["point_total"]),
         "cells": round(epoch.scalars["coverage"] * measurement.cell_index.size),
     }
+    if epoch.scalars["discarded_share"]:
+        metrics["discarded_pct"] = round(100 * epoch.scalars["discarded_share"], 2)
     sample = slice(None, None, 1 + len(measurement.cells) // MAX_METRIC_CELLS)
     change_m, sigma_m = measurement.change_m[sample], measurement.cells["uncertainty_m"][sample]
     valid = np.isfinite(sigma_m)

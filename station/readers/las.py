@@ -9,7 +9,7 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from functools import cached_property, partial
+from functools import cached_property, partial, reduce
 from io import BufferedReader
 from pathlib import Path
 from typing import ClassVar, Self
@@ -18,24 +18,22 @@ import lazrs
 import numpy as np
 from laspy import DecompressionSelection, LasHeader
 from laspy.header import GpsTimeType
-from numpy.typing import NDArray
 
 from station.errors import NotReadyError, ScanError
-from station.quantities import AzimuthTrack, Floats, Shots
+from station.quantities import AzimuthTrack, Bools, Floats, IntensityScale, Ints, Shots
+from station.readers.las_echoes import Brightness, Records, brightness_candidates, discard_tables
 from station.readers.las_header import LasFileHeader, read_header
 from station.readers.prefetch import Buffer, prefetch
 from station.readers.scan import WEEK_S, ScanHeader, decoder_errors
 
-REQUIRED_FIELDS = DecompressionSelection.base().decompress_z().decompress_gps_time()  # of formats 6 and up
-WITH_INTENSITY = REQUIRED_FIELDS.decompress_intensity()
+POSITION_AND_TIME = DecompressionSelection.base().decompress_z().decompress_gps_time()  # of formats 6 and up
+GROUND = POSITION_AND_TIME.decompress_flags().decompress_classification()
 BLOCKS_PER_BUFFER = 8  # decoded together, several chunks per core; converted one by one, in the cache
 MAX_SCAN_S = 86_400.0
 SAMPLE_COUNT = 200  # points sampled from a scan with no or few chunks
 SKIP_POINTS = 50_000  # points decoded at a time to skip them
-INTENSITY_SCALE = 1 / 65535  # intensity has 16 bits: LAS 1.4 R15, table 7
+BRIGHTNESS_POINTS = 1000  # points at the start of a scan that show whether its brightness varies
 MIN_CHUNKS = 20  # with fewer, chunk starts are too far apart to follow the azimuth
-
-Records = NDArray[np.void]
 
 
 class LasScan:
@@ -80,13 +78,15 @@ class LasScan:
     def close(self) -> None:
         """Do nothing: no file is open between calls."""
 
-    def blocks(self, size: int = 50_000, *, with_intensity: bool = True) -> Iterator[Shots]:
-        """Yield all echoes in file order, `size` at a time; memory does not grow with the file.
+    def blocks(self, size: int = 50_000, *, intensity: IntensityScale = "auto") -> Iterator[Shots]:
+        """Yield the echoes of the ground in file order, from `size` points at a time, in bounded memory.
 
-        Decoding runs ahead in a child process if possible, from this call on. Without `with_intensity` an
-        eighth of the decoding is saved. Raises ScanError if the file contains fewer points than its header
-        counts, or if a point is outside the header's box, beyond `range_max_m`, or without a finite time.
+        Returns before the last one, withheld points and noise are left out. Decoding runs ahead in a child
+        process if possible, from this call on; without intensity an eighth of it is saved. Raises ScanError
+        if the file contains fewer points than its header counts, or none of the ground, or if a point is
+        outside the header's box, without a finite time, or, on the ground, beyond `range_max_m`.
         """
+        brightness = self._brightness(intensity)
         has_time = self.time_range_s() is not None
         buffer_points, point_count = BLOCKS_PER_BUFFER * size, self.header.point_count
         record_bytes = self._las_header.record_dtype.itemsize
@@ -94,20 +94,29 @@ class LasScan:
             min(buffer_points, point_count - first) * record_bytes
             for first in range(0, point_count, buffer_points)
         ]
-        layers = WITH_INTENSITY if with_intensity else REQUIRED_FIELDS
+        layers = GROUND if brightness is None else _with_brightness(GROUND, brightness)
         buffers = prefetch(partial(self._open_decoder, layers), lengths)
-        return self._iter_shots(buffers, size, has_time=has_time, with_intensity=with_intensity)
+        return self._iter_shots(buffers, size, brightness, has_time=has_time)
 
     def _iter_shots(
-        self, buffers: Iterator[Buffer], size: int, *, has_time: bool, with_intensity: bool
+        self, buffers: Iterator[Buffer], size: int, brightness: Brightness | None, *, has_time: bool
     ) -> Iterator[Shots]:
         decoder = _ShotDecoder(self._las_header.las, self._range_max_m)
+        tables, is_empty = discard_tables(self._las_header.las.point_format), True
         for buffer in buffers:
             records = buffer.view(self._las_header.record_dtype)
             for start in range(0, len(records), size):
-                yield decoder.decode(
-                    records[start : start + size], has_time=has_time, with_intensity=with_intensity
-                )
+                block = records[start : start + size]
+                shots = decoder.decode(block, brightness, _ground(block, tables), has_time=has_time)
+                if len(shots):
+                    decoder.check_range(shots)
+                    is_empty = False
+                    yield shots
+        if is_empty:
+            raise ScanError(
+                f"none of its {self.header.point_count:,} points is a last or only return that is neither"
+                " withheld nor noise: export the last returns too"
+            )
 
     @contextmanager
     def _open_decoder(self, layers: DecompressionSelection) -> Iterator[Callable[[Buffer], None]]:
@@ -136,7 +145,7 @@ class LasScan:
             return None
         time_s, x_m, y_m = self._sample
         if self._las_header.laszip is not None and len(time_s) <= MIN_CHUNKS:  # its chunks and the last point
-            blocks = self.blocks(max(self.header.point_count // SAMPLE_COUNT, 1), with_intensity=False)
+            blocks = self.blocks(max(self.header.point_count // SAMPLE_COUNT, 1), intensity="none")
             first_shots = [
                 (shots.time_s[0], *shots.xyz_m[:2, 0]) for shots in blocks if shots.time_s is not None
             ]
@@ -154,7 +163,7 @@ class LasScan:
             [last] if header.laszip else [*np.linspace(0, last, SAMPLE_COUNT).astype(int).tolist(), last]
         )
         raw = header.first_points
-        with self._open_points(REQUIRED_FIELDS, all_cores=False) as points:
+        with self._open_points(POSITION_AND_TIME, all_cores=False) as points:
             for index in indices:
                 points.seek(index)
                 raw += points.read(1).tobytes()
@@ -162,6 +171,24 @@ class LasScan:
         shots = _ShotDecoder(header.las, self._range_max_m).decode(records, has_time=True)
         assert shots.time_s is not None  # noqa: S101 - requested
         return shots.time_s, shots.xyz_m[0], shots.xyz_m[1]
+
+    def _brightness(self, scale: IntensityScale) -> Brightness | None:
+        """Return the field that holds the brightness of the echoes.
+
+        None if there is none, or if it is the same for all echoes at the start of the scan and of each chunk.
+        """
+        candidates = brightness_candidates(self._las_header, scale)
+        if not candidates:
+            return None
+        layers = _with_brightness(POSITION_AND_TIME, *candidates)
+        with self._open_points(layers, all_cores=False) as points:
+            first_points = points.read(min(BRIGHTNESS_POINTS, self.header.point_count))
+        starts = np.frombuffer(self._las_header.first_points, first_points.dtype)
+        for brightness in candidates:
+            intensity = [*brightness.intensity(first_points), *brightness.intensity(starts)]
+            if max(intensity) > min(intensity):
+                return brightness
+        return None
 
     @contextmanager
     def _open_points(self, layers: DecompressionSelection, *, all_cores: bool) -> Iterator[_PointStream]:
@@ -239,20 +266,39 @@ class _ShotDecoder:
         self._earliest_s = np.inf
         self._latest_s = -np.inf
 
-    def decode(self, records: Records, *, has_time: bool, with_intensity: bool = False) -> Shots:
-        """Return the echoes of records, contiguous (n,), with their times if `has_time`."""
+    def decode(
+        self,
+        records: Records,
+        brightness: Brightness | None = None,
+        ground: Ints | None = None,
+        *,
+        has_time: bool,
+    ) -> Shots:
+        """Return the echoes of records, contiguous (n,), with their times if `has_time`.
+
+        `ground` (m,) are the indices of those to return; None for all.
+        """
         xyz_m = np.empty((3, len(records)))
         for axis, axis_m in enumerate(xyz_m):
             self._scale_axis(records, axis, axis_m)
-        if self._range_max_m is not None:
-            farthest_m = float(np.sqrt((xyz_m**2).sum(axis=0).max()))
-            if farthest_m > self._range_max_m:
-                raise ScanError(
-                    f"an echo {farthest_m:,.0f} m away, beyond scanner.range_max_m = {self._range_max_m:g}:"
-                    " corrupt, or not of the unit, frame or scanner that the site file states"
-                )
-        intensity = records["intensity"] * INTENSITY_SCALE if with_intensity else None
-        return Shots(xyz_m, self._decode_times(records) if has_time else None, intensity)
+        time_s = self._decode_times(records) if has_time else None
+        intensity = None if brightness is None else brightness.intensity(records)
+        if ground is not None:
+            xyz_m = xyz_m.take(ground, axis=1)
+            time_s = None if time_s is None else time_s.take(ground)
+            intensity = None if intensity is None else intensity.take(ground)
+        return Shots(xyz_m, time_s, intensity)
+
+    def check_range(self, shots: Shots) -> None:
+        """Raise ScanError if one of the shots, at least one, is out of range."""
+        if self._range_max_m is None:
+            return
+        farthest_m = float(np.sqrt((shots.xyz_m**2).sum(axis=0).max()))
+        if farthest_m > self._range_max_m:
+            raise ScanError(
+                f"an echo {farthest_m:,.0f} m away, beyond scanner.range_max_m = {self._range_max_m:g}:"
+                " corrupt, or not of the unit, frame or scanner that the site file states"
+            )
 
     def _scale_axis(self, records: Records, axis: int, values: Floats) -> None:
         """Write the coordinates (n,) along an axis into `values` [m]."""
@@ -267,7 +313,7 @@ class _ShotDecoder:
             )
 
     def _decode_times(self, records: Records) -> Floats:
-        time_s = np.ascontiguousarray(records["gps_time"], dtype=np.float64)
+        time_s = np.array(records["gps_time"], dtype=np.float64)  # a copy: the buffer is used again
         low_s, high_s = float(time_s.min()), float(time_s.max())
         if not (np.isfinite(low_s) and np.isfinite(high_s)):
             raise ScanError("a time stamp is not a number: corrupt, or written by a faulty program")
@@ -283,6 +329,21 @@ class _ShotDecoder:
                 " corrupt, or several scans in one file"
             )
         return time_s
+
+
+def _with_brightness(layers: DecompressionSelection, *fields: Brightness) -> DecompressionSelection:
+    """Return the layers together with those that hold the brightness."""
+    for field in fields:
+        layers = (
+            layers.decompress_all_extra_bytes() if field.in_extra_bytes else layers.decompress_intensity()
+        )
+    return layers
+
+
+def _ground(records: Records, tables: dict[str, Bools]) -> Ints | None:
+    """Return the indices (m,) of the records of the ground; None if it is all of them."""
+    discarded = reduce(np.logical_or, (table.take(records[name]) for name, table in tables.items()))
+    return np.flatnonzero(~discarded) if discarded.any() else None
 
 
 def _crs_wkt(las: LasHeader) -> str | None:

@@ -25,6 +25,7 @@ FIXED = struct.Struct("<24xBB68xHIIBHI")  # the fields of _Start
 HEADER_BYTES = {0: 227, 1: 227, 2: 227, 3: 235, 4: 375}  # by minor version
 POINT_BYTES = (20, 28, 26, 34, 57, 63, 30, 36, 38, 59, 67)  # by point format
 VLR = struct.Struct("<2x16sHH32x")  # header of a variable length record: owner, number, length
+LASZIP_KEY, EXTRA_BYTES_KEY = (b"laszip encoded", 22204), (b"LASF_Spec", 4)  # owner and number
 MAX_VLRS = 10_000  # the largest number met in practice is 390
 MAX_RECORD_BYTES = 4096
 MAX_POINTS_OFFSET = 1 << 27  # read into memory; 390 records of the largest size take 26 MB
@@ -35,6 +36,26 @@ VARIABLE_CHUNKS = 2**32 - 1
 CHUNKED, LAYERED = 2, 3  # compressors; 1 is the oldest of LASzip, without chunks
 LAYERS_BY_ITEM = {10: 9, 11: 1, 12: 2, 13: 1}  # by item type: Point14, RGB14, RGBNIR14, Wavepacket14
 BYTE14_ITEM = 14  # item type with one layer per byte
+EXTRA_BYTES = np.dtype(  # LAS 1.4 R15, table 24
+    {
+        "names": ["type", "options", "name", "scale", "offset"],
+        "formats": ["u1", "u1", "S32", "<f8", "<f8"],
+        "offsets": [2, 3, 4, 112, 136],
+        "itemsize": 192,
+    }
+)
+EXTRA_TYPES = ("u1", "i1", "<u2", "<i2", "<u4", "<i4", "<u8", "<i8", "<f4", "<f8")  # table 25, from 1
+SCALED, SHIFTED = 8, 16  # bits of the options: scale and offset are valid
+
+
+@dataclass(frozen=True)
+class ExtraField:
+    """A number in the extra bytes of a record; its value is `scale` times the stored one plus `offset`."""
+
+    position: int  # in the record [bytes]
+    dtype: str
+    scale: float
+    offset: float
 
 
 @dataclass(frozen=True)
@@ -45,6 +66,7 @@ class LasFileHeader:
     laszip: bytes | None  # the record that describes the compression; None if there is none
     first_points: bytes  # the first point of each chunk, which is stored uncompressed
     equal_chunks: bool  # all chunks but the last have the same length
+    reflectance: ExtraField | None  # the extra bytes called Reflectance, if any
 
     @property
     def record_dtype(self) -> np.dtype[np.void]:
@@ -71,6 +93,24 @@ class _Start(NamedTuple):
     point_count: int  # may be 0 in version 1.4
 
 
+class _Record(NamedTuple):
+    """A variable length record: its owner and number, and where it begins and ends [bytes]."""
+
+    owner: bytes
+    number: int
+    first: int
+    end: int
+
+    @property
+    def key(self) -> tuple[bytes, int]:
+        """Owner and number, which together tell what the record holds."""
+        return self.owner, self.number
+
+    def content(self, raw: bytearray) -> bytes:
+        """Return what follows the header of the record."""
+        return bytes(raw[self.first + VLR.size : self.end])
+
+
 @dataclass(frozen=True)
 class _LasZip:
     """The record that describes the compression."""
@@ -88,7 +128,9 @@ def read_header(file: BinaryIO, size: int) -> LasFileHeader:
     start = _check_start(file.read(HEADER_BYTES[4]), size)
     file.seek(0)
     raw = bytearray(file.read(start.points_offset))
-    laszip = _find_laszip(raw, start)
+    records = _variable_length_records(raw, start)
+    laszip, reflectance = _find_laszip(raw, start, records), _find_reflectance(raw, start, records)
+    _erase_owners(raw, records)
     with decoder_errors("corrupt header"):
         las = LasHeader.read_from(BytesIO(raw))
     if start.point_count not in {0, las.point_count}:
@@ -100,11 +142,12 @@ def read_header(file: BinaryIO, size: int) -> LasFileHeader:
     points_end = _points_end(las, size)
     if not start.format_byte & 0xC0:
         _check_point_count(las, points_end)
-        return LasFileHeader(las, None, b"", equal_chunks=False)
+        return LasFileHeader(las, None, b"", equal_chunks=False, reflectance=reflectance)
     if laszip is None:
         raise ScanError("compressed, but the record that says how (LASzip VLR) is missing")
     first_points = _check_chunks(file, las, laszip, points_end)
-    return LasFileHeader(las, laszip.record, first_points, laszip.chunk_points != VARIABLE_CHUNKS)
+    equal_chunks = laszip.chunk_points != VARIABLE_CHUNKS
+    return LasFileHeader(las, laszip.record, first_points, equal_chunks, reflectance)
 
 
 def _check_start(raw: bytes, size: int) -> _Start:
@@ -135,16 +178,12 @@ def _check_start(raw: bytes, size: int) -> _Start:
     return start
 
 
-def _find_laszip(raw: bytearray, start: _Start) -> _LasZip | None:
-    """Return the LASzip record, if any; all variable length records must end before the points.
-
-    Erases the owners of records that are not needed, because laspy rejects a file for an invalid character
-    in any record that it knows.
-    """
+def _variable_length_records(raw: bytearray, start: _Start) -> list[_Record]:
+    """Return the variable length records, all of which must end before the points."""
     position = start.header_bytes
     if start.vlr_count > min(MAX_VLRS, (len(raw) - position) // VLR.size):
         raise ScanError(f"corrupt header: no room for {start.vlr_count:,} variable length records")
-    laszip = None
+    records = []
     for index in range(start.vlr_count):
         first = position
         fits = first + VLR.size <= len(raw)
@@ -155,11 +194,41 @@ def _find_laszip(raw: bytearray, start: _Start) -> _LasZip | None:
                 f"corrupt header: variable length record {index + 1} of {start.vlr_count}"
                 " runs into the points"
             )
-        if owner.rstrip(b"\0") == b"laszip encoded" and number == 22204:
-            laszip = _parse_laszip(bytes(raw[first + VLR.size : position]), start.record_bytes)
-        elif owner.rstrip(b"\0") != b"LASF_Projection":
-            raw[first + 2 : first + 18] = bytes(16)
-    return laszip
+        records.append(_Record(owner.rstrip(b"\0"), number, first, position))
+    return records
+
+
+def _erase_owners(raw: bytearray, records: list[_Record]) -> None:
+    """Erase the owners of records that laspy need not know: it rejects a file for one invalid character."""
+    for record in records:
+        if record.key != LASZIP_KEY and record.owner != b"LASF_Projection":
+            raw[record.first + 2 : record.first + 18] = bytes(16)
+
+
+def _find_laszip(raw: bytearray, start: _Start, records: list[_Record]) -> _LasZip | None:
+    """Return the last LASzip record; None if there is none."""
+    content = [record.content(raw) for record in records if record.key == LASZIP_KEY]
+    return _parse_laszip(content[-1], start.record_bytes) if content else None
+
+
+def _find_reflectance(raw: bytearray, start: _Start, records: list[_Record]) -> ExtraField | None:
+    """Return the first extra bytes called Reflectance that hold one number; None if there are none."""
+    content = b"".join(record.content(raw) for record in records if record.key == EXTRA_BYTES_KEY)
+    position = POINT_BYTES[start.format_byte & 0x3F]
+    for row in np.frombuffer(content, EXTRA_BYTES, len(content) // EXTRA_BYTES.itemsize):
+        kind, options = int(row["type"]), int(row["options"])
+        if kind > 3 * len(EXTRA_TYPES):  # of unknown size: what follows cannot be located
+            return None
+        values, index = divmod(kind - 1, len(EXTRA_TYPES))  # deprecated types have two or three values
+        size = np.dtype(EXTRA_TYPES[index]).itemsize * (values + 1) if kind else options
+        scale = float(row["scale"]) if options & SCALED else 1.0
+        offset = float(row["offset"]) if options & SHIFTED else 0.0
+        is_number = 1 <= kind <= len(EXTRA_TYPES) and np.isfinite([scale, offset]).all() and scale
+        is_inside = position + size <= start.record_bytes
+        if is_number and is_inside and row["name"].strip().lower() == b"reflectance":
+            return ExtraField(position, EXTRA_TYPES[index], scale, offset)
+        position += size
+    return None
 
 
 def _parse_laszip(record: bytes, record_bytes: int) -> _LasZip:

@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import ClassVar, Protocol, Self
 
 from station.errors import NotReadyError, ScanError, StationError
-from station.quantities import AzimuthTrack, Shots
+from station.quantities import AzimuthTrack, IntensityScale, Shots
 
 log = logging.getLogger(__name__)
 
@@ -82,8 +82,11 @@ class ScanReader(Protocol):
     def __init__(self, path: Path, *, range_max_m: float | None = None) -> None:
         """Open the file; `range_max_m` limits the range of the echoes of a scan in the scanner's frame."""
 
-    def blocks(self, size: int = 50_000, *, with_intensity: bool = True) -> Iterator[Shots]:
-        """Yield all echoes in file order, `size` at a time, with their intensity if `with_intensity`."""
+    def blocks(self, size: int = 50_000, *, intensity: IntensityScale = "auto") -> Iterator[Shots]:
+        """Yield the echoes of the ground in file order, from `size` points at a time; no block is empty.
+
+        `intensity` is the scale in which the file tells brightness: `scans.intensity` of the site file.
+        """
 
     def time_range_s(self) -> tuple[float, float] | None:
         """Return the earliest and latest time stamp [s], from samples; None if there are none."""

@@ -4,6 +4,7 @@ import json
 import shutil
 from dataclasses import replace
 
+import laspy
 import pytest
 
 from station.config import read_site
@@ -79,3 +80,17 @@ def test_read_only_inbox_is_a_warning_if_retention_deletes_scans(folder, monkeyp
 
 def folder_warnings(site):
     return [finding["what"] for finding in site_check._folders(site) if finding["level"] == "warning"]
+
+
+def test_scan_without_brightness_is_a_warning_that_says_what_it_costs(folder):
+    site = read_site(folder / "site.toml")
+    assert [finding["what"] for finding in site_check._newest_scan(site)] == ["scan"]
+    scan = max(site.scans.inbox.glob("*.laz"))
+    las = laspy.read(scan)
+    las.intensity[:] = 0
+    las.write(scan)
+    verdict, finding = site_check._newest_scan(site)
+    assert "no brightness" in verdict["message"]
+    assert (finding["level"], finding["what"]) == ("warning", "brightness")
+    assert "recognised by slope only" in finding["message"]
+    assert "scans.intensity" in finding["message"]

@@ -17,7 +17,7 @@ from station.operations import site_check
 from station.processing import provenance, reference_tasks, scan_tasks
 from station.processing.pipeline import to_map
 from station.processing.scan_inputs import load_scan_inputs, pressure_fault
-from station.quantities import Air
+from station.quantities import Air, Quality
 from station.readers.scan import utc_interval
 from station.science.uncertainty.parameters import LINE_GROUPS_PER_KNOT
 from station.simulation.instrument.motion import sensor_faults
@@ -351,6 +351,95 @@ def test_linked_scan_is_rejected(folder):
     scan.symlink_to(folder / "elsewhere.laz")
     with pytest.raises(ScanError, match="not a regular file"):
         process(folder)
+
+
+NO_BRIGHTNESS = "no brightness: snow on stable ground cannot be recognised"
+
+
+def rewrite(path, change):
+    """Change the echoes of a scan."""
+    las = laspy.read(path)
+    change(las)
+    las.write(path)
+
+
+def test_scan_without_brightness_is_degraded_and_uses_steep_ground_only(folder):
+    site = edited_site(folder)
+    scans = sorted(site.scans.inbox.glob("*.laz"))
+    reference_tasks.build_reference_version(site, [scan_file(site, scans[0])], "1", lambda: None)
+    bright, _ = process(folder)
+    assert (bright.verdict, bright.reason) == ("good", "")
+    stable = stable_ground(site, bright)
+
+    rewrite(scans[1], lambda las: las.intensity.fill(0))
+    dark, _ = process(folder)
+    assert (dark.verdict, dark.reason) == ("degraded", NO_BRIGHTNESS)
+    steep = stable_ground(site, dark)
+    assert 0 < np.count_nonzero(steep) < 0.5 * np.count_nonzero(stable)
+    assert np.count_nonzero(steep & ~stable) < 0.02 * np.count_nonzero(steep)  # noise of their brightness
+    elevation_m = scan_tasks.load_reference(site).elevation_m[:]
+    rise = np.hypot(*np.gradient(elevation_m, site.grid.cell_m))  # not smoothed as the program does
+    assert np.nanmedian(np.degrees(np.arctan(rise[steep]))) > 50
+    assert np.nanmedian(np.degrees(np.arctan(rise[stable & ~steep]))) < 50
+
+    no_intensity, _ = process(folder, ("[scans]", '[scans]\nintensity = "none"'))
+    assert no_intensity.reason == NO_BRIGHTNESS
+
+
+def stable_ground(site, result):
+    """Return the cells (ny, nx) of stable ground that an epoch used."""
+    with netCDF4.Dataset(site.station.data / result.epoch) as file:
+        return (np.ma.filled(file["quality"][0], 0).astype(int) & Quality.STABLE_GROUND) > 0
+
+
+def test_brightness_in_decibels_is_recognised_as_such(folder):
+    """The same scans with the intensity as PDAL writes reflectance, and the site file that says so."""
+    site = edited_site(folder, ("[scans]", '[scans]\nintensity = "decibel"'))
+    scans = sorted(site.scans.inbox.glob("*.laz"))
+    for scan in scans:
+        rewrite(scan, to_decibels)
+    reference_tasks.build_reference_version(site, [scan_file(site, scans[0])], "1", lambda: None)
+    result, _ = process(folder)
+    assert (result.verdict, result.reason) == ("good", "")
+
+
+def to_decibels(las):
+    relative_db = 10 * np.log10(np.maximum(np.asarray(las.intensity) / 65535, 1e-3))
+    las.intensity = np.rint((np.clip(relative_db, -25, 5) + 25) / 30 * 65535).astype(np.uint16)
+
+
+def test_discarded_points_are_counted_and_leave_the_surface_unchanged(folder):
+    """One echo in ten is doubled, 40 m closer: snowflakes, first of two returns."""
+    clean, _ = process(folder)
+    site = read_site(folder / "site.toml")
+    scan = sorted(site.scans.inbox.glob("*.laz"))[1]
+    las = laspy.read(scan)
+    chosen = np.arange(0, len(las), 10)
+    order = np.sort(np.concatenate([np.arange(len(las)), chosen]), kind="stable")
+    first = np.flatnonzero(np.diff(order) == 0)  # of the two copies
+    xyz_m = np.stack([las.x, las.y, las.z])[:, order]
+    xyz_m[:, first] *= 1 - 40 / np.linalg.norm(xyz_m[:, first], axis=0)
+    las.points = las.points[order]
+    las.x, las.y, las.z = xyz_m
+    number, count = np.ones((2, len(order)), np.uint8)
+    number[first + 1] = count[first] = count[first + 1] = 2
+    las.return_number, las.number_of_returns = number, count
+    las.write(scan)
+    snowy, _ = process(folder)
+    assert "discarded_pct" not in clean.metrics
+    assert snowy.metrics["points"] == len(order)
+    assert snowy.metrics["discarded_pct"] == pytest.approx(100 * len(chosen) / len(order), abs=0.01)
+    with (
+        netCDF4.Dataset(site.station.data / clean.epoch) as before,
+        netCDF4.Dataset(site.station.data / snowy.epoch) as after,
+    ):
+        assert before["discarded_share"][0] == 0
+        assert after["discarded_share"][0] == pytest.approx(len(chosen) / len(order))
+        assert snowy.epoch != clean.epoch
+        difference_m = (after["elevation"][:] - before["elevation"][:]).compressed()
+        assert len(difference_m) > 5000
+        assert np.abs(difference_m).max() < 0.01  # the azimuth of the head is sampled at other points
+        assert np.ma.allequal(before["elevation"][:].mask, after["elevation"][:].mask)
 
 
 @pytest.mark.integration

@@ -41,15 +41,15 @@ HOSTILE = {
     "simple-laszip-compressor-version-1.2r0.laz": r"LASzip 1\.2 .* rewrite it",
     "spurious.las": r"x = -124\.069 .* leaves the header's -123\.075 to -123\.063",
 }
-VALID = {
-    "1.2-empty-geotiff-vlrs.las": 43,
+VALID = {  # last or only returns, without noise, counted with laspy
+    "1.2-empty-geotiff-vlrs.las": 42,
     "autzen-bmx-2010.las": 829,
     "autzen-bmx-2023.las": 687,
     "bad-geotiff-keys.las": 10,
-    "extrabytes.las": 1065,
+    "extrabytes.las": 901,
     "lots_of_vlr.las": 1,
-    "simple.laz": 1065,
-    "warsaw_small.las": 3000,
+    "simple.laz": 901,
+    "warsaw_small.las": 2177,
 }
 
 
@@ -188,7 +188,10 @@ def test_time_stamps_more_than_a_day_apart_are_rejected(write_scan):
 @settings(max_examples=250, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(seed=st.integers(0, 2**32), name=st.sampled_from(["s.las", "s.laz", "old.laz"]), head=st.booleans())
 def test_flipped_bits_are_rejected_or_harmless(tmp_path, seed, name, head, valid_files):
-    """Either rejected with a reason, or the counted number of finite echoes within the header's box."""
+    """Either rejected with a reason, or finite echoes within the header's box, at most the counted number.
+
+    A flipped bit may mark a point as noise, as withheld, or as an earlier return, which is not used.
+    """
     raw = bytearray(valid_files[name])
     rng = random.Random(seed)  # noqa: S311 - no secret
     for _ in range(rng.choice([1, 1, 1, 8])):
@@ -201,8 +204,8 @@ def test_flipped_bits_are_rejected_or_harmless(tmp_path, seed, name, head, valid
         scan.azimuth_track()
     except ScanError:
         return
-    assert sum(len(block) for block in blocks) == scan.header.point_count
-    for block in blocks:
+    assert 0 < sum(len(block) for block in blocks) <= scan.header.point_count
+    for block in filter(len, blocks):
         assert block.time_s is None or np.isfinite(block.time_s).all()
         for axis, values in enumerate(block.xyz_m):
             assert values.min() >= scan.header.low_m[axis] - 1

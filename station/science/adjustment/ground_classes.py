@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 
 from station.quantities import Bools, Floats, Floats32, Ints
@@ -12,10 +14,16 @@ HOLDOUT_BLOCK_M = 50.0  # edge of a hold-out block
 HOLDOUT_EVERY = 10
 MAX_MOVING_SLOPE = np.tan(np.radians(37.0))  # tan; steeper ground holds snow in patches only
 MIN_STABLE_SLOPE = np.tan(np.radians(40.0))  # tan; of ground detected as stable: too steep to hold snow
-MAX_INTENSITY_RATIO = (
-    1.25  # above: rock under at least 1 cm of snow, which reflects 1064 nm two to four times as well
-)
-MIN_INTENSITY_RATIO = 0.5  # below: rock after its snow has melted; wet rock alone is not as dark
+# tan; steeper rock holds little snow: above 60° a tenth of that on a rock face (Sommer et al., 2015)
+MIN_BARE_SLOPE = np.tan(np.radians(50.0))
+DARK_SNOW_UM = 1.4  # wavelength from which snow is darker than rock: water and ice absorb (Warren, 1982)
+# Limits of the intensity over that of the reference. At 1064 nm snow is two to four times as bright as rock;
+# below: rock after its snow has melted, above: rock under at least 1 cm of snow. At 1550 nm snow reflects 2
+# to 20 % and rock 20 to 50 %. Rock that is wet now, 0.6 times as bright at worst, stays within.
+BRIGHT_SNOW_RATIOS = (0.5, 1.25)
+DARK_SNOW_RATIOS = (0.55, 1 / 0.55)
+MAX_GAIN_CHANGE = 0.15  # of the receiver, usually 5 % from scan to scan; beyond, the ground has changed
+MIN_GAIN_CELLS = 50
 NOISE_CLASS_RANGE_M = 500.0
 NOISE_CLASS_SLOPE = 0.25
 
@@ -35,8 +43,8 @@ def is_holdout(x_m: Floats, y_m: Floats) -> Bools:
 def classify(stable: Bools, holdout: Bools, smooth: Bools, changed: Bools) -> Ints:
     """Return the ground class of cells (n,).
 
-    `stable` is set by polygon or by the cell's history, `changed` where the brightness differs from the
-    reference, `smooth` where the slope is below `MAX_MOVING_SLOPE`.
+    `stable` is set by polygon or by the cell's history, `changed` where snow came or went since the
+    reference (see `SnowTest`), `smooth` where the slope is below `MAX_MOVING_SLOPE`.
     """
     changeable = np.where(smooth, GroundClass.MOVING, GroundClass.UNUSED)
     stable_class = np.where(holdout, GroundClass.HOLDOUT, GroundClass.STABLE)
@@ -49,14 +57,47 @@ def holds_no_snow(elevation_m: Floats, cell_m: float) -> Bools:
     return np.asarray(np.hypot(east, north) > MIN_STABLE_SLOPE)
 
 
-def brightness_changed(intensity: Floats32, reference: Floats32) -> Bools:
-    """Return True for cells (n,) much brighter or darker than in the reference: snow has come or gone.
+@dataclass(frozen=True)
+class SnowTest:
+    """Tells by brightness where snow has come or gone since the reference.
 
-    False where either intensity is NaN.
+    `gain` is the common factor of all intensities, between `ratios` of intensity nothing has changed.
     """
-    return np.asarray(
-        (intensity > MAX_INTENSITY_RATIO * reference) | (intensity < MIN_INTENSITY_RATIO * reference)
-    )
+
+    gain: float
+    ratios: tuple[float, float]
+
+    def changed(self, intensity: Floats32, reference: Floats32, steep: Bools) -> Bools:
+        """Return True for cells (n,) where snow came or went, or, unless they are `steep`, may have.
+
+        Snow at 1064 nm makes a cell brighter, at 1550 nm darker. Where either intensity is NaN, only the
+        slope tells.
+        """
+        ratio = _ratio(intensity, reference) / np.float32(self.gain)
+        lowest, highest = self.ratios
+        return np.where(np.isfinite(ratio), (ratio < lowest) | (ratio > highest), ~steep)
+
+
+def snow_test(intensity: Floats32, reference: Floats32, wavelength_um: float) -> SnowTest:
+    """Return the test of a scan, from the intensity of stable cells (n,) that are too steep to hold snow.
+
+    Their median ratio is the gain, unless it is too large for one: then they have changed themselves. Flatter
+    cells would not do, because the gain must not absorb the snow that lies on most of them.
+
+    The limits follow from the reflectance of snow by wavelength and grain size: Warren (1982), Deems et al.
+    (2013).
+    """
+    ratios = BRIGHT_SNOW_RATIOS if wavelength_um < DARK_SNOW_UM else DARK_SNOW_RATIOS
+    ratio = _ratio(intensity, reference)
+    ratio = ratio[np.isfinite(ratio)]
+    gain = float(np.median(ratio)) if len(ratio) >= MIN_GAIN_CELLS else 1.0
+    return SnowTest(gain if abs(gain - 1) <= MAX_GAIN_CHANGE else 1.0, ratios)
+
+
+def _ratio(intensity: Floats32, reference: Floats32) -> Floats32:
+    """Return intensities (n,) over those of the reference; NaN where either is unknown."""
+    ratio = np.full(len(intensity), np.nan, np.float32)
+    return np.divide(intensity, reference, out=ratio, where=reference > 0)
 
 
 def noise_class(range_m: Floats, tan_slope: Floats) -> Ints:

@@ -33,6 +33,7 @@ MAX_HOLDOUT_Z_STD = 3.0  # of hold-out stable ground
 MAX_MISFIT_SIGMAS = 5.0  # of an unadjusted scan; beyond, its sigma does not cover the error
 MIN_STABLE_CELLS = 20
 MAX_MISFIT_CELLS = 100_000  # larger sets are thinned for the misfit
+NO_BRIGHTNESS = "no brightness: snow on stable ground cannot be recognised"
 
 
 @dataclass(frozen=True)
@@ -154,15 +155,18 @@ def assess(
     adjustment: Adjustment | None,
     stable_z_std: float | None,
     faults: Sequence[str] = (),
+    *,
+    has_brightness: bool = True,
 ) -> tuple[str, str]:
     """Return the verdict of an epoch and its reasons, the gravest first.
 
     Unusable: flagged by a person, a fault of the inputs, no usable view, or a sigma that does not cover the
     error. Degraded: any other warning. `adjustment` is the adjustment of the scan even if it was not used in
-    the end; `stable_z_std` is given only if it was used. `faults` are those of the inputs.
+    the end; `stable_z_std` is given only if it was used. `faults` are those of the inputs. `has_brightness`
+    is False if the scan, or its reference, does not tell by brightness where snow lies.
     """
     fatal = [*([f"flagged: {flag}"] if flag else []), *faults]
-    reasons = list(warnings)
+    reasons = [*warnings, *([] if has_brightness else [NO_BRIGHTNESS])]
     if viewing is not None and viewing.params is not None:
         visible = visibility(measurement.count, viewing)
         (fatal if visible.share < UNUSABLE_VISIBILITY else reasons).extend(obstructions(visible))

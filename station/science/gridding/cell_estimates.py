@@ -21,7 +21,7 @@ from station.quantities import (
     ScanGeometry,
     SharedParameters,
 )
-from station.science.adjustment import ground_classes
+from station.science.adjustment.ground_classes import SnowTest
 from station.science.geometry.observation import Observation
 from station.science.geometry.terrain import HALO_ROWS, gradient_at
 from station.science.gridding import significance
@@ -251,14 +251,15 @@ class CellEstimator:
     """Corrects the cells of a scan for the adjustment and estimates their uncertainty.
 
     `posterior` are the shared parameters of the difference from the reference, `independent` those of the
-    scan alone, None if unknown; `correction` returns what to subtract from heights [m], None without an
-    adjustment.
+    scan alone, None if unknown. `correction` returns what to subtract from heights [m], and `snow_test` tells
+    which stable ground is under snow; both are None without an adjustment.
     """
 
     scan_geometry: ScanGeometry
     posterior: SharedParameters | None
     independent: SharedParameters | None
     correction: Callable[[HeightJacobian], Reals] | None
+    snow_test: SnowTest | None
 
     def in_reference(
         self, cell_index: Ints, sector: AzimuthSector, sums: CellSums, viewing: ViewingGeometry
@@ -280,13 +281,11 @@ class CellEstimator:
         flags = Quality.FEW_POINTS * (sums.count < FEW_POINTS).view(np.uint8)
         flags |= Quality.HIGH_INCIDENCE * sector.in_class(CellClass.GRAZING).view(np.uint8)
         flags |= Quality.CHANGE_SIGNIFICANT * significance.significant(change_m, sigma_m).view(np.uint8)
-        if self.correction is not None:
-            brightness_differs = ground_classes.brightness_changed(
-                sums.intensity(), viewing.intensity(cell_index)
+        if self.snow_test is not None:
+            changed = self.snow_test.changed(
+                sums.intensity(), viewing.intensity(cell_index), sector.in_class(CellClass.STEEP)
             )
-            flags |= Quality.STABLE_GROUND * (sector.in_class(CellClass.STABLE) & ~brightness_differs).view(
-                np.uint8
-            )
+            flags |= Quality.STABLE_GROUND * (sector.in_class(CellClass.STABLE) & ~changed).view(np.uint8)
         elevation_m = viewing.datum_m + (sector.height_m.astype(np.float64) + change_m)
         return _CellEstimates(elevation_m, change_m, sigma_m, np.sqrt(random_m2), flags, terms)
 

@@ -172,6 +172,16 @@ class Gridder:
         intensity_sum = self._intensity_sum[first:end] if self._has_intensity else None
         return CellSums(self._count[first:end], self._moments[first:end], intensity_sum)
 
+    @property
+    def has_intensity(self) -> bool:
+        """True if the intensity of any point is known."""
+        return bool(self._has_intensity and self._intensity_sum.any())
+
+    def intensity(self, cell_index: Ints) -> Floats32:
+        """Return the mean intensity of reference cells (n,) by index, 0-1; NaN where it is unknown."""
+        sums = self.sums(0, self.reference_cells)
+        return sums.take(cell_index).intensity()
+
     def take(self, cell_index: Ints32) -> CellSums:
         """Return a copy of the sums of cells (n,) by index, without intensity."""
         return CellSums(self._count.take(cell_index), self._moments.take(cell_index, axis=0), None)

@@ -66,6 +66,7 @@ class CellClass(IntFlag):
     HOLDOUT = 2  # if stable: excluded from every fit
     SMOOTH = 4  # flat enough to change like its neighbours
     GRAZING = 8  # incidence above 80°
+    STEEP = 16  # above 50°: sheds its snow
 
 
 @dataclass(frozen=True)
@@ -283,7 +284,9 @@ def _cells(
     cell_class = np.where(stable[known], CellClass.STABLE, 0) | np.where(
         ground_classes.is_holdout(x_m, y_m), CellClass.HOLDOUT, 0
     )
-    cell_class |= np.where(np.hypot(east, north) < ground_classes.MAX_MOVING_SLOPE, CellClass.SMOOTH, 0)
+    slope = np.hypot(east, north)
+    cell_class |= np.where(slope < ground_classes.MAX_MOVING_SLOPE, CellClass.SMOOTH, 0)
+    cell_class |= np.where(slope > ground_classes.MIN_BARE_SLOPE, CellClass.STEEP, 0)
     knot_position: Reals = np.zeros(len(row))
     visibility_bin: Ints = np.zeros(len(row), np.int64)
     shot_m2 = np.full(len(row), scanner.range_sigma_m**2)

@@ -63,21 +63,65 @@ def test_slopes_above_40_degrees_hold_no_snow():
         assert (ground_classes.holds_no_snow(plane, 5.0) == expected).all()
 
 
-def test_brightness_changes_with_snow_but_not_with_wetness_or_missing_intensity():
-    rng = np.random.default_rng(1)
-    now, then = rng.uniform(0.05, 1, (2, 500)).astype(np.float32)
-    actual = ground_classes.brightness_changed(now, then)
-    assert np.array_equal(actual, (now / then > 1.25) | (now / then < 0.5))
-    assert 50 < actual.sum() < 450
-    rock = np.full(3, 0.25, np.float32)
-    actual = ground_classes.brightness_changed(
-        np.array([0.25 * 2.4, 0.25 * 0.65, 0.25 * 1.08], np.float32), rock
-    )
-    assert actual.tolist() == [True, False, False]  # snow, wet rock, a different gain
-    nan = np.full(500, np.nan, np.float32)
-    assert not ground_classes.brightness_changed(now, nan).any()
-    assert not ground_classes.brightness_changed(nan, then).any()
-    assert not ground_classes.brightness_changed(nan, nan).any()
+FLAT, STEEP = np.zeros(1, bool), np.ones(1, bool)
+NEAR_INFRARED_UM, SHORT_WAVE_UM = 1.064, 1.55
+
+
+def changed(wavelength_um, now, then, *, gain=1.0, steep=FLAT):
+    """Return whether ground of reflectance `then` counts as changed when it reflects `now`."""
+    cells = np.full(100, 0.3, np.float32)
+    test = ground_classes.snow_test(np.float32(gain) * cells, cells, wavelength_um)
+    pair = (np.array([gain * now], np.float32), np.array([then], np.float32))
+    return test.changed(*pair, steep).tolist() == [True]
+
+
+@pytest.mark.parametrize("gain", [1.0, 0.87, 1.14])
+@pytest.mark.parametrize(
+    ("wavelength_um", "now", "then", "expected"),
+    [
+        (NEAR_INFRARED_UM, 0.85, 0.35, True),  # fresh snow on rock
+        (NEAR_INFRARED_UM, 0.60, 0.40, True),  # coarse wet snow on bright rock
+        (NEAR_INFRARED_UM, 0.20, 0.60, True),  # snow has melted
+        (NEAR_INFRARED_UM, 0.18, 0.30, False),  # wet rock
+        (NEAR_INFRARED_UM, 0.33, 0.30, False),
+        (SHORT_WAVE_UM, 0.15, 0.35, True),  # fresh, fine snow on rock
+        (SHORT_WAVE_UM, 0.03, 0.35, True),  # old snow
+        (SHORT_WAVE_UM, 0.10, 0.20, True),  # fine snow on dark rock
+        (SHORT_WAVE_UM, 0.35, 0.10, True),  # snow has melted
+        (SHORT_WAVE_UM, 0.21, 0.35, False),  # wet rock
+        (SHORT_WAVE_UM, 0.35, 0.21, False),  # the rock of the reference was wet
+        (SHORT_WAVE_UM, 0.38, 0.30, False),
+    ],
+)
+def test_snow_is_bright_at_1064_nm_and_dark_at_1550_nm(wavelength_um, now, then, expected, gain):
+    assert changed(wavelength_um, now, then, gain=gain) == expected
+    assert changed(wavelength_um, now, then, gain=gain, steep=STEEP) == expected
+
+
+@pytest.mark.parametrize("wavelength_um", [NEAR_INFRARED_UM, SHORT_WAVE_UM])
+@pytest.mark.parametrize("pair", [(np.nan, 0.3), (0.3, np.nan), (np.nan, np.nan), (0.3, 0.0)])
+def test_without_brightness_only_steep_ground_is_known_to_be_unchanged(wavelength_um, pair):
+    assert changed(wavelength_um, *pair)
+    assert not changed(wavelength_um, *pair, steep=STEEP)
+
+
+@pytest.mark.parametrize(
+    ("snow_share", "common", "expected"),
+    [(0.0, 1.1, 1.1), (0.4, 1.1, 1.1), (0.0, 0.9, 0.9), (0.9, 1.0, 1.0), (0.0, 1.2, 1.0), (0.0, 0.8, 1.0)],
+)
+def test_gain_is_the_common_factor_of_the_receiver_but_not_of_snow(snow_share, common, expected):
+    rng = np.random.default_rng(2)
+    then = rng.uniform(0.2, 0.4, 2000).astype(np.float32)
+    snow = rng.random(2000) < snow_share
+    now = then * common * rng.normal(1, 0.02, 2000) * np.where(snow, 2.5, 1.0)
+    then[::7] = np.nan
+    test = ground_classes.snow_test(now.astype(np.float32), then, NEAR_INFRARED_UM)
+    assert test.gain == pytest.approx(expected, abs=0.03)
+
+
+def test_a_few_cells_tell_no_gain():
+    few = np.full(49, 0.3, np.float32)
+    assert ground_classes.snow_test(few * np.float32(1.1), few, NEAR_INFRARED_UM).gain == 1.0
 
 
 def test_noise_classes_start_at_zero_and_group_similar_range_and_slope():

@@ -163,6 +163,12 @@ def test_holdout_ground_may_scatter_by_three_sigma():
     assert "scatters by 3.1 sigma" in reason
 
 
+def test_missing_brightness_degrades_the_verdict():
+    result = measurement(0.0, 0.1, RANGE_M < 100, None)
+    actual = verdict.assess("", ("a",), result, None, None, None, has_brightness=False)
+    assert actual == ("degraded", "a; no brightness: snow on stable ground cannot be recognised")
+
+
 def test_verdict_without_a_reference_depends_on_warnings_and_flags():
     result = measurement(0.0, 0.1, RANGE_M < 100, None)
     assert verdict.assess("", (), result, None, None, None) == ("good", "")

@@ -76,6 +76,14 @@ def test_gradients_heights_and_shot_variance_of_a_plane():
     assert np.array_equal(np.sort(stable_cells), np.flatnonzero(KNOWN & STABLE))
 
 
+@pytest.mark.parametrize(("slope_deg", "steep"), [(49, False), (51, True), (80, True)])
+def test_ground_above_50_degrees_is_steep(slope_deg, steep):
+    rise = math.tan(math.radians(slope_deg)) * (0.6 * GRID.x_m[None, :] + 0.8 * GRID.y_m[:, None])
+    reference = Reference.from_elevation(GRID, "plane", rise)
+    viewing = compute_viewing_geometry(reference, STABLE, VZ6000, POSITION_M)
+    assert len(viewing.select(CellClass.STEEP)) == (GRID.nx * GRID.ny if steep else 0)
+
+
 @pytest.mark.parametrize("max_moving", [3000, 9000])
 def test_adjustment_uses_a_sample_of_very_many_cells(monkeypatch, max_moving):
     all_arrays = all_cells(
