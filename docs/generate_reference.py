@@ -37,6 +37,7 @@ LOG_KEYS = {
     "reason": "why, in a sentence",
     "points": "points read",
     "discarded_pct": "share of the points that are not the last return, withheld, or classified as noise [%]",
+    "rejected_echo_pct": "share of the points on the grid that are not of the surface of their cell [%]",
     "cells": "cells of the grid with a value",
     "sigma_median_m": "median of the uncertainty of a cell's change [m]",
     "change_median_m": "median change against the reference [m]",

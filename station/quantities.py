@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from enum import IntFlag
-from math import radians
+from math import radians, sqrt
 from typing import Any, Literal, TypeVar
 
 import numpy as np
@@ -186,6 +186,16 @@ class SharedParameters:
     line_tilt_variance: Floats  # (p,)
     change_errors: ChangeErrors | None = None
 
+    def scaled(self, factor: float) -> SharedParameters:
+        """Return the same estimate with its variances multiplied by a factor."""
+        errors = self.change_errors
+        return replace(
+            self,
+            covariance=self.covariance * factor,
+            line_tilt_variance=self.line_tilt_variance * factor,
+            change_errors=errors and replace(errors, modes=errors.modes * sqrt(factor)),
+        )
+
     def __add__(self, other: SharedParameters) -> SharedParameters:
         """Return the shared parameters of a sum or difference of two independent surfaces."""
         return replace(
@@ -306,13 +316,16 @@ class Measurement:
 class Reference:
     """The reference surface that change is measured from.
 
-    `elevation_m` are nodes at the cell centres, NaN where unknown; between them the surface is bilinear.
+    `elevation_m` are nodes at the cell centres, NaN where unknown; between them the surface is bilinear. On
+    rough ground the shots of a cell lie above or below it on average. `mean_residual_m` is what its own scans
+    show of that, so that change, counted from it, is zero on their average in every cell.
     """
 
     grid: Grid
     version: str
     elevation_m: Floats  # (ny, nx)
-    random_variance_m2: Floats32  # (ny, nx)
+    mean_residual_m: Floats32  # (ny, nx) of its scans to the surface
+    random_variance_m2: Floats32  # (ny, nx) of the mean of its scans
     roughness_m2: Floats32  # (ny, nx) variance of the terrain about the surface within each cell
     shared: SharedParameters | None  # None: external surface with unknown shared errors
     scan_ids: tuple[str, ...]
@@ -332,6 +345,7 @@ class Reference:
             grid=grid,
             version=version,
             elevation_m=elevation_m,
+            mean_residual_m=zeros,
             random_variance_m2=zeros,
             roughness_m2=zeros,
             shared=None,

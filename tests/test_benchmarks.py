@@ -5,8 +5,12 @@ import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 
+from benchmarks.accuracy_measures import RECORD, SCALES, summarise
+from benchmarks.accuracy_rows import ROWS
+from benchmarks.accuracy_table import BEGIN, END, missed, write_markdown
 from benchmarks.peers import GridTask, Peer, peer_cost
 from benchmarks.process_cost import Cost, FailedError, Row, cost_of, job_cost, median_cost
 
@@ -105,3 +109,69 @@ def test_scipy_fills_as_many_cells_as_the_station(quick):
     _, by_scipy = peer_cost(Peer("scipy", "", "scipy", ""), GridTask(**task), folder)
     _, by_station = job_cost("benchmarks.station_jobs", "epoch", folder, **arguments)
     assert by_scipy["cells"] == pytest.approx(by_station["cells"], rel=0.01)
+
+
+def records_of(factor, true_m, retained=1.0):
+    """Return records of four stations with normal errors, `factor` times as large as stated."""
+    rng = np.random.default_rng(1)
+    parts = []
+    for scale, count in zip(SCALES, (2000, 40, 40, 1), strict=True):
+        for seed, scan, other in np.ndindex(4, 20, 2):
+            part = np.zeros(count, RECORD)
+            part["scale"], part["seed"], part["scan"], part["other"] = scale, seed, scan, other - 1
+            part["sigma_m"] = 0.01
+            part["true_m"] = true_m * scan
+            part["error_m"] = factor * rng.normal(0, 0.01, count) + (retained - 1) * part["true_m"]
+            part["range_m"] = rng.uniform(200, 3500, count)
+            part["points"], part["significant"] = 2, np.abs(part["error_m"]) > 0.0196
+            parts.append(part)
+    return np.concatenate(parts)
+
+
+def figures_of_row(records, good=1.0, reason_share=1.0):
+    verdicts = {"good": good, "degraded": 1 - good, "unusable": 0.0}
+    return summarise(records, 0) | {"verdicts": verdicts, "reason": "", "told": reason_share}
+
+
+def test_accuracy_figures_are_those_of_the_simulated_errors():
+    figures = figures_of_row(records_of(1.0, 0.0))
+    assert figures["box_rms_m"] == pytest.approx(0.01, rel=0.05)
+    assert figures["box_95_m"] == pytest.approx(0.0196, rel=0.05)
+    assert [*figures["z"].values()] == pytest.approx([1.0] * 4, abs=0.2)
+    assert [*figures["z_pairs"].values()] == pytest.approx([1.0] * 3, abs=0.2)
+    assert figures["inside_95"] == pytest.approx(0.95, abs=0.01)
+    assert figures["significant"] == pytest.approx(0.05, abs=0.01)
+    assert missed(ROWS["rough"], figures) == []
+    retained = summarise(records_of(1.0, 0.01, 0.6), 0)["retained"]
+    assert [*retained.values()] == pytest.approx([0.6] * 3, abs=0.02)
+    assert np.isnan(figures["retained"]["100 m"])
+
+
+@pytest.mark.parametrize("factor", [1.3, 1 / 1.35])
+def test_accuracy_row_misses_its_limits_if_sigma_is_wrong_by_a_third(factor):
+    found = missed(ROWS["rough"], figures_of_row(records_of(factor, 0.0), good=0.9))
+    assert {"z cell", "z 10 m", "z 100 m", "z cell 1.5-2.5 km", "significant", "good"} <= set(found)
+    assert missed(ROWS["snow-no-brightness"], figures_of_row(records_of(1.0, 0.0), reason_share=0.5)) == [
+        "reason"
+    ]
+
+
+def test_change_that_is_taken_for_motion_misses_the_limits_unless_sigma_covers_it():
+    figures = figures_of_row(records_of(1.0, 0.01, 0.6))
+    assert {"retained", "sign", "z area"} <= set(missed(ROWS["settling"], figures))
+    figures["z"]["area"], figures["sign_chance"] = 1.0, 1.0
+    assert "retained" not in missed(ROWS["settling"], figures)
+
+
+def test_accuracy_tables_replace_those_of_a_page(tmp_path):
+    page = tmp_path / "accuracy.md"
+    page.write_text(f"before\n\n{BEGIN}\n\nold\n\n{END}\n\nafter\n")
+    figures = {"rough": figures_of_row(records_of(1.0, 0.0))}
+    for _ in range(2):  # the second time replaces the tables of the first
+        write_markdown(page, ROWS, figures, "28 scans")
+    text = page.read_text()
+    assert text.startswith(f"before\n\n{BEGIN}\n\n28 scans:\n\n| case |")
+    assert text.endswith(f"|\n\n{END}\n\nafter\n")
+    row = r"\| rough: rough valley, rock all round \| 0\.010 / 0\.0(19|20) \| 0\.015 / 0\.03 \("
+    assert len(re.findall(row, text)) == 1
+    assert "old" not in text

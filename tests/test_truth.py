@@ -1,5 +1,6 @@
 """Simulated stations with a known truth: errors of the pipeline and calibration of its uncertainty."""
 
+from collections import defaultdict
 from dataclasses import replace
 
 import laspy
@@ -25,6 +26,7 @@ CALM = replace(named("quiet", hours=6), reference_scans=REFERENCE)
 PERFECT = CALM.without_errors()
 SHOTS_ONLY = {"range_noise_m": 0.01, "beam_divergence_mrad": 0.12, "line_jitter_deg": 0.0008}
 BOX = 10  # cells of 10 m
+SEEDS = (1, 2, 3, 4, 5)
 FILTERED = ('method = "joint"', 'method = "none"')
 
 
@@ -77,6 +79,19 @@ class ProcessedStation:
                     sigma = np.sqrt(self.aggregates.variance(weights, epoch))
                     rows.append((error[box][observed].mean(), sigma, self.distance_m[box].mean()))
         return np.array(rows).T
+
+    def area_z(self):
+        """Return the mean error of all cells off stable ground over its sigma, by scan."""
+        z = []
+        for scan, error in enumerate(self.error()):
+            observed = np.isfinite(error) & ~self.stable
+            variance = self.aggregates.variance(observed / observed.sum(), self.aggregates.find_epoch(scan))
+            z.append(error[observed].mean() / np.sqrt(variance))
+        return np.array(z)
+
+
+def rms(values):
+    return np.sqrt(np.mean(np.square(values)))
 
 
 def test_random_sigma_is_calibrated(tmp_path):
@@ -135,7 +150,7 @@ def test_adjustment_is_as_accurate_as_manual_registration(calm):
     assert np.sqrt(np.mean(error**2)) < 0.03
     assert np.quantile(np.abs(error), 0.95) < 0.06
     assert np.abs(error).max() < 0.10
-    assert 0.6 < np.sqrt(np.mean((error / sigma) ** 2)) < 1.4
+    assert 0.8 < rms(error / sigma) < 1.25
     assert {result.verdict for result in calm.results} == {"good"}
     assert calm.series.adjustment.values.tolist() == ["joint"] * 3
 
@@ -143,11 +158,7 @@ def test_adjustment_is_as_accurate_as_manual_registration(calm):
 def test_uncertainty_of_cells_and_areas_is_calibrated(calm):
     z = calm.error() / calm.series.elevation_change_uncertainty.values
     assert 0.8 < np.nanstd(np.clip(z, -5, 5)) < 1.25
-    observed = np.isfinite(calm.error()) & ~calm.stable
-    for scan in range(3):
-        weights = observed[scan] / observed[scan].sum()
-        error = np.sum(weights[observed[scan]] * calm.error()[scan][observed[scan]])
-        assert abs(error) < 3.5 * np.sqrt(calm.aggregates.variance(weights, calm.aggregates.find_epoch(scan)))
+    assert np.abs(calm.area_z()).max() < 3.5
     flagged = calm.series.quality.values.astype(int) & Quality.CHANGE_SIGNIFICANT
     assert (flagged > 0)[np.isfinite(calm.error())].mean() < 0.15
 
@@ -194,8 +205,30 @@ def test_snow_on_stable_ground_without_brightness_is_within_sigma(tmp_path):
     processed = ProcessedStation(tmp_path / "station")
     error, sigma, _ = processed.boxes()
     assert np.sqrt(np.mean(error**2)) < 0.05
-    assert 0.6 < np.sqrt(np.mean((error / sigma) ** 2)) < 1.4
+    assert 0.8 < rms(error / sigma) < 1.25
     assert all("no brightness" in result.reason for result in processed.results)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("name", "verdict", "limit_m"), [("airborne", "good", 0.02), ("airborne-heavy", "degraded", 0.03)]
+)
+@pytest.mark.parametrize("along", ["near", "along"])
+def test_echoes_of_the_air_move_no_box(tmp_path, name, verdict, limit_m, along):
+    """0.1 % and 1 % of all shots, in the scans of the reference too: plain means are off by up to 0.3 m."""
+    scenario = replace(named(name, hours=6), reference_scans=REFERENCE, airborne=along)
+    simulate(tmp_path / "station", scenario)
+    processed = ProcessedStation(tmp_path / "station")
+    error, sigma, _ = processed.boxes()
+    assert np.sqrt(np.mean(error**2)) < limit_m
+    assert np.quantile(np.abs(error), 0.95) < 2 * limit_m
+    assert 0.6 < np.sqrt(np.mean((error / sigma) ** 2)) < 1.4
+    z = np.clip(processed.error() / processed.series.elevation_change_uncertainty.values, -5, 5)
+    assert 0.8 < np.nanstd(z) < 1.25
+    assert {result.verdict for result in processed.results} == {verdict}
+    assert all(
+        ("not from the ground" in result.reason) == (verdict != "good") for result in processed.results
+    )
 
 
 @pytest.mark.slow
@@ -235,22 +268,63 @@ def test_missing_input_is_reported_and_included_in_sigma(tmp_path, damage, reaso
         assert result.verdict == "degraded"
         assert reason in result.reason
     error, sigma, _ = processed.boxes()
-    assert np.sqrt(np.mean((error / sigma) ** 2)) < 1.3
+    assert 0.8 < rms(error / sigma) < 1.25
+
+
+@pytest.fixture(scope="module")
+def z_of_others(tmp_path_factory):
+    """Standardised errors of stations with other weather, motion and sensor errors, by method and scale."""
+    z = defaultdict(list)
+    for seed in SEEDS:
+        folder = tmp_path_factory.mktemp("other") / "station"
+        simulate(folder, replace(CALM, seed=seed))
+        for method, changes in (("joint", []), ("none", [FILTERED])):
+            processed = ProcessedStation(folder, *changes)
+            error, sigma, _ = processed.boxes()
+            assert rms(error) < (0.03 if method == "joint" else 0.5)
+            cells = processed.error() / processed.series.elevation_change_uncertainty.values
+            z[method, "cell"].append(cells[np.isfinite(cells)])
+            z[method, "100 m"].append(error / sigma)
+            z[method, "area"].append(processed.area_z())
+    return {key: np.concatenate(values) for key, values in z.items()}
+
+
+def sigma_too_large(value):
+    return pytest.mark.xfail(strict=True, reason=f"sigma is too large: z is {value}")
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("seed", [2, 3, 4, 5])
-def test_sigma_is_calibrated_for_other_stations(tmp_path, seed):
-    """Other weather, motion and sensor errors: boxes within two sigma, with a sigma not too large."""
-    simulate(tmp_path / "station", replace(CALM, seed=seed))
-    error, sigma, _ = ProcessedStation(tmp_path / "station").boxes()
-    assert np.mean(np.abs(error) < 2 * sigma) > 0.9
-    assert np.std(error / sigma) > 0.5
-    assert np.sqrt(np.mean(error**2)) < 0.03
+@pytest.mark.parametrize(
+    ("method", "scale"),
+    [
+        ("joint", "cell"),
+        pytest.param("joint", "100 m", marks=pytest.mark.xfail(strict=False, reason="at the bound: 0.79")),
+        pytest.param("joint", "area", marks=sigma_too_large(0.57)),
+        pytest.param("none", "cell", marks=sigma_too_large(0.66)),
+        pytest.param("none", "100 m", marks=sigma_too_large(0.68)),
+        ("none", "area"),
+    ],
+)
+def test_sigma_is_calibrated_over_five_stations(z_of_others, method, scale):
+    """At most a quarter off; 15 scans have 15 errors of the area, for which bounds are wider."""
+    z = z_of_others[method, scale]
+    spread = 1.4826 * np.median(np.abs(z)) if scale == "cell" else rms(z)
+    low, high = (0.6, 1.5) if scale == "area" else (0.8, 1.25)
+    assert low < spread < high
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["drift", "wind", "melt", "poor", "fog", "moved"])
+@pytest.mark.parametrize(
+    "name",
+    [
+        "drift",
+        "wind",
+        "melt",
+        pytest.param("poor", marks=pytest.mark.xfail(strict=True, reason="sigma is too small: z is 1.3")),
+        "fog",
+        "moved",
+    ],
+)
 def test_scenarios_stay_within_their_uncertainty(tmp_path, name):
     """Errors of boxes and of their sigma; a relocation and fog are reported."""
     scenario = replace(named(name, hours=9), reference_scans=REFERENCE)
@@ -258,7 +332,7 @@ def test_scenarios_stay_within_their_uncertainty(tmp_path, name):
     processed = ProcessedStation(tmp_path / "station")
     error, sigma, _ = processed.boxes()
     assert np.sqrt(np.mean(error**2)) < 0.04
-    assert np.sqrt(np.mean((error / sigma) ** 2)) < 1.6
+    assert 0.8 < rms(error / sigma) < 1.25
     reasons = {"moved": "moved?", "fog": "of the usually visible cells observed, none beyond 1"}
     if name in reasons:
         assert any(reasons[name] in result.reason for result in processed.results)
@@ -293,13 +367,17 @@ def test_log_five_seconds_late_is_within_sigma_and_reported_in_wind(tmp_path, me
         path.write_text("\n".join([head, *late]) + "\n")
     processed = ProcessedStation(folder, *([FILTERED] if method == "none" else []))
     error, sigma, _ = processed.boxes()
-    assert np.sqrt(np.mean((error / sigma) ** 2)) < 1.3
+    smallest = (
+        0.8 if method == "joint" else 0.3
+    )  # without adjustment one error of tilt in each of three scans
+    assert smallest < rms(error / sigma) < 1.25
     if method == "none":
         assert {result.verdict for result in processed.results} == {"good"}
         return
     true_offset_s = 5 + true_clock_offsets(scenario)[REFERENCE:]
     error_s = processed.series.log_clock_offset + processed.series.log_offset - true_offset_s
-    assert np.sqrt(np.mean((error_s / processed.series.log_clock_offset_uncertainty) ** 2)) < 1.5
+    z = error_s.values / processed.series.log_clock_offset_uncertainty.values
+    assert 0.3 < rms(z) < 1.6  # of six
     assert {result.verdict for result in processed.results} == {"good", "degraded"}
     assert any("s late (±" in result.reason for result in processed.results)
 
@@ -310,7 +388,7 @@ def test_changed_cyclic_error_is_reported(tmp_path):
     simulate(folder, replace(CALM, log_cyclic_change=0.6))
     processed = ProcessedStation(folder)
     error, sigma, _ = processed.boxes()
-    assert np.sqrt(np.mean((error / sigma) ** 2)) < 1.3
+    assert 0.8 < rms(error / sigma) < 1.25
     assert any("cyclic error differs" in result.reason for result in processed.results)
 
 

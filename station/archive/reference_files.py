@@ -27,6 +27,11 @@ _VARIABLES = (
         "surface_altitude", 3, None, "bilinear between cell centres",
     ),
     Variable(
+        "reference_mean_residual", ("y", "x"), "f4",
+        "mean height of the reference's scans above its surface in the cell", "m", None, 4, None,
+        "elevation changes are counted from the surface plus this height",
+    ),
+    Variable(
         "reference_random_uncertainty", ("y", "x"), "f4", "random uncertainty of the reference surface", "m",
         None, 4, None, "one standard deviation of a single cell",
     ),
@@ -178,6 +183,7 @@ def _raster_rows(reference: Reference, rows: slice) -> list[np.ndarray[Any, Any]
     """Return a block of rows of each raster, in the order of `_VARIABLES`."""
     return [
         reference.elevation_m[rows],
+        reference.mean_residual_m[rows],
         np.sqrt(reference.random_variance_m2[rows]),
         np.sqrt(reference.roughness_m2[rows]),
         reference.variance_factor[rows],
@@ -290,6 +296,7 @@ def _replace_fill(values: np.ndarray[Any, Any], fill: float = np.nan) -> Floats3
 
 _RASTER_FIELDS: tuple[tuple[str, str, Callable[[np.ndarray[Any, Any]], np.ndarray[Any, Any]]], ...] = (
     ("elevation_m", "reference_elevation", lambda values: _replace_fill(values).astype(np.float64)),
+    ("mean_residual_m", "reference_mean_residual", _replace_fill),
     ("random_variance_m2", "reference_random_uncertainty", lambda values: _replace_fill(values) ** 2),
     ("roughness_m2", "reference_roughness", lambda values: _replace_fill(values) ** 2),
     ("variance_factor", "reference_variance_factor", lambda values: _replace_fill(values, 1.0)),

@@ -47,6 +47,9 @@ class Variable:
 
 _MEAN = "area: mean"
 _ONE_SIGMA = "one standard deviation of a single cell"
+_QUANTUM = (
+    "rounded to the power of two that is a 16th of the random uncertainty or just below, at most 1/1024 m"
+)
 
 VARIABLES: tuple[Variable, ...] = (
     Variable(
@@ -56,8 +59,9 @@ VARIABLES: tuple[Variable, ...] = (
         "elevation of the surface, mean over the cell",
         "m",
         "surface_altitude",
-        3,
+        None,
         _MEAN,
+        _QUANTUM,
     ),
     Variable(
         "elevation_change",
@@ -66,9 +70,9 @@ VARIABLES: tuple[Variable, ...] = (
         "elevation above the reference surface",
         "m",
         None,
-        3,
+        None,
         _MEAN,
-        "mean height of the points above the reference surface of reference.nc",
+        f"mean height of the points above the reference surface of reference.nc; {_QUANTUM}",
     ),
     Variable(
         "elevation_change_uncertainty",
@@ -76,10 +80,7 @@ VARIABLES: tuple[Variable, ...] = (
         "f4",
         "uncertainty of the elevation change",
         "m",
-        None,
-        4,
-        None,
-        f"{_ONE_SIGMA}; do not average: the error shared by all cells does not shrink",
+        comment=f"{_ONE_SIGMA}, three digits; do not average: the error shared by all cells does not shrink",
     ),
     Variable(
         "elevation_change_random_uncertainty",
@@ -87,10 +88,7 @@ VARIABLES: tuple[Variable, ...] = (
         "f4",
         "random uncertainty of the elevation change",
         "m",
-        None,
-        4,
-        None,
-        f"{_ONE_SIGMA}; the part that is independent between cells and averages out",
+        comment=f"{_ONE_SIGMA}, three digits; the part that is independent between cells and averages out",
     ),
     Variable(
         "elevation_spread",
@@ -232,6 +230,13 @@ VARIABLES: tuple[Variable, ...] = (
         "share of the points that are not used: not the last return, withheld, or classified as noise",
         "1",
     ),
+    Variable(
+        "rejected_echo_share",
+        ("time",),
+        "f8",
+        "share of the points on the grid that are not of the surface of their cell: echoes of the air",
+        "1",
+    ),
     Variable("coverage", ("time",), "f8", "share of the grid's cells with points", "1"),
     Variable("stable_count", ("time",), "f8", "number of hold-out cells of stable ground", "1"),
     Variable("stable_median", ("time",), "f8", "median change on hold-out stable ground", "m"),
@@ -247,6 +252,22 @@ VARIABLES: tuple[Variable, ...] = (
         ("time",),
         "f8",
         "robust standard deviation of the standardised change on hold-out stable ground",
+        "1",
+    ),
+    Variable(
+        "random_variance_factor",
+        ("time",),
+        "f8",
+        "median factor by which the modelled random variance was multiplied, from residuals of this scan",
+        "1",
+        comment="stated over modelled; it differs by range, roughness and grazing angle",
+    ),
+    Variable(
+        "systematic_variance_factor",
+        ("time",),
+        "f8",
+        "factor by which the modelled variance of the shared parameters was multiplied, from residuals of"
+        " blocks of stable ground of this scan",
         "1",
     ),
     Variable(

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass, replace
 from functools import cached_property, partial
 
 import numpy as np
@@ -30,13 +30,24 @@ from station.science.geometry.pose import ScannerToMap, TimedRotation, timed_rot
 from station.science.geometry.robust_statistics import nmad
 from station.science.gridding.cell_estimates import CellEstimator, estimate_cells
 from station.science.gridding.gridder import Gridder
+from station.science.gridding.significance import supported_variance
 from station.science.gridding.viewing_geometry import CellClass, ViewingGeometry, compute_viewing_geometry
 from station.science.uncertainty import propagation
 from station.science.uncertainty.jacobian import HeightJacobian
 from station.science.uncertainty.parameters import ParameterLayout
+from station.science.uncertainty.variance_factors import (
+    UNIT_FACTORS,
+    Residuals,
+    VarianceFactors,
+    class_with_excess,
+    estimate_variance_factors,
+)
 
 MIN_STABLE_CELLS = 20  # fewer cells give no meaningful statistics
 MIN_BRIGHTNESS_SHARE = 0.5  # of the stable cells; less counts as no brightness
+MAX_RESIDUALS = 100_000  # of more cells a sample tells the variance factors
+RESIDUAL_GROUP_M = 40.0  # range extent of cells whose mean is subtracted; in azimuth one knot of the tilt
+MAX_RESIDUAL_GROUPS = 1000  # by range
 MAX_BRIGHTNESS_CELLS = 100_000  # of more stable cells a sample tells the gain and whether there is brightness
 
 
@@ -69,20 +80,27 @@ def reference_viewing_geometry(
 
 def new_gridder(scan_geometry: ScanGeometry, viewing: ViewingGeometry | None) -> Gridder:
     """Return an empty gridder, of residuals to the reference surface if there is one."""
-    surface = viewing.surface() if viewing is not None else None
-    return Gridder(
-        scan_geometry.grid, surface, scan_geometry.position_m[2] if scan_geometry.position_m else 0.0
-    )
+    datum_m = scan_geometry.position_m[2] if scan_geometry.position_m else 0.0
+    if viewing is None:
+        return Gridder(scan_geometry.grid, None, datum_m)
+    thickness = viewing.layer_thickness(published=scan_geometry.published_budget)
+    return Gridder(scan_geometry.grid, viewing.surface(), datum_m, thickness)
 
 
 def grid_scan(gridder: Gridder, blocks: Iterable[Shots], pose: Pose, progress: Callable[[], None]) -> int:
+    """Add all shots of a scan to the grid and end the scan; return their number."""
+    count = add_blocks(gridder, blocks, pose, progress)
+    gridder.finish()
+    return count
+
+
+def add_blocks(gridder: Gridder, blocks: Iterable[Shots], pose: Pose, progress: Callable[[], None]) -> int:
     """Add all shots of a scan to the grid; return their number."""
     count = 0
     for shots in blocks:
         add_shots(gridder, to_map(shots, pose), shots.intensity)
         count += len(shots)
         progress()
-    gridder.finish()
     return count
 
 
@@ -186,7 +204,7 @@ def _cells(gridder: Gridder, viewing: ViewingGeometry, test: SnowTest) -> Iterat
                     sums.intensity(), viewing.intensity(first + observed), sector.in_class(CellClass.STEEP)
                 ),
             ),
-            sums.mean_residual(),
+            sums.mean_residual() - sector.mean_residual_m,
             sector.point_variance_m2 / sums.count + sector.reference_variance_m2,
             viewing.sampling_step,
         )
@@ -208,10 +226,70 @@ def stacking_inputs(
     return variance_m2, correction_m
 
 
+def mean_correction(
+    viewing: ViewingGeometry, adjustments: Sequence[tuple[AdjustmentInputs, Adjustment]]
+) -> Floats32:
+    """Return the mean height correction of several scans [m] in all cells of a reference (ny, nx).
+
+    Zero without adjustments, and for scans whose parameters differ, as after a relocation of the scanner.
+    """
+    correction_m = np.zeros(viewing.grid.shape, np.float32)
+    if not adjustments or len({inputs.params.names for inputs, _ in adjustments}) > 1:
+        return correction_m
+    inputs, adjustment = adjustments[0]
+    mean = (
+        replace(inputs, assumed_rad=np.mean([inputs.assumed_rad for inputs, _ in adjustments], axis=0)),
+        replace(adjustment, estimate=np.mean([adjustment.estimate for _, adjustment in adjustments], axis=0)),
+    )
+    for _, sector in viewing.sectors():
+        correction_m.reshape(-1)[sector.cell] = _correction(mean, viewing.jacobian(sector))
+    return correction_m
+
+
 def _correction(adjustment: tuple[AdjustmentInputs, Adjustment], jacobian: HeightJacobian) -> Reals:
     """Return the correction to subtract from heights (n,) [m]: effect of estimated minus assumed state."""
     inputs, estimated = adjustment
     return np.asarray(estimated.effect(jacobian) - tilt_effect(jacobian, inputs.assumed_rad))
+
+
+def variance_factors(
+    gridder: Gridder,
+    scan_geometry: ScanGeometry,
+    viewing: ViewingGeometry,
+    adjustment: tuple[AdjustmentInputs, Adjustment],
+    posterior: SharedParameters,
+) -> VarianceFactors:
+    """Return the variance factors of an adjusted scan, from a sample of its cells."""
+    test = snow_test(gridder, scan_geometry, viewing)
+    step = 1 + int(viewing.sector_bounds[-1]) // MAX_RESIDUALS
+    parts = []
+    for first, whole in viewing.sectors():
+        cell_index = np.arange(first, first + len(whole), step)
+        cell_index = cell_index[gridder.count[cell_index] > 0]
+        if not len(cell_index):
+            continue
+        sector, sums = whole.take(cell_index - first), gridder.take(cell_index.astype(np.int32))
+        jacobian = viewing.jacobian(sector)
+        east_m, north_m, _ = viewing.offset_m(sector.cell, sector.height_m)
+        range_bin = (np.hypot(east_m, north_m) / RESIDUAL_GROUP_M).astype(np.int64)
+        intensity, steep = viewing.intensity(cell_index), sector.in_class(CellClass.STEEP)
+        snow = test.changed(gridder.intensity(cell_index), intensity, steep)
+        residual_m = sums.mean_residual() - sector.mean_residual_m - _correction(adjustment, jacobian)
+        point_m2 = supported_variance(sector.point_variance_m2, sums.standard_deviation(), sums.count)
+        parts.append(
+            Residuals(
+                east_m,
+                north_m,
+                range_bin + jacobian.knot_position.astype(np.int64) * MAX_RESIDUAL_GROUPS,
+                class_with_excess(sector.noise_class, point_m2 > sector.point_variance_m2),
+                sector.in_class(CellClass.STABLE) & ~snow,
+                residual_m.astype(np.float32),
+                point_m2 / sums.count,
+                sector.reference_variance_m2,
+                jacobian.variance(posterior),
+            )
+        )
+    return estimate_variance_factors(Residuals.concatenate(parts)) if parts else UNIT_FACTORS
 
 
 def measure(
@@ -220,18 +298,20 @@ def measure(
     posterior: SharedParameters | None,
     viewing: ViewingGeometry | None,
     adjustment: tuple[AdjustmentInputs, Adjustment] | None = None,
+    factors: VarianceFactors = UNIT_FACTORS,
 ) -> Measurement:
     """Return surface, change and their uncertainty of a gridded scan; overwrites the gridder's buffers.
 
     `posterior` are the parameters that all points of the scan share: relative to the reference if
-    `adjustment` is given, which adjusted the scan to it; None if nothing is known of them.
+    `adjustment` is given, which adjusted the scan to it; None if nothing is known of them. Of the `factors`
+    the posterior already contains the systematic one.
     """
     independent = posterior
     if adjustment is None and posterior is not None and viewing is not None:
         posterior = propagation.difference_to_reference(posterior, viewing.reference.shared)
     correction = None if adjustment is None else partial(_correction, adjustment)
     test = None if adjustment is None or viewing is None else snow_test(gridder, scan_geometry, viewing)
-    estimator = CellEstimator(scan_geometry, posterior, independent, correction, test)
+    estimator = CellEstimator(scan_geometry, posterior, independent, correction, test, factors.random)
     return estimate_cells(gridder, viewing, estimator)
 
 

@@ -34,6 +34,7 @@ from station.processing.pipeline import (
     measure,
     new_gridder,
     reference_viewing_geometry,
+    variance_factors,
 )
 from station.processing.previews import PreviewRecorder
 from station.processing.scan_inputs import ScanInputs, load_scan_inputs
@@ -50,6 +51,7 @@ from station.science.analysis import inclination_check, verdict
 from station.science.geometry.terrain import nodes_from_means
 from station.science.gridding.gridder import Gridder
 from station.science.gridding.viewing_geometry import ViewingGeometry
+from station.science.uncertainty.variance_factors import UNIT_FACTORS
 
 Progress = Callable[[], None]
 MAX_METRIC_CELLS = 100_000  # the metrics of larger scans are computed from a sample
@@ -241,13 +243,24 @@ def _compute_epoch(
     attempt = adjustment[1] if adjustment else None
     if adjustment is not None and adjustment[1].rejected_share > UNUSABLE_REJECTED_SHARE:
         adjustment = None
-    shared = adjustment[1].to_shared_parameters() if adjustment is not None else inputs.log_only_shared
+    shared, factors = inputs.log_only_shared, UNIT_FACTORS
+    if adjustment is not None and viewing is not None:
+        shared = adjustment[1].to_shared_parameters()
+        if not inputs.geometry.published_budget:
+            factors = variance_factors(gridder, inputs.geometry, viewing, adjustment, shared)
+            shared = shared.scaled(factors.systematic)
+            trim_heap()
     log_warnings, clock_scalars = _check_log(adjustment, reference)
-    measurement = measure(gridder, inputs.geometry, shared, viewing, adjustment)
+    measurement = measure(gridder, inputs.geometry, shared, viewing, adjustment, factors)
     progress()
     scalars = _scalar_variables(measurement, inputs, *point_counts)
+    scalars["rejected_echo_share"] = gridder.rejected_echo_share
     if adjustment is not None and viewing is not None:
         scalars |= holdout_statistics(measurement, viewing) | {"change_step": adjustment[1].change_step_m}
+        scalars |= {
+            "random_variance_factor": float(np.median(factors.random[viewing.cells["noise_class"][:]])),
+            "systematic_variance_factor": factors.systematic,
+        }
         scalars |= dict(zip(LEVERAGE_VARIABLES, adjustment[1].leverage_m2, strict=True))
     verdict_name, reason = verdict.assess(
         flag,
@@ -258,6 +271,7 @@ def _compute_epoch(
         scalars.get("stable_z_std", 0.0) if adjustment else None,
         inputs.faults,
         has_brightness=brightness_known,
+        rejected_echo_share=gridder.rejected_echo_share,
     )
     return epochs.Epoch(
         start_s=start.timestamp(),
@@ -466,6 +480,8 @@ def _log_metrics(epoch: epochs.Epoch, seconds: float) -> dict[str, float | str]:
     }
     if epoch.scalars["discarded_share"]:
         metrics["discarded_pct"] = round(100 * epoch.scalars["discarded_share"], 2)
+    if epoch.scalars["rejected_echo_share"]:
+        metrics["rejected_echo_pct"] = round(100 * epoch.scalars["rejected_echo_share"], 3)
     sample = slice(None, None, 1 + len(measurement.cells) // MAX_METRIC_CELLS)
     change_m, sigma_m = measurement.change_m[sample], measurement.cells["uncertainty_m"][sample]
     valid = np.isfinite(sigma_m)

@@ -243,8 +243,11 @@ class Aggregates:
 
     def _references_differ(self, epochs: list[EpochCells], cells: Bools) -> Bools:
         """Return True where the reference surfaces of two epochs differ."""
-        first, second = (epoch_cells.reference.elevation_m[cells] for epoch_cells in epochs)
-        return np.asarray(first != second)
+        (first, first_mean), (second, second_mean) = (
+            (epoch_cells.reference.elevation_m[cells], epoch_cells.reference.mean_residual_m[cells])
+            for epoch_cells in epochs
+        )
+        return np.asarray((first != second) | (first_mean != second_mean))
 
     def coarsen(self, epoch: EpochRef, cells: int) -> xr.Dataset:
         """Return the change of an epoch in blocks of `cells` × `cells` with one sigma [m].

@@ -33,7 +33,7 @@ from station.science.geometry.air import air_correction
 from station.science.geometry.inclination import NO_CYCLIC_ERROR
 from station.science.geometry.pose import scanner_to_local_map, scanner_to_map_by_origin
 from station.science.gridding import cell_estimates, viewing_geometry
-from station.science.gridding.reference_surface import build_reference
+from station.science.gridding.reference_surface import build_surface, centre_reference
 from station.science.gridding.scan_stack import ScanStack
 from station.science.uncertainty import budget
 from station.science.uncertainty.parameters import parameter_layout
@@ -139,15 +139,20 @@ def test_random_uncertainty_without_reference_includes_slope_sampling():
 def test_reference_from_scans_equals_the_truth_within_its_uncertainty():
     scans = [shots_at(*random_positions(100_000, seed), seed=seed) for seed in range(4, 10)]
     reference, x_m, y_m = None, *np.meshgrid(GRID.x_m, GRID.y_m)
-    for _ in range(3):
+    for centred in (False, False, True):
         stack = ScanStack(GRID)
         for shots in scans:
             _, gridder, scan_geometry, viewing = process_shots(shots, reference)
-            stack.add(gridder, reference and stacking_inputs(gridder, viewing, None))
-        reference = build_reference(
-            stack, reference, [None], scan_geometry.position_m, "1", ("a",), VarianceComponents()
-        )
-    error = reference.elevation_m - height(x_m, y_m)
+            roughness_m2 = None if reference is None else reference.roughness_m2
+            stack.add(gridder, reference and stacking_inputs(gridder, viewing, None), roughness_m2)
+        position_m, components = scan_geometry.position_m, VarianceComponents()
+        if centred:
+            reference = centre_reference(reference, stack, position_m, components)
+        else:
+            reference = build_surface(stack, reference, [None], position_m, "1", ("a",), components)
+    change_m = [process_shots(shots, reference)[0].change_m for shots in scans]
+    assert np.nanmax(np.abs(np.nanmean(change_m, axis=0))) <= 2**-11  # changes are rounded to 2^-10 m
+    error = reference.elevation_m + reference.mean_residual_m - height(x_m, y_m)
     assert np.nanmedian(error) == pytest.approx(0.0, abs=1e-3)
     assert 1.4826 * np.nanmedian(np.abs(error)) < 0.03
     measured, *_ = process_shots(shots_at(*random_positions(100_000, 30), seed=30), reference)

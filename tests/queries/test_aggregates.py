@@ -101,6 +101,7 @@ def make_reference():
         grid=GRID,
         version="1",
         elevation_m=elevation_m,
+        mean_residual_m=zeros,
         random_variance_m2=random_m2.astype(np.float32),
         roughness_m2=zeros,
         shared=random_parameters(7, 0.5),

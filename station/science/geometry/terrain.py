@@ -18,6 +18,10 @@ BLOCK_CELLS = 200_000  # cells extrapolated at once
 GRADIENT_CELLS = 1.5  # one sigma of the Gaussian that gradients are smoothed with
 BLOCK_WINDOWS = 8_000  # cells whose neighbourhoods are processed at once
 TAKE_MODE: Final = "wrap"  # indices are valid by construction; without the bounds check a third faster
+# Sigma of the Gaussian that a plane is fitted with; the sum of weights up to which a wider one is taken.
+PLANE_CELLS = (1.5, 3.0, 6.0)
+MIN_PLANE_CELLS = 10.0
+PLANE_RIDGE = 1e-2  # draws the slope to zero where the known cells do not tell it
 MIN_WEIGHT = 1e-3  # weight of the known cells of a neighbourhood, below which it counts as empty
 
 
@@ -210,6 +214,55 @@ def _with_neighbours(rows: slice) -> slice:
 
 def _row_count(rows: slice) -> int:
     return int(rows.stop - rows.start)
+
+
+def fit_planes(elevation_m: Floats, *, keep_dense: bool = False) -> Floats:
+    """Elevations (ny, nx) [m] of planes fitted around each known cell; NaN stays.
+
+    The weights are Gaussian, of the least of `PLANE_CELLS` that reaches enough known cells. With
+    `keep_dense`, a cell whose eight neighbours are all known keeps its own. Source: equations.md, 4.11.
+    """
+    fitted_m, halo = np.full(elevation_m.shape, np.nan), len(_gaussian(PLANE_CELLS[-1])) // 2
+    for rows in row_blocks(len(elevation_m)):
+        window = slice(max(rows.start - halo, 0), rows.stop + halo)
+        inner = slice(rows.start - window.start, rows.stop - window.start)
+        part_m = elevation_m[window]
+        wanted = np.isfinite(part_m)
+        if not wanted.any():
+            continue
+        datum_m = float(part_m[wanted].mean())
+        height_m, known = np.where(wanted, part_m - datum_m, 0.0), wanted.astype(np.float64)
+        if keep_dense:
+            dense = ndimage.binary_erosion(wanted, np.ones((3, 3), bool))
+            fitted_m[rows] = np.where(dense, part_m, np.nan)[inner]
+            wanted &= ~dense
+        for cells in PLANE_CELLS:
+            reached, plane_m = _fit_plane(height_m, known, cells)
+            chosen = (wanted & ((reached >= MIN_PLANE_CELLS) | (cells == PLANE_CELLS[-1])))[inner]
+            fitted_m[rows][chosen] = plane_m[inner][chosen] + datum_m
+            wanted[inner][chosen] = False
+    return fitted_m
+
+
+def _fit_plane(height_m: Floats, known: Floats, cells: float) -> tuple[Floats, Floats]:
+    """Return the sum of the weights of known cells, and the plane's height at the centre (ny, nx)."""
+    weights = _gaussian(cells).astype(np.float64)
+    weights /= weights.max()
+    offset = np.arange(len(weights)) - len(weights) // 2.0
+    kernels = [weights * offset**power for power in range(3)]
+
+    def moment(values: Floats, east: int, south: int) -> Floats:
+        columns = ndimage.correlate1d(values, kernels[south], axis=0, mode="constant")
+        return np.asarray(ndimage.correlate1d(columns, kernels[east], axis=1, mode="constant"))
+
+    total, east, south = moment(known, 0, 0), moment(known, 1, 0), moment(known, 0, 1)
+    ridge = PLANE_RIDGE * cells**2 * np.maximum(total, MIN_WEIGHT)
+    east2, south2, mixed = moment(known, 2, 0) + ridge, moment(known, 0, 2) + ridge, moment(known, 1, 1)
+    height, height_east, height_south = (moment(height_m, *powers) for powers in ((0, 0), (1, 0), (0, 1)))
+    minors = east2 * south2 - mixed**2, east * south2 - mixed * south, east * mixed - east2 * south
+    determinant = total * minors[0] - east * minors[1] + south * minors[2]
+    numerator = height * minors[0] - height_east * minors[1] + height_south * minors[2]
+    return total, numerator / np.maximum(determinant, MIN_WEIGHT**3)
 
 
 def nodes_from_means(means: Floats) -> Floats:

@@ -34,11 +34,33 @@ from station.science.gridding.viewing_geometry import (
 )
 from station.science.uncertainty import budget, parameters, shot_noise
 from station.science.uncertainty.jacobian import HeightJacobian, height_jacobian
+from station.science.uncertainty.variance_factors import class_with_excess
 
 BAND_ROWS = 64  # rows whose cells outside the reference are read at once
 BLOCK_CELLS = 50_000  # cells outside the reference that are estimated at once
 FEW_POINTS = 3
-ELEVATION_QUANTUM_M = 2.0**-10  # resolution of elevations as stored, exact in float32 up to 16 km
+MANTISSA_BITS, EXPONENT = 23, np.uint32(0x7F800000)  # of a float32
+SIGMA_BITS = 9  # of the mantissa: three digits
+QUANTA_PER_SIGMA = 16.0  # at least, of heights and changes as stored
+QUANTUM_M = (2.0**-14, 2.0**-10)  # smallest and largest
+
+
+def round_sigma(sigma_m: Reals) -> Floats32:
+    """Return standard deviations (n,) rounded to three digits, so that they take less space [m]."""
+    step = np.uint32(1 << (MANTISSA_BITS - SIGMA_BITS))
+    bits = sigma_m.astype(np.float32).view(np.uint32)
+    return ((bits + step // np.uint32(2)) & ~(step - np.uint32(1))).view(np.float32)
+
+
+def quantum(sigma_m: Floats32) -> Floats32:
+    """Return the power of two that heights and changes of cells (n,) are rounded to, by their random σ [m].
+
+    Its error, up to a 32nd of σ, adds less than 0.1 % to σ.
+    """
+    power_m = (sigma_m.view(np.uint32) & EXPONENT).view(np.float32)  # of two, not above σ
+    least_m, most_m = QUANTUM_M
+    scaled_m = power_m * np.float32(1 / QUANTA_PER_SIGMA)
+    return np.asarray(np.clip(scaled_m, np.float32(least_m), np.float32(most_m)))
 
 
 def estimate_cells(
@@ -229,18 +251,19 @@ class _MeasurementBuilder:
         enough = sums.count >= self.min_points
         few = np.flatnonzero(~enough)
         cells = np.empty(len(cell_index), CELL_DTYPE)
-        quantised_m = np.rint(estimates.elevation_m * (1 / ELEVATION_QUANTUM_M)).astype(np.float32)
-        quantised_m *= ELEVATION_QUANTUM_M
+        random_m = round_sigma(estimates.random_m)
+        quantum_m = quantum(random_m)  # not by all of σ: what cells share does not blur their differences
         for name, values in (
-            ("elevation_m", quantised_m),
-            ("uncertainty_m", estimates.sigma_m),
-            ("random_uncertainty_m", estimates.random_m),
+            ("elevation_m", np.rint(estimates.elevation_m / quantum_m) * quantum_m),
+            ("uncertainty_m", round_sigma(estimates.sigma_m)),
+            ("random_uncertainty_m", random_m),
         ):
             cells[name] = values
             cells[name][few] = np.nan
         cells["spread_m"] = sums.standard_deviation()
         _as_opaque_items(self.cells)[cell_index] = _as_opaque_items(cells)
-        self.change_m[cell_index] = np.where(enough, estimates.change_m, np.nan)
+        change_m = np.rint(estimates.change_m / quantum_m) * quantum_m
+        self.change_m[cell_index] = np.where(enough, change_m, np.nan)
         self.quality[cell_index] = np.where(enough, estimates.flags, 0)
         for name, values in estimates.terms.items():
             self.terms[name][cell_index[enough]] = values[enough]
@@ -252,7 +275,8 @@ class CellEstimator:
 
     `posterior` are the shared parameters of the difference from the reference, `independent` those of the
     scan alone, None if unknown. `correction` returns what to subtract from heights [m], and `snow_test` tells
-    which stable ground is under snow; both are None without an adjustment.
+    which stable ground is under snow; both are None without an adjustment. `variance_factors` (512,) are
+    those of the random variance by noise class.
     """
 
     scan_geometry: ScanGeometry
@@ -260,24 +284,31 @@ class CellEstimator:
     independent: SharedParameters | None
     correction: Callable[[HeightJacobian], Reals] | None
     snow_test: SnowTest | None
+    variance_factors: Floats32
 
     def in_reference(
         self, cell_index: Ints, sector: AzimuthSector, sums: CellSums, viewing: ViewingGeometry
     ) -> _CellEstimates:
         """Return estimates for cells (n,) of a sector of the reference."""
         count = sums.count.astype(np.float32)
-        random_m2 = sector.point_variance_m2 / count + sector.reference_variance_m2
+        point_m2 = sector.point_variance_m2
+        if not self.scan_geometry.published_budget:
+            point_m2 = significance.supported_variance(point_m2, sums.standard_deviation(), sums.count)
+        excess = point_m2 > sector.point_variance_m2
+        point_m2 = point_m2 * self.variance_factors.take(class_with_excess(sector.noise_class, excess))
+        random_m2 = point_m2 / count + sector.reference_variance_m2
         shared_m2, correction_m, terms = np.zeros_like(count), np.zeros_like(count), dict[str, Floats]()
         if viewing.params is not None:
             jacobian = viewing.jacobian(sector)
             shared_m2, correction_m = self._systematic(jacobian)
             if self.scan_geometry.store_terms:
                 observation = viewing.observation(sector)
+                excess_m2 = np.maximum(point_m2 - sector.point_variance_m2, 0.0) / count
                 terms = self._terms(
-                    jacobian, observation, sums.count.astype(np.float64), np.zeros(len(sector))
+                    jacobian, observation, sums.count.astype(np.float64), excess_m2.astype(np.float64)
                 )
         sigma_m = self._sigma(random_m2 + shared_m2)
-        change_m = sums.mean_residual().astype(np.float32) - correction_m
+        change_m = (sums.mean_residual() - sector.mean_residual_m).astype(np.float32) - correction_m
         flags = Quality.FEW_POINTS * (sums.count < FEW_POINTS).view(np.uint8)
         flags |= Quality.HIGH_INCIDENCE * sector.in_class(CellClass.GRAZING).view(np.uint8)
         flags |= Quality.CHANGE_SIGNIFICANT * significance.significant(change_m, sigma_m).view(np.uint8)
@@ -286,7 +317,8 @@ class CellEstimator:
                 sums.intensity(), viewing.intensity(cell_index), sector.in_class(CellClass.STEEP)
             )
             flags |= Quality.STABLE_GROUND * (sector.in_class(CellClass.STABLE) & ~changed).view(np.uint8)
-        elevation_m = viewing.datum_m + (sector.height_m.astype(np.float64) + change_m)
+        height_m = sector.height_m.astype(np.float64) + sector.mean_residual_m
+        elevation_m = viewing.datum_m + (height_m + change_m)
         return _CellEstimates(elevation_m, change_m, sigma_m, np.sqrt(random_m2), flags, terms)
 
     def outside_reference(self, outside: _CellsOutside, sums: CellSums, datum_m: float) -> _CellEstimates:

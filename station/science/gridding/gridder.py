@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from station.science.geometry.terrain import row_blocks
+from station.science.gridding.echo_layers import EchoLayers, LayerSums, supported
 
 if TYPE_CHECKING:
     from station.quantities import Floats, Floats32, Grid, Ints, Ints32
@@ -18,6 +19,7 @@ if TYPE_CHECKING:
 UNITS_PER_M = 2.0**20
 MAX_INTENSITY = 65535.0  # intensity has 16 bits
 MAX_INTENSITY_POINTS = 65537  # points per cell whose intensity 32 bits can sum
+NO_THICKNESS = np.empty(0, np.uint8)
 
 
 @dataclass(frozen=True)
@@ -32,6 +34,11 @@ class CellSums:
         """Return a copy of the sums of the selected cells (n,)."""
         intensity_sum = None if self.intensity_sum is None else self.intensity_sum.take(selection)
         return CellSums(self.count.take(selection), self.moments.take(selection, axis=0), intensity_sum)
+
+    def rows(self, rows: slice) -> CellSums:
+        """Return views of the sums of some rows."""
+        intensity_sum = None if self.intensity_sum is None else self.intensity_sum[rows]
+        return CellSums(self.count[rows], self.moments[rows], intensity_sum)
 
     def mean_residual(self) -> Floats:
         """Mean height above reference or datum (ny, nx) [m], NaN in empty cells.
@@ -70,10 +77,21 @@ class Gridder:
 
     Sums are stored by cell index, and only cells with an index occupy memory: cells of the reference have the
     index of its viewing geometry, in the order of the head's azimuth; others get theirs at their first point.
+
+    Echoes of the air stay out: the sums are those of one run of adjacent layers per cell (equations.md, 6.6).
     """
 
-    def __init__(self, grid: Grid, surface: BilinearSurface | None, datum_m: float) -> None:
-        """Create an empty grid; heights in cells without reference count from `datum_m`, for small sums."""
+    def __init__(
+        self,
+        grid: Grid,
+        surface: BilinearSurface | None,
+        datum_m: float,
+        thickness: NDArray[np.uint8] = NO_THICKNESS,
+    ) -> None:
+        """Create an empty grid; heights in cells without reference count from `datum_m`, for small sums.
+
+        `thickness` (n,) are the codes of the layers of the reference cells: see `thickness_code`.
+        """
         self.grid = grid
         self._surface = surface
         self.datum_m = float(np.round(datum_m))
@@ -83,9 +101,14 @@ class Gridder:
         self.reference_cells = int(self.cell_index.max()) + 1  # cells of the reference have the first indices
         self.used = self.reference_cells
         cells = grid.nx * grid.ny
-        self._count = np.zeros(cells, np.int32)
-        self._moments = np.zeros((cells, 2), np.int64)
-        self._intensity_sum = np.zeros(cells, np.uint32)
+        self._rest = cells  # where the sums of outlying points go, which nobody reads
+        self._count = np.zeros(cells + 1, np.int32)
+        self._moments = np.zeros((cells + 1, 2), np.int64)
+        self._intensity_sum = np.zeros(cells + 1, np.uint32)
+        if not len(thickness):
+            thickness = np.ones(self.reference_cells, np.uint8)
+        self._layers: EchoLayers | None = EchoLayers(cells, grid.cell_m, thickness)
+        self.rejected = 0  # points that are not of the surface of their cell
         # On a reference, intensity is only summed in the cells where it is compared with the reference's.
         self._intensity_cells = cells if surface is None else self.reference_cells
         self._has_intensity = False
@@ -140,27 +163,127 @@ class Gridder:
         return not self.count.any()
 
     def finish(self) -> None:
-        """End the scan: release the surface, which only points need."""
+        """End the scan: leave the surface of each cell in its sums, and release what only points need."""
         self._surface = None
+        if self._layers is None:
+            return
+        self.rejected = self._layers.dropped
+        cells = self._layers.cells_in_table()
+        if len(cells):
+            self._keep_surfaces(self._layers, cells)
+        self._reject_airborne(self._layers)
+        self._layers = None
+
+    def _keep_surfaces(self, layers: EchoLayers, cells: Ints) -> None:
+        """Replace the sums of cells (n,) with those of their surface."""
+        low, high = layers.run_bounds(cells)
+        dense = LayerSums(
+            cells,
+            low,
+            high,
+            self._count[cells].astype(np.int64),
+            self._moments[cells, 0],
+            self._moments[cells, 1],
+            self._intensity_sum[cells].astype(np.int64),
+        )
+        total = int(dense.count.sum()) + layers.stored
+        chosen = layers.choose(dense, self.reference_cells)
+        self.rejected += total - int(chosen.count.sum())
+        self._count[cells] = chosen.count
+        self._moments[cells, 0], self._moments[cells, 1] = chosen.residual, chosen.square
+        self._intensity_sum[cells] = chosen.intensity
+
+    def _reject_airborne(self, layers: EchoLayers) -> None:
+        """Empty the reference cells in which no echo is of a surface: the few far from it that are alone."""
+        doubtful, clouds = layers.far_from_reference(self._count[: self.reference_cells])
+        if not len(doubtful):
+            return
+        residual_m = self.take(doubtful.astype(np.int32)).mean_residual()
+        neighbours_m = self._neighbours(doubtful)
+        airborne = doubtful[clouds | ~supported(residual_m, neighbours_m, layers.thickness_m(doubtful))]
+        self.rejected += int(self._count[airborne].sum())
+        self._count[airborne], self._moments[airborne], self._intensity_sum[airborne] = 0, 0, 0
+
+    def _neighbours(self, cell_index: Ints) -> Floats32:
+        """Return the mean residuals of the eight cells around reference cells (n,) [m], NaN if unknown."""
+        neighbours_m = np.full((len(cell_index), 8), np.nan, np.float32)
+        rows, columns = self._positions(cell_index)
+        steps = [(row, column) for row in (-1, 0, 1) for column in (-1, 0, 1) if row or column]
+        for number, (row_step, column_step) in enumerate(steps):
+            row, column = rows + row_step, columns + column_step
+            inside = np.flatnonzero(
+                (row >= 0) & (row < self.grid.ny) & (column >= 0) & (column < self.grid.nx)
+            )
+            adjacent = self.cell_index[row[inside], column[inside]]
+            known = (adjacent >= 0) & (adjacent < self.reference_cells)
+            neighbours_m[inside[known], number] = self.take(adjacent[known]).mean_residual()
+        return neighbours_m
+
+    def _positions(self, cell_index: Ints) -> tuple[Ints, Ints]:
+        """Return rows and columns of ascending cells (n,) by index."""
+        row, column = np.empty((2, len(cell_index)), np.int64)
+        wanted = np.zeros(self.used + 1, bool)  # the last one is for the index -1
+        wanted[cell_index] = True
+        for rows in row_blocks(self.grid.ny):
+            indices = self.cell_index[rows].reshape(-1)
+            found = np.flatnonzero(wanted.take(indices, mode="wrap"))
+            place = np.searchsorted(cell_index, indices[found])
+            row[place], column[place] = self.grid.row_and_column(found)
+            row[place] += rows.start
+        return row, column
+
+    @property
+    def rejected_echo_share(self) -> float:
+        """Share of the points on the grid that are not of the surface of their cell."""
+        total = int(self.count.sum(dtype=np.int64)) + self.rejected
+        return self.rejected / total if total else 0.0
 
     def add(self, cell_index: Ints32, residual_m: Floats, intensity: Floats | None) -> None:
         """Add points (n,): cell index, height above reference or datum [m], and intensity, 0-1."""
         position = cell_index.astype(np.intp)
+        rounded = np.rint(residual_m * UNITS_PER_M)
+        units = rounded.astype(np.int64)
+        squares = np.rint(rounded * rounded * (1 / UNITS_PER_M)).astype(np.int64)
+        assert self._layers is not None  # noqa: S101 - points are added before the end of the scan
+        outside, layer = self._layers.outside(position, residual_m)
+        cells = position[outside]
+        position[outside] = self._rest
+        self._sum(position, units, squares, intensity)
+        if len(outside):
+            bright = None if intensity is None else intensity[outside]
+            self._add_outside(self._layers, cells, layer, units[outside], squares[outside], bright)
+
+    def _sum(self, position: Ints, units: Ints, squares: Ints, intensity: Floats | None) -> None:
+        """Add points (n,) to the sums of their cells."""
         np.add.at(self._count, position, np.int32(1))
         if intensity is not None:
             self._has_intensity = True
             compared = np.flatnonzero(position < self._intensity_cells)
-            np.add.at(
-                self._intensity_sum,
-                position[compared],
-                np.rint(intensity[compared] * MAX_INTENSITY).astype(np.uint32),
-            )
-        position *= 2
-        moments = self._moments.reshape(-1)
-        units = np.rint(residual_m * UNITS_PER_M)
-        squares = np.rint(units * units * (1 / UNITS_PER_M))
-        np.add.at(moments, position, units.astype(np.int64))
-        np.add.at(moments[1:], position, squares.astype(np.int64))
+            np.add.at(self._intensity_sum, position[compared], _intensity_units(intensity[compared]))
+        moments, first = self._moments.reshape(-1), 2 * position
+        np.add.at(moments, first, units)
+        np.add.at(moments[1:], first, squares)
+
+    def _add_outside(
+        self,
+        layers: EchoLayers,
+        cells: Ints,
+        layer: Ints,
+        units: Ints,
+        squares: Ints,
+        intensity: Floats | None,
+    ) -> None:
+        """Add points (n,) outside the runs of layers of their cells: to runs that grow, or to the table."""
+        joins = layers.grow(cells, layer, self._count)
+        joined, other = np.flatnonzero(joins), np.flatnonzero(~joins)
+        self._sum(
+            cells[joined], units[joined], squares[joined], None if intensity is None else intensity[joined]
+        )
+        if len(other):
+            compared = np.zeros(len(other), np.int64)
+            if intensity is not None:
+                compared[:] = _intensity_units(intensity[other]) * (cells[other] < self._intensity_cells)
+            layers.store(cells[other], layer[other], units[other], squares[other], compared)
 
     @property
     def count(self) -> Ints32:
@@ -206,6 +329,10 @@ class Gridder:
         """Return the buffers of moments and intensity, 16 and 4 bytes per cell, to be overwritten."""
         moments, intensity_sum = self._moments[: self.used], self._intensity_sum[: self.used]
         return moments.reshape(-1).view(np.uint8), intensity_sum.view(np.uint8)
+
+
+def _intensity_units(intensity: Floats) -> NDArray[np.uint32]:
+    return np.rint(intensity * MAX_INTENSITY).astype(np.uint32)
 
 
 def slope_sampling_variance(cell_m: float, tan_slope: Floats, count: Floats) -> Floats:

@@ -1,4 +1,4 @@
-"""The reference surface that change is measured from: built from many scans, updated from more."""
+"""The reference that change is measured from: a surface, and the mean of its scans above it in every cell."""
 
 from __future__ import annotations
 
@@ -8,17 +8,16 @@ import numpy as np
 
 from station.quantities import Bools, Floats, Floats32, Reference, SharedParameters, VarianceComponents
 from station.science.adjustment import ground_classes
-from station.science.geometry.terrain import HALO_ROWS, row_blocks, smooth, smooth_gradient
+from station.science.geometry.terrain import HALO_ROWS, fit_planes, row_blocks, smooth_gradient
 from station.science.gridding.scan_stack import ScanStack
 
-FIRST_PASS_SMOOTHING = 1.0  # cells: one sigma of the smoothing of the first pass
 MAX_DEVIATION_SIGMAS = 3.0  # of a mean over many scans, on stable ground
 MAX_VARIANCE_FACTOR = 3.0  # empirical over modelled variance from scan to scan, on stable ground
 
 Position = tuple[float, float, float]
 
 
-def build_reference(
+def build_surface(
     stack: ScanStack,
     base: Reference | None,
     posteriors: list[SharedParameters | None],
@@ -27,19 +26,20 @@ def build_reference(
     scan_ids: tuple[str, ...],
     components: VarianceComponents,
 ) -> Reference:
-    """Return the reference surface from scans stacked on `base`.
+    """Return a reference whose surface follows the scans stacked on `base`, or their plain means without one.
 
-    Without a base, their plain means are smoothed. A plain mean depends on where its points lie on the slope
-    (equations.md, 4.10), which a later pass of residuals cannot repair from cell to cell; but it restores the
-    terrain that smoothing removes. Errors shared within a scan are taken as independent between scans, so
-    that the mean of n scans has an nth of their mean covariance.
+    A plain mean depends on where its points lie on the slope (equations.md, 4.10), which a later pass of
+    residuals repairs. Where cells around are missing, a node of its own would give the surface the slope of
+    its sampling error, which exceeds that of the terrain: there the surface is a plane through the cells
+    around. Errors shared within a scan are taken as independent between scans, so that the mean of n scans
+    has an nth of their mean covariance.
     """
     mean_m = stack.mean_residual()
     if base is None:
         datum_m = float(np.round(position_m[2])) if position_m else 0.0
-        elevation_m = np.where(np.isfinite(mean_m), smooth(mean_m, FIRST_PASS_SMOOTHING), np.nan) + datum_m
+        elevation_m = fit_planes(mean_m) + datum_m
     else:
-        elevation_m = base.elevation_m + mean_m
+        elevation_m = fit_planes(base.elevation_m + mean_m, keep_dense=True)
     known = [posterior for posterior in posteriors if posterior is not None]
     shared = None
     if known:
@@ -52,18 +52,45 @@ def build_reference(
             covariance=total.covariance / len(known) ** 2,
             line_tilt_variance=total.line_tilt_variance / len(known) ** 2,
         )
-    factor, stable = np.ones(stack.grid.shape, np.float32), np.zeros(stack.grid.shape, bool)
-    if position_m is not None:
-        factor, stable = _empirical_variance(stack, position_m, elevation_m)
     roughness_m2 = stack.roughness()
     return Reference(
         grid=stack.grid,
         version=version,
         elevation_m=elevation_m,
-        random_variance_m2=stack.random_variance(roughness_m2) * factor,
+        mean_residual_m=np.where(np.isfinite(elevation_m), np.float32(0), np.float32(np.nan)),
+        random_variance_m2=stack.random_variance(roughness_m2),
         roughness_m2=roughness_m2,
         shared=shared,
         scan_ids=scan_ids,
+        intensity=stack.intensity(),
+        variance_factor=np.ones(stack.grid.shape, np.float32),
+        stable=np.zeros(stack.grid.shape, bool),
+        components=components,
+        visibility=stack.visibility(),
+    )
+
+
+def centre_reference(
+    surface: Reference,
+    stack: ScanStack,
+    position_m: Position | None,
+    components: VarianceComponents,
+) -> Reference:
+    """Return a reference on `surface` from which its own scans, stacked on it, differ by zero on average.
+
+    The variance is that of the mean of the scans, from their scatter.
+    """
+    mean_residual_m = stack.scan_mean()
+    factor, stable = np.ones(stack.grid.shape, np.float32), np.zeros(stack.grid.shape, bool)
+    if position_m is not None:
+        factor, stable = _empirical_variance(stack, position_m, surface.elevation_m)
+    known = np.isfinite(mean_residual_m)
+    return replace(
+        surface,
+        elevation_m=np.where(known, surface.elevation_m, np.nan),
+        mean_residual_m=mean_residual_m,
+        random_variance_m2=stack.scan_mean_variance() * factor,
+        roughness_m2=stack.roughness(),
         intensity=stack.intensity(),
         variance_factor=factor,
         stable=stable,
@@ -77,20 +104,18 @@ def update_reference(
 ) -> Reference:
     """Return a reference whose stable ground is the mean of more scans, stacked on it and adjusted to it.
 
-    Elsewhere its heights stay, because change is measured from them. Variance factor, stable ground and
-    visibility are estimated again.
+    Elsewhere its heights stay, because change is measured from them; so does its surface. Variance factor,
+    stable ground and visibility are estimated again.
     """
-    mean_m, mean_m2 = stack.mean_residual(), stack.random_variance(stack.roughness())
     factor, steady = _empirical_variance(stack, position_m, base.elevation_m)
-    mean_m2 *= factor
-    unchanged = np.abs(mean_m) < MAX_DEVIATION_SIGMAS * np.sqrt(mean_m2 + base.random_variance_m2)
-    stable = steady & unchanged
-    elevation_m = base.elevation_m + np.where(stable, mean_m, 0.0)
+    mean_m, mean_m2 = stack.scan_mean(), stack.scan_mean_variance() * factor
+    sigma_m = np.sqrt(mean_m2 + base.random_variance_m2)
+    stable = steady & (np.abs(mean_m - base.mean_residual_m) < MAX_DEVIATION_SIGMAS * sigma_m)
     return replace(
         base,
         version=version,
-        elevation_m=elevation_m,
-        random_variance_m2=np.where(stable, mean_m2, base.random_variance_m2).astype(np.float32),
+        mean_residual_m=np.where(stable, mean_m, base.mean_residual_m),
+        random_variance_m2=np.where(stable, mean_m2, base.random_variance_m2),
         variance_factor=factor,
         stable=stable,
         components=components,

@@ -13,8 +13,9 @@ from station.science.gridding.gridder import CellSums, Gridder
 if TYPE_CHECKING:
     from station.quantities import Floats, Floats32, Grid, Ints32, Reals
 
-MAX_STEP_SIGMAS = 6.0  # steps between scans are clipped here: larger ones are real change
-CLASS_STEPS = 10.0  # weight of a cell's class, in steps of the cell from scan to scan
+MAX_DEVIATION_SIGMAS = 6.0  # deviations of a scan are clipped here: larger ones are real change
+CLASS_DEGREES_OF_FREEDOM = 10.0  # weight of a cell's class against the cell's own scatter
+NEIGHBOURHOOD_CELLS = 9  # edge of the square whose mean is what scans share beyond a cell
 ROUGHNESS_CELLS = 1.0  # one sigma of the Gaussian that roughness is pooled with
 
 
@@ -30,11 +31,13 @@ class ScanStack:
         self.count, self._variance, self._within, self._degrees_of_freedom = (
             np.zeros(grid.shape, np.float32) for _ in range(4)
         )
-        self._intensity_sum, self._intensity_count, self._steps, self._pairs, self._visibility = (
-            np.zeros(grid.shape, np.float32) for _ in range(5)
+        self._intensity_sum, self._intensity_count, self._observed = (
+            np.zeros(grid.shape, np.float32) for _ in range(3)
+        )
+        self._mean, self._mean_variance, self._deviation, self._squared_deviation = (
+            np.zeros(grid.shape, np.float32) for _ in range(4)
         )
         self._scans = 0
-        self._last: Floats32 | None = None  # (2, ny, nx): mean of the previous scan, and its variance
 
     def add(
         self,
@@ -45,25 +48,34 @@ class ScanStack:
         """Add a scan.
 
         `known`, on a reference: random variance of a shot [m²] and correction to subtract from heights [m].
-        With the `roughness_m2` of that reference, scans are also compared with each other. All (ny, nx).
+        With the `roughness_m2` of that reference, the scatter of the scans is summed too. All (ny, nx).
         """
         self._scans += 1
-        if roughness_m2 is not None and self._last is None:
-            self._last = np.full((2, *self.grid.shape), np.nan, np.float32)
         for rows in row_blocks(self.grid.ny):
-            sums = gridder.rasters(rows)
-            count = sums.count.astype(np.float32)
-            shot_m2, correction_m = (block[rows] for block in known) if known else np.zeros((2, *count.shape))
+            halo = NEIGHBOURHOOD_CELLS // 2 if roughness_m2 is not None else 0
+            window = slice(max(rows.start - halo, 0), min(rows.stop + halo, self.grid.ny))
+            inner = slice(rows.start - window.start, rows.stop - window.start)
+            sums = gridder.rasters(window)
+            shot_m2, correction_m = (
+                (block[window] for block in known) if known else np.zeros((2, *sums.count.shape))
+            )
             mean_m = sums.mean_residual() - correction_m
-            self._add(rows, sums, count, mean_m, shot_m2)
+            self._add(rows, sums.rows(inner), mean_m[inner], shot_m2[inner])
             if roughness_m2 is not None:
-                variance_m2 = (shot_m2 + roughness_m2[rows]) / np.maximum(count, 1)
-                self._compare(rows, mean_m.astype(np.float32), variance_m2.astype(np.float32))
+                variance_m2 = (shot_m2 + roughness_m2[window]) / np.maximum(sums.count, 1)
+                self._add_scatter(rows, inner, mean_m, variance_m2)
 
-    def _add(self, rows: slice, sums: CellSums, count: Floats32, mean_m: Floats, shot_m2: Reals) -> None:
-        self._visibility[rows] += count > 0
+    def shift(self, height_m: Floats32) -> None:
+        """Raise all scans by a height (ny, nx) [m]."""
+        self._residual += height_m * self.count
+        self._mean += height_m * self._observed
+
+    def _add(self, rows: slice, sums: CellSums, mean_m: Floats, shot_m2: Reals) -> None:
+        count = sums.count.astype(np.float32)
+        self._observed[rows] += count > 0
         self.count[rows] += count
         self._residual[rows] += np.nan_to_num(mean_m) * count
+        self._mean[rows] += np.nan_to_num(mean_m)
         intensity = sums.intensity()
         weight = np.where(np.isfinite(intensity), count, np.float32(0))
         self._intensity_sum[rows] += np.nan_to_num(intensity) * weight
@@ -73,16 +85,23 @@ class ScanStack:
         self._within[rows] += np.nan_to_num(sums.standard_deviation()) ** 2 * degrees_of_freedom
         self._degrees_of_freedom[rows] += degrees_of_freedom
 
-    def _compare(self, rows: slice, mean_m: Floats32, variance_m2: Floats32) -> None:
-        """Add the squared step from the previous scan, relative to its expected variance."""
-        assert self._last is not None  # noqa: S101 - the caller's case
-        previous_mean_m, previous_variance_m2 = self._last[:, rows]
-        expected_m2 = variance_m2 + previous_variance_m2
-        compared = np.isfinite(mean_m - previous_mean_m) & (expected_m2 > 0)
-        steps = (mean_m - previous_mean_m)[compared] ** 2 / expected_m2[compared]
-        self._steps[rows][compared] += np.minimum(steps, MAX_STEP_SIGMAS**2)
-        self._pairs[rows][compared] += 1
-        previous_mean_m[:], previous_variance_m2[:] = mean_m, variance_m2
+    def _add_scatter(self, rows: slice, inner: slice, mean_m: Floats, variance_m2: Reals) -> None:
+        """Add the deviations of a scan's cells from those around, which its shared errors do not cause.
+
+        Of the mean of a cell, a deviation lacks what the mean of its neighbourhood contains of the cell.
+        """
+        observed = np.isfinite(mean_m)
+        share = ndimage.uniform_filter(observed.astype(np.float64), NEIGHBOURHOOD_CELLS, mode="constant")
+        local_m = ndimage.uniform_filter(np.nan_to_num(mean_m), NEIGHBOURHOOD_CELLS, mode="constant")
+        own_share = 1 / np.maximum(share * NEIGHBOURHOOD_CELLS**2, 1.0)
+        with np.errstate(invalid="ignore"):
+            deviation_m = (mean_m - local_m / np.maximum(share, 1e-9))[inner]
+        observed = observed[inner]
+        limit_m = MAX_DEVIATION_SIGMAS * np.sqrt(variance_m2[inner])
+        deviation_m = np.clip(np.nan_to_num(deviation_m), -limit_m, limit_m)
+        self._deviation[rows] += deviation_m
+        self._squared_deviation[rows] += deviation_m**2
+        self._mean_variance[rows] += np.where(observed, variance_m2[inner] * (1 - own_share[inner]), 0.0)
 
     def intensity(self) -> Floats32:
         """Mean intensity of each cell (ny, nx), 0-1; NaN where unknown."""
@@ -98,24 +117,49 @@ class ScanStack:
 
     def visibility(self) -> Floats32:
         """Share of the scans that observed each cell (ny, nx) [1]."""
-        return self._visibility / np.float32(max(self._scans, 1))
+        return self._observed / np.float32(max(self._scans, 1))
 
     def variance_factor(self, classes: Ints32) -> Floats32:
         """Random variance of cells from scan to scan, empirical over modelled (ny, nx) [1].
 
-        It is shrunk towards that of the cell's class, of `classes` (ny, nx) counted from 0: a cell's own few
-        steps are weighted against `CLASS_STEPS` of its class. It is 1 without data.
+        It is shrunk towards that of the cell's class, of `classes` (ny, nx) counted from 0: the scatter of a
+        cell's few scans is weighted against `CLASS_DEGREES_OF_FREEDOM` of its class. It is 1 without data.
         """
         class_count = int(classes.max()) + 1
-        steps, pairs = np.zeros((2, class_count))
+        scatter, freedom = np.zeros((2, class_count))
         for rows in row_blocks(self.grid.ny):
-            steps += np.bincount(classes[rows].ravel(), self._steps[rows].ravel(), class_count)
-            pairs += np.bincount(classes[rows].ravel(), self._pairs[rows].ravel(), class_count)
-        ratio = ((steps + CLASS_STEPS) / (pairs + CLASS_STEPS)).astype(np.float32)
-        factor = CLASS_STEPS * ratio[classes]
-        factor += self._steps
-        factor /= self._pairs + CLASS_STEPS
-        return np.asarray(factor)
+            ratio, degrees = self._scatter(rows)
+            scatter += np.bincount(classes[rows].ravel(), (ratio * degrees).ravel(), class_count)
+            freedom += np.bincount(classes[rows].ravel(), degrees.ravel(), class_count)
+        prior = CLASS_DEGREES_OF_FREEDOM
+        of_class = ((scatter + prior) / (freedom + prior)).astype(np.float32)
+        factor = np.empty(self.grid.shape, np.float32)
+        for rows in row_blocks(self.grid.ny):
+            ratio, degrees = self._scatter(rows)
+            factor[rows] = (prior * of_class[classes[rows]] + ratio * degrees) / (degrees + prior)
+        return factor
+
+    def _scatter(self, rows: slice) -> tuple[Floats32, Floats32]:
+        """Return variance over scans of the deviations, over the modelled one, and its degrees of freedom."""
+        observed, expected_m2 = self._observed[rows], self._mean_variance[rows]
+        degrees = np.where(expected_m2 > 0, np.maximum(observed - 1, 0), np.float32(0))
+        scatter_m2 = self._squared_deviation[rows] - self._deviation[rows] ** 2 / np.maximum(observed, 1)
+        ratio = np.zeros(degrees.shape, np.float32)
+        np.divide(scatter_m2 * observed, expected_m2 * degrees, out=ratio, where=degrees > 0)
+        return ratio, degrees.astype(np.float32)
+
+    def scan_mean(self) -> Floats32:
+        """Mean over the scans of their mean heights above the reference (ny, nx) [m], NaN in empty cells."""
+        return self._per_scan(self._mean)
+
+    def scan_mean_variance(self) -> Floats32:
+        """Modelled random variance of `scan_mean` (ny, nx) [m²], NaN in empty cells."""
+        return self._per_scan(self._per_scan(self._mean_variance))
+
+    def _per_scan(self, values: Floats32) -> Floats32:
+        per_scan = np.full_like(values, np.nan)
+        np.divide(values, self._observed, out=per_scan, where=self._observed > 0)
+        return per_scan
 
     def mean_residual(self) -> Floats:
         """Mean height of all points above reference or datum (ny, nx) [m], NaN in empty cells."""

@@ -15,13 +15,15 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import ndimage
 
 from station.quantities import VERTICAL_AXIS, Bools, Floats32, Grid, Ints, Ints32, Reals, Reference, Scanner
 from station.science.adjustment import ground_classes
 from station.science.geometry import terrain
 from station.science.geometry.observation import Observation
 from station.science.geometry.terrain import HALO_ROWS, BilinearSurface, smooth_gradient
-from station.science.uncertainty import shot_noise
+from station.science.gridding import echo_layers
+from station.science.uncertainty import shot_noise, variance_factors
 from station.science.uncertainty.jacobian import HeightJacobian, height_jacobian
 from station.science.uncertainty.parameters import (
     TILT_KNOTS_PER_REFRACTION,
@@ -34,10 +36,13 @@ MAX_STABLE_CELLS = 800_000  # the same of stable ground, in whole rows; more add
 BLOCK_CELLS = 50_000  # cells per sector if the scanner's position is unknown
 VISIBILITY_BIN_M = 200.0  # range bin in which cells are counted for visibility
 MAX_VISIBILITY_CELLS = 500_000  # cells counted for visibility; of more, a sample
+MIN_ENCLOSED_SHARE = 0.3  # of the even cells of a kind; if fewer are, those at gaps are used too
+MAX_MOVING_RATIO, MAX_STABLE_RATIO = 0.5, 0.7  # sampling ratio of cells that an adjustment uses
 HIGH_INCIDENCE_COS = float(np.cos(np.radians(80.0)))
 
 FLOAT_ARRAYS = [
     "height_m",
+    "mean_residual_m",
     "east_gradient",
     "north_gradient",
     "knot_position",
@@ -52,6 +57,7 @@ CELL_ARRAYS = {  # per cell, by name
     **dict.fromkeys(FLOAT_ARRAYS, np.float32),
     "visibility_bin": np.int32,
     "cell_class": np.uint8,
+    "noise_class": np.uint8,
 }
 VISIBILITY_ARRAYS = ("visibility", "visibility_bin")  # for the `sampled` cells only
 
@@ -67,6 +73,8 @@ class CellClass(IntFlag):
     SMOOTH = 4  # flat enough to change like its neighbours
     GRAZING = 8  # incidence above 80°
     STEEP = 16  # above 50°: sheds its snow
+    ENCLOSED = 32  # all cells around it are known
+    EVEN = 64  # of so little roughness that a tilt of the scanner has the expected effect
 
 
 @dataclass(frozen=True)
@@ -75,12 +83,14 @@ class AzimuthSector:
 
     cell: Ints32  # in the flattened grid
     height_m: Floats32  # mean of the reference over the cell, above its datum
+    mean_residual_m: Floats32  # of the reference's scans to its surface
     east_gradient: Floats32
     north_gradient: Floats32
     knot_position: Floats32  # azimuth in tilt knots, fractional
     point_variance_m2: Floats32  # random variance of one point: shot and roughness, times the factor
     reference_variance_m2: Floats32  # random variance of the reference
     cell_class: NDArray[np.uint8]
+    noise_class: NDArray[np.uint8]
 
     def __len__(self) -> int:
         """Return the number of cells."""
@@ -141,6 +151,19 @@ class ViewingGeometry:
         return BilinearSurface(
             self.grid, self.datum_m, np.asarray(self.height_above_datum_m), self.cell_index
         )
+
+    def layer_thickness(self, *, published: bool) -> NDArray[np.uint8]:
+        """Return the thickness of the layers of the cells (n,), as coded by `echo_layers.thickness_code`.
+
+        In the published form, and on an external surface, the roughness is not in the variance.
+        """
+        is_known = not published and self.reference.shared is not None
+        thickness = np.empty(int(self.sector_bounds[-1]), np.uint8)
+        for first, sector in self.sectors():
+            thickness[first : first + len(sector)] = echo_layers.thickness_code(
+                sector.point_variance_m2, self.grid.cell_m, is_roughness_known=is_known
+            )
+        return thickness
 
     def sectors(self, *, sampled: bool = False) -> Iterator[tuple[int, AzimuthSector]]:
         """Yield the sectors that contain cells, each with the index of its first cell.
@@ -232,7 +255,7 @@ def compute_viewing_geometry(
             cells[name][first:end] = values
         first = end
     is_stable = (cells["cell_class"] & np.uint8(CellClass.STABLE)) > 0
-    sampled, sampling_step = _sampled(grid, cells["cell"], is_stable)
+    sampled, sampling_step = _sampled(grid, cells["cell"], is_stable, _well_sampled(cells["cell_class"]))
     if params is None:  # any small blocks will do
         sector, sectors = np.arange(count, dtype=np.int32) // BLOCK_CELLS, count // BLOCK_CELLS + 1
     else:
@@ -279,6 +302,7 @@ def _cells(
     )
     inner = slice(rows.start - first, rows.stop - first)
     gradient = smooth_gradient(window_m, grid.cell_m, rows=inner)
+    neighbours_known = ndimage.binary_erosion(np.isfinite(window_m), np.ones((3, 3), bool), border_value=1)
     east, north = (np.nan_to_num(raster[known].astype(np.float64)) for raster in gradient)
     x_m, y_m, height_m = grid.x_m[column], grid.y_m[rows][row], surface.cell_means(rows)[known]
     cell_class = np.where(stable[known], CellClass.STABLE, 0) | np.where(
@@ -288,6 +312,7 @@ def _cells(
     cell_class |= np.where(slope < ground_classes.MAX_MOVING_SLOPE, CellClass.SMOOTH, 0)
     cell_class |= np.where(slope > ground_classes.MIN_BARE_SLOPE, CellClass.STEEP, 0)
     knot_position: Reals = np.zeros(len(row))
+    noise_class: Ints = np.zeros(len(row), np.int64)
     visibility_bin: Ints = np.zeros(len(row), np.int64)
     shot_m2 = np.full(len(row), scanner.range_sigma_m**2)
     if params is not None and position_m is not None:
@@ -299,11 +324,16 @@ def _cells(
             shot_noise.height_variance(observation, scanner, published=published),
         )
         cell_class |= np.where(observation.cos_incidence < HIGH_INCIDENCE_COS, CellClass.GRAZING, 0)
+        roughness_m = np.sqrt(reference.roughness_m2[rows][known] * reference.variance_factor[rows][known])
+        ratio = sampling_ratio(roughness_m, grid.cell_m, observation.cos_incidence)
+        limit = np.where(stable[known], MAX_STABLE_RATIO, MAX_MOVING_RATIO)
+        enclosed = neighbours_known[inner][known]
+        cell_class |= np.where(enclosed, CellClass.ENCLOSED, 0) | np.where(ratio < limit, CellClass.EVEN, 0)
         last = np.nextafter(np.float32(params.knot_intervals), np.float32(0))
         knot_position = np.minimum(knot_position.astype(np.float32), last)
-        range_bin = (np.hypot(observation.offset_m[0], observation.offset_m[1]) / VISIBILITY_BIN_M).astype(
-            np.int64
-        )
+        range_m = np.hypot(observation.offset_m[0], observation.offset_m[1])
+        noise_class = variance_factors.noise_class(range_m, ratio, enclosed)
+        range_bin = (range_m / VISIBILITY_BIN_M).astype(np.int64)
         visibility_bin = (knot_position / TILT_KNOTS_PER_REFRACTION).astype(np.int64) * _visibility_bins(
             grid, position_m
         ) + range_bin
@@ -317,6 +347,7 @@ def _cells(
     return {
         "cell": (rows.start + row) * grid.nx + column,
         "height_m": height_m - surface.datum_m,
+        "mean_residual_m": reference.mean_residual_m[rows][known],
         "east_gradient": east,
         "north_gradient": north,
         "knot_position": knot_position,
@@ -327,7 +358,19 @@ def _cells(
         "visibility": reference.visibility[rows][known],
         "visibility_bin": visibility_bin,
         "cell_class": cell_class,
+        "noise_class": noise_class,
     }
+
+
+def sampling_ratio(roughness_m: Reals, cell_m: float, cos_incidence: Reals) -> Reals:
+    """Return the error of the surface's slope within cells (n,) over the sine of the grazing angle [1].
+
+    When the scanner tilts, its shots move along the ground. On ground of another slope than the surface their
+    heights are off by this share of the shift across the line of sight. `roughness_m` is the standard
+    deviation of the terrain about the surface, which for a plane is cell × slope / √12.
+    Source: equations.md, 4.12.
+    """
+    return np.asarray(math.sqrt(12) * roughness_m / cell_m / np.maximum(cos_incidence, 1e-3))
 
 
 def visibility_step(count: int) -> slice:
@@ -344,13 +387,30 @@ def _visibility_bins(grid: Grid, position_m: Position) -> int:
     return int(math.hypot(east_m, north_m) / VISIBILITY_BIN_M) + 1
 
 
-def _sampled(grid: Grid, cell: Array, stable: Bools) -> tuple[Bools, tuple[int, int]]:
+def _well_sampled(cell_class: Array) -> Bools:
+    """Return True for cells (n,) that an adjustment may use.
+
+    Cells at gaps are left out, because there the surface has the slope of a plane only, unless most cells of
+    their kind are: moving ground, stable ground, and steep stable ground, which alone is known to be bare.
+    """
+    stable, steep, even, enclosed = (
+        (cell_class & np.uint8(flag)) > 0
+        for flag in (CellClass.STABLE, CellClass.STEEP, CellClass.EVEN, CellClass.ENCLOSED)
+    )
+    usable = even & enclosed
+    for kind in (~stable & even, stable & ~steep & even, stable & steep & even):
+        if np.count_nonzero(usable & kind) < MIN_ENCLOSED_SHARE * np.count_nonzero(kind):
+            usable |= kind
+    return usable
+
+
+def _sampled(grid: Grid, cell: Array, stable: Bools, usable: Bools) -> tuple[Bools, tuple[int, int]]:
     """Return the mask (n,) of cells for an adjustment, and the sampling steps of moving and of stable cells.
 
     If there are too many, stable cells are sampled in whole rows, the others in a regular pattern.
     """
     row, column = grid.row_and_column(cell)
-    step = 1 + int(np.count_nonzero(stable)) // MAX_STABLE_CELLS
-    column_step = 1 + len(row) // (step * MAX_MOVING_CELLS)
-    used = (row % step == 0) & (stable | ((row // step + column) % column_step == 0))
+    step = 1 + int(np.count_nonzero(stable & usable)) // MAX_STABLE_CELLS
+    column_step = 1 + int(np.count_nonzero(usable)) // (step * MAX_MOVING_CELLS)
+    used = usable & (row % step == 0) & (stable | ((row // step + column) % column_step == 0))
     return used, (step * column_step, step)

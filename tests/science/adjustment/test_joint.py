@@ -388,7 +388,7 @@ def test_sigma_of_the_predicted_log_matches_its_errors():
     lines, stable, reference = log_design(), random_sites(3, 400), reference_of(math.radians(0.003))
     state_prior, ratios = knot_prior(PARAMS).relative_to(reference), []
     root = np.linalg.cholesky(reference.covariance + 1e-24 * np.eye(len(PARAMS.names)))
-    for seed in range(30):
+    for seed in range(60):
         rng = np.random.default_rng(seed)
         scan_state = dense_prior(PARAMS)[1] @ rng.normal(size=len(dense_prior(PARAMS)[0]))
         state = scan_state - propagation.expand_rows(PARAMS, root @ rng.normal(size=(len(root), 1)))[:, 0]
@@ -397,7 +397,7 @@ def test_sigma_of_the_predicted_log_matches_its_errors():
         adjustment = adjust_scan(stable.patches(residual_m), NO_TILT, state_prior, log)
         sigma_rad = np.sqrt(np.diag(adjustment.posterior.sight_tilt_covariance(log)))
         ratios.append((adjustment.predicted_log_rad - lines @ scan_state) / sigma_rad)
-    assert np.sqrt(np.mean(np.square(ratios))) == pytest.approx(1, abs=0.3)
+    assert 0.8 < np.sqrt(np.mean(np.square(ratios))) < 1.25
 
 
 def test_line_groups_without_log_samples_have_no_influence():
@@ -423,24 +423,26 @@ def test_posterior_without_observations_is_the_prior():
 
 
 def test_smooth_snowfall_hardly_biases_the_state_if_stable_ground_is_spread_out():
-    stable = random_sites(41, 100)
-    for seed in range(4):
+    stable, z = random_sites(41, 100), []
+    for seed in range(8):
         error_m, sigma_m, adjustment = simulate(seed, stable, moving=1000, change_m=smooth_snow(0.4))
         assert adjustment.change_step_m >= 0.05
         assert np.abs(error_m).max() < 0.06
         assert np.sqrt(np.mean(error_m**2)) < 0.02
-        assert np.sqrt(np.mean((error_m / sigma_m) ** 2)) < 2.0
+        z.append(error_m / sigma_m)
+    assert 0.8 < np.sqrt(np.mean(np.square(z))) < 1.25
 
 
 @pytest.mark.integration
+@pytest.mark.xfail(strict=True, reason="the size of a smooth change is taken as known: z is 1.8")
 @pytest.mark.parametrize(
     ("stable", "log"),
     [(random_sites(42, 60, sector_deg=(0, 10)), False), (random_sites(43, 1, sector_deg=(0, 10)), True)],
     ids=["a distant ridge", "the log only"],
 )
-def test_sigma_covers_the_errors_during_snowfall_with_little_stable_ground(stable, log):
-    z, _, _ = standardised_errors(12, stable, log=log, moving=800, change_m=smooth_snow(0.4))
-    assert np.sqrt(np.mean(z**2)) < 2.0
+def test_sigma_matches_the_errors_during_snowfall_with_little_stable_ground(stable, log):
+    z, _, _ = standardised_errors(24, stable, log=log, moving=800, change_m=smooth_snow(0.4))
+    assert 0.8 < np.sqrt(np.mean(z**2)) < 1.25
 
 
 def test_an_unchanged_glacier_improves_the_adjustment():
@@ -475,7 +477,7 @@ def test_ten_percent_outliers_of_a_metre_are_rejected():
     )
     clean_m = np.array([adjust_with_outliers(seed, 1000, 0.0)[0] for seed in range(8)])
     z = np.array(error_m) / np.array(sigma_m)
-    assert np.sqrt(np.mean(z**2)) < 1.2
+    assert 0.85 < np.sqrt(np.mean(z**2)) < 1.2
     assert np.median(np.abs(error_m)) < 1.5 * np.median(np.abs(clean_m))
     for adjusted, rejected in zip(adjustment, outlier, strict=True):
         assert adjusted.stable_weights[rejected].max() == 0.0
@@ -569,7 +571,7 @@ def test_thin_snow_on_rock_is_not_mistaken_for_a_shift_of_the_scanner():
         for values in zip(*(simulate_thin_snow(seed, 0.006) for seed in range(6)), strict=True)
     )
     assert np.abs(error_m.mean(axis=1)).max() < 0.003  # without the snow depths: 6 mm
-    assert np.sqrt(np.mean(z**2)) < 1.3
+    assert 0.8 < np.sqrt(np.mean(z**2)) < 1.25
     sigma_m, sigma_melt_m = (
         np.median(np.divide(*simulate_thin_snow(7, change)[::-1])) for change in (0.006, -0.006)
     )
@@ -634,14 +636,23 @@ def glacier_mean_errors(seed, change_m):
     return np.array([error_m[box].mean() for box in BOXES]), adjustment.to_shared_parameters()
 
 
-def difference_z_std(draws, change_of):
+SECOND_CHANGE = {
+    "equal": lambda seed: 0.9 * glacier_change(seed),
+    "opposite": lambda seed: -glacier_change(seed),
+    "unrelated": lambda seed: glacier_change(seed + 1000),
+}
+
+
+@cache
+def difference_z_std(second_change, draws=25):
     """Standard deviation of z of differences of two scans: errors independent, and with common errors."""
     height_errors = GLACIER.jacobian()
     effect = np.array([height_errors.aggregate(box / box.sum()) for box in BOXES])
     independent, with_common = [], []
     for draw in range(draws):
         (first_m, first), (second_m, second) = (
-            glacier_mean_errors(2 * draw + n, change_m) for n, change_m in enumerate(change_of(draw))
+            glacier_mean_errors(2 * draw + n, change_m)
+            for n, change_m in enumerate((glacier_change(draw), SECOND_CHANGE[second_change](draw)))
         )
         variance_m2 = sum(
             np.array(
@@ -660,26 +671,29 @@ def difference_z_std(draws, change_of):
 
 @pytest.mark.integration
 def test_common_errors_of_equal_change_cancel_in_a_difference():
-    independent, with_common = difference_z_std(
-        25, lambda seed: (glacier_change(seed), 0.9 * glacier_change(seed))
-    )
+    independent, with_common = difference_z_std("equal")
     assert independent < 0.65
-    assert 1.25 * independent < with_common < 1.2
+    assert with_common > 1.25 * independent
 
 
 @pytest.mark.integration
 def test_common_errors_of_opposite_change_add_up_in_a_difference():
-    independent, with_common = difference_z_std(
-        25, lambda seed: (glacier_change(seed), -glacier_change(seed))
-    )
-    assert independent > 1.2
-    assert 0.8 < with_common < 1.2
+    assert difference_z_std("opposite")[0] > 1.2
 
 
 @pytest.mark.integration
 def test_unrelated_change_leaves_independent_errors_in_a_difference():
-    independent, with_common = difference_z_std(
-        25, lambda seed: (glacier_change(seed), glacier_change(seed + 1000))
-    )
-    assert 0.8 < independent < 1.2
-    assert 0.8 < with_common < 1.2
+    assert 0.8 < difference_z_std("unrelated")[0] < 1.2
+
+
+@pytest.mark.integration
+@pytest.mark.parametrize(
+    "second_change",
+    [
+        pytest.param("equal", marks=pytest.mark.xfail(strict=True, reason="what the modes omit: z is 0.72")),
+        "opposite",
+        "unrelated",
+    ],
+)
+def test_sigma_of_a_difference_with_common_errors_matches_its_errors(second_change):
+    assert 0.8 < difference_z_std(second_change)[1] < 1.2

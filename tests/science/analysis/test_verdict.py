@@ -124,7 +124,9 @@ def reference_from_scans():
 STABLE = (RANGE_M < 500) & (X > 0)
 
 
-def assess(change_m=0.0, sigma_m=0.1, observed=None, warnings=(), z_std=None, stable=STABLE, surface=None):
+def assess(
+    change_m=0.0, sigma_m=0.1, observed=None, warnings=(), z_std=None, stable=STABLE, surface=None, air=0.0
+):
     noise = np.random.default_rng(5).normal(0, 0.1, GRID.shape)
     viewing = compute_viewing_geometry(
         reference_from_scans() if surface is None else surface, stable, SCANNER, POSITION_M
@@ -132,7 +134,7 @@ def assess(change_m=0.0, sigma_m=0.1, observed=None, warnings=(), z_std=None, st
     result = measurement(
         noise + change_m, sigma_m, random_cells(0.9) if observed is None else observed, viewing
     )
-    return verdict.assess("", warnings, result, viewing, None, z_std)
+    return verdict.assess("", warnings, result, viewing, None, z_std, rejected_echo_share=air)
 
 
 def test_verdict_is_good_degraded_or_unusable():
@@ -163,10 +165,23 @@ def test_holdout_ground_may_scatter_by_three_sigma():
     assert "scatters by 3.1 sigma" in reason
 
 
+def test_unusually_many_echoes_of_the_air_are_reported():
+    assert assess(air=0.001)[0] == "good"
+    assert assess(air=0.0034) == (
+        "degraded",
+        "0.34% of the echoes are not from the ground: snow, rain or dust?",
+    )
+    result = measurement(0.0, 0.1, RANGE_M < 100, None)  # without a reference
+    assert verdict.assess("", (), result, None, None, None, rejected_echo_share=0.0034)[0] == "good"
+
+
 def test_missing_brightness_degrades_the_verdict():
     result = measurement(0.0, 0.1, RANGE_M < 100, None)
     actual = verdict.assess("", ("a",), result, None, None, None, has_brightness=False)
-    assert actual == ("degraded", "a; no brightness: snow on stable ground cannot be recognised")
+    no_brightness = "no brightness: snow on stable ground cannot be recognised"
+    assert actual == ("degraded", f"a; {no_brightness}")
+    first = verdict.assess("", (), result, None, None, None, has_brightness=False)
+    assert first == ("good", no_brightness)  # else a station without brightness would never get a reference
 
 
 def test_verdict_without_a_reference_depends_on_warnings_and_flags():

@@ -109,3 +109,42 @@ def test_significance_at_the_95_percent_level():
     noise = np.random.default_rng(1).normal(0, 0.1, 100_000).astype(np.float32)
     assert significance.significant(noise, sigma).mean() == pytest.approx(0.05, abs=0.003)
     assert not significance.significant(np.array([np.nan], np.float32), sigma[:1])[0]
+
+
+def test_fitted_planes_keep_a_plane_and_average_noise_where_cells_are_missing():
+    rng = np.random.default_rng(7)
+    x, y = np.meshgrid(np.arange(200.0), np.arange(180.0))
+    plane = 1000 + 0.7 * x - 0.3 * y
+    sparse = np.where(rng.random(plane.shape) < 0.3, plane, np.nan)
+    assert terrain.fit_planes(sparse)[20:-20, 20:-20] == pytest.approx(
+        sparse[20:-20, 20:-20], abs=0.05, nan_ok=True
+    )
+    noise = rng.normal(0, 1.0, plane.shape)
+    fitted = terrain.fit_planes(sparse + noise)
+    assert np.array_equal(np.isnan(fitted), np.isnan(sparse))
+    assert np.nanstd((fitted - plane)[20:-20, 20:-20]) < 0.3  # of 1.0 without the fit
+
+
+def test_fitted_planes_leave_cells_with_all_neighbours():
+    rough = np.random.default_rng(8).normal(0, 1.0, (40, 50))
+    rough[20, 25] = np.nan
+    fitted = terrain.fit_planes(rough, keep_dense=True)
+    dense = np.ones(rough.shape, bool)
+    dense[[0, -1]], dense[:, [0, -1]], dense[19:22, 24:27] = False, False, False
+    assert np.array_equal(fitted[dense], rough[dense])
+    assert (fitted != rough)[~dense].all()
+
+
+def test_fitted_plane_equals_a_weighted_least_squares_fit():
+    rng = np.random.default_rng(9)
+    heights = np.where(rng.random((41, 41)) < 0.05, rng.normal(0, 1.0, (41, 41)), np.nan)
+    heights[20, 20] = 0.5
+    sigma, half = 6.0, 12
+    offset = np.arange(-half, half + 1)
+    window = heights[20 - half : 20 + half + 1, 20 - half : 20 + half + 1]
+    row, column = np.nonzero(np.isfinite(window))
+    x, y = offset[column], offset[row]
+    root_weight = np.exp(-(x**2 + y**2) / (4 * sigma**2))
+    design = np.stack([np.ones(len(x)), x, y], axis=1) * root_weight[:, None]
+    expected = np.linalg.lstsq(design, window[row, column] * root_weight, rcond=None)[0][0]
+    assert terrain.fit_planes(heights)[20, 20] == pytest.approx(expected, abs=0.01)

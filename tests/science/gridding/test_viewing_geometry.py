@@ -1,9 +1,11 @@
 """Viewing geometry: all known cells in the order of the head's azimuth, gradients and shot variance."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy import ndimage
 
 from station.quantities import Grid, Reference, Scanner, SharedParameters, VarianceComponents
 from station.science.adjustment import prior
@@ -89,7 +91,7 @@ def test_adjustment_uses_a_sample_of_very_many_cells(monkeypatch, max_moving):
     all_arrays = all_cells(
         compute_viewing_geometry(plane(), STABLE, VZ6000, POSITION_M).sectors(sampled=True)
     )
-    assert len(all_arrays["cell"]) == np.count_nonzero(KNOWN)
+    assert len(all_arrays["cell"]) == np.count_nonzero(KNOWN)  # few are enclosed: even those at gaps
     monkeypatch.setattr(viewing_geometry, "MAX_STABLE_CELLS", 3000)
     monkeypatch.setattr(viewing_geometry, "MAX_MOVING_CELLS", max_moving)
     sample = all_cells(compute_viewing_geometry(plane(), STABLE, VZ6000, POSITION_M).sectors(sampled=True))
@@ -99,6 +101,16 @@ def test_adjustment_uses_a_sample_of_very_many_cells(monkeypatch, max_moving):
     assert max_moving / 4 < np.count_nonzero(chosen & ~STABLE) <= max_moving
     rows = (chosen & STABLE).any(axis=1)
     assert np.array_equal(chosen[rows] & STABLE[rows], KNOWN[rows] & STABLE[rows])  # whole rows
+
+
+def test_adjustment_uses_enclosed_and_even_cells(monkeypatch):
+    rough_m = np.where(np.arange(GRID.nx) < 75, 0.02, 3.0)
+    reference = replace(plane(), roughness_m2=np.broadcast_to(rough_m.astype(np.float32) ** 2, GRID.shape))
+    monkeypatch.setattr(viewing_geometry, "MIN_ENCLOSED_SHARE", 0.0)
+    used = all_cells(compute_viewing_geometry(reference, STABLE, VZ6000, POSITION_M).sectors(sampled=True))
+    enclosed = ndimage.binary_erosion(KNOWN, np.ones((3, 3)), border_value=1)
+    expected = enclosed & (np.arange(GRID.nx) < 75)
+    assert np.array_equal(np.sort(used["cell"]), np.flatnonzero(expected))
 
 
 def test_single_precision_suffices_for_the_jacobian():
@@ -134,3 +146,27 @@ def test_without_a_scanner_position_sectors_are_blocks_of_the_grid(monkeypatch):
     parts = [part for _, part in compute_viewing_geometry(plane(), STABLE, VZ6000, None).sectors()]
     assert max(map(len, parts)) == 1000
     assert np.array_equal(np.concatenate([part.cell for part in parts]), only.cell)
+
+
+def test_sampling_ratio_is_the_error_of_a_tilt_on_ground_of_another_slope_than_the_surface():
+    """Two rays on planes: their heights above the surface, over the shift across the line of sight."""
+    surface_slope, slope_error, cell_m, distance_m, drop_m = 0.1, 0.03, 2.0, 800.0, -300.0
+    depression = np.arctan2(-drop_m, distance_m)
+
+    def hit(slope, angle):
+        """Return distance and height of a ray on a plane through the point at `distance_m`, `drop_m`."""
+        distance = (drop_m - slope * distance_m) / (-np.tan(angle) - slope)
+        return distance, drop_m + slope * (distance - distance_m)
+
+    tilt = 1e-5
+    effects = []
+    for slope in (surface_slope, surface_slope + slope_error):
+        distance, height = hit(slope, depression + tilt)  # the true ray
+        range_m = np.hypot(distance, height)
+        computed = range_m * np.array([np.cos(depression), -np.sin(depression)])  # the tilt is not known
+        effects.append(computed[1] - (drop_m + surface_slope * (computed[0] - distance_m)))
+    roughness_m = cell_m * slope_error / np.sqrt(12)
+    sin_grazing = np.sin(depression + np.arctan(surface_slope))
+    expected = viewing_geometry.sampling_ratio(np.array([roughness_m]), cell_m, np.array([sin_grazing]))[0]
+    shift_m = tilt * np.hypot(distance_m, drop_m)
+    assert abs(effects[1] - effects[0]) / shift_m == pytest.approx(expected, rel=0.1)

@@ -1,0 +1,154 @@
+"""Variance factors of one scan: how much more or less its residuals scatter than modelled.
+
+Small residuals, of cells against the cells around them, show the random variance by range and roughness. Mean
+residuals of blocks of stable ground show the systematic variance. Both are compared with the model and drawn
+towards it where there are few; the factors are applied and stored.
+Source: equations.md, 6.7.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from station.quantities import Bools, Floats32, Ints, Reals
+from station.science.geometry.robust_statistics import robust_scale
+
+NOISE_CLASSES = 512  # twice those of the reference's cells: points may scatter as modelled, or more
+RANGE_CLASS_M = 500.0
+RATIO_EDGES = (0.025, 0.05, 0.1, 0.2, 0.4, 0.8)  # between classes of the sampling ratio
+MIN_GROUP_CELLS = 3  # of cells whose mean is taken off
+MIN_CLASS_CELLS = 30  # in a class: fewer do not show a variance
+PRIOR_CELLS = 30.0  # weight of the model against the cells of a class
+MIN_STABLE_CELLS = 200  # of a class, from which moving ground, which may have changed, is not needed
+BLOCK_M = 100.0
+MIN_BLOCK_CELLS = 5
+CORRELATED_BLOCKS = 9.0  # blocks that share their systematic error: it varies over some 300 m
+PRIOR_BLOCKS = 3.0  # weight of the model, in independent blocks
+FACTOR_BOUNDS = (0.1, 100.0)  # random
+MAX_SYSTEMATIC_FACTOR = 100.0
+BISECTIONS = 30
+
+
+@dataclass(frozen=True)
+class VarianceFactors:
+    """Factors of the modelled variances of one scan [1]: random by noise class (512,), and systematic."""
+
+    random: Floats32
+    systematic: float
+
+
+UNIT_FACTORS = VarianceFactors(np.ones(NOISE_CLASSES, np.float32), 1.0)
+
+
+@dataclass(frozen=True)
+class Residuals:
+    """Residuals of cells (n,) of an adjusted scan, with their modelled variances.
+
+    The random variance is that of the scan and that of the reference, whose factor is its own.
+    """
+
+    x_m: Reals
+    y_m: Reals
+    group: Ints  # cells of about the same azimuth and range
+    noise_class: NDArray[np.integer[Any]]
+    stable: Bools
+    residual_m: Reals
+    scan_m2: Reals
+    reference_m2: Reals
+    systematic_m2: Reals
+
+    @classmethod
+    def concatenate(cls, parts: list[Residuals]) -> Residuals:
+        """Return the residuals of all parts."""
+        return cls(
+            *(np.concatenate([getattr(part, column.name) for part in parts]) for column in fields(cls))
+        )
+
+
+def noise_class(range_m: Reals, sampling_ratio: Reals, dense: Bools) -> Ints:
+    """Return the noise class (n,) of cells, 0 to 255: range, roughness against grazing angle, sampling."""
+    ratio_class = np.digitize(sampling_ratio, RATIO_EDGES)
+    last = NOISE_CLASSES // (4 * (len(RATIO_EDGES) + 1)) - 1
+    range_class = np.minimum((range_m / RANGE_CLASS_M).astype(np.int64), last)
+    return np.asarray((range_class * (len(RATIO_EDGES) + 1) + ratio_class) * 2 + dense)
+
+
+def class_with_excess(noise_class: NDArray[np.uint8], excess: Bools) -> Ints:
+    """Return the noise class (n,) of cells in a scan, 0 to 511, by `excess` of its scatter too."""
+    return np.asarray(noise_class + np.where(excess, NOISE_CLASSES // 2, 0))
+
+
+def estimate_variance_factors(residuals: Residuals) -> VarianceFactors:
+    """Return the variance factors that the residuals of a scan show."""
+    random = _random_factors(residuals)
+    return VarianceFactors(random, _systematic_factor(residuals, random))
+
+
+def _random_factors(residuals: Residuals) -> Floats32:
+    """Return the factor of the random variance by noise class, from deviations from the mean of the group."""
+    weight = 1 / (residuals.scan_m2 + residuals.reference_m2).astype(np.float64)
+    groups = int(residuals.group.max(initial=0)) + 1
+    count = np.bincount(residuals.group, minlength=groups)
+    weight_sum = np.bincount(residuals.group, weight, groups)
+    sum_m = np.bincount(residuals.group, weight * residuals.residual_m, groups)
+    mean_m = sum_m / np.maximum(weight_sum, np.finfo(float).tiny)
+    own_share = weight / weight_sum[residuals.group]
+    ratio = (residuals.residual_m - mean_m[residuals.group]) * np.sqrt(
+        weight / np.maximum(1 - own_share, 1 / MIN_GROUP_CELLS)
+    )
+    usable = count[residuals.group] >= MIN_GROUP_CELLS
+    factors = np.ones(NOISE_CLASSES, np.float32)
+    order = np.argsort(residuals.noise_class, kind="stable")
+    order = order[usable[order]]
+    edges = np.searchsorted(residuals.noise_class[order], np.arange(NOISE_CLASSES + 1))
+    for index in np.flatnonzero(np.diff(edges) >= MIN_CLASS_CELLS):
+        members = order[edges[index] : edges[index + 1]]
+        stable = members[residuals.stable[members]]
+        if len(stable) >= MIN_STABLE_CELLS:
+            members = stable
+        reference_share = float(residuals.reference_m2[members].sum() / residuals.scan_m2[members].sum())
+        variance = robust_scale(ratio[members]) ** 2
+        variance += (variance - 1) * reference_share
+        factor = (len(members) * variance + PRIOR_CELLS) / (len(members) + PRIOR_CELLS)
+        factors[index] = np.clip(factor, *FACTOR_BOUNDS)
+    return factors
+
+
+def _systematic_factor(residuals: Residuals, random: Floats32) -> float:
+    """Return the factor of the systematic variance, from the mean residuals of blocks of stable ground.
+
+    It is at least 1: little stable ground fits the state that was estimated from it, which does not make that
+    state more certain.
+    """
+    stable = residuals.stable
+    column, row = (
+        np.floor(axis_m[stable] / BLOCK_M).astype(np.int64) for axis_m in (residuals.x_m, residuals.y_m)
+    )
+    if not len(column):
+        return 1.0
+    key = (row - row.min()) * (np.ptp(column) + 1) + column - column.min()
+    _, block, count = np.unique(key, return_inverse=True, return_counts=True)
+    random_m2 = (residuals.scan_m2 * random[residuals.noise_class] + residuals.reference_m2)[stable]
+    weight = 1 / random_m2.astype(np.float64)
+    weight_sum = np.bincount(block, weight)
+    enough = count >= MIN_BLOCK_CELLS
+    mean_m, systematic_m2 = (
+        (np.bincount(block, weight * values[stable]) / weight_sum)[enough]
+        for values in (residuals.residual_m, residuals.systematic_m2)
+    )
+    mean_m2, blocks = 1 / weight_sum[enough], np.count_nonzero(enough)
+    if blocks < CORRELATED_BLOCKS:
+        return 1.0
+    low, high = 0.0, float(np.log(MAX_SYSTEMATIC_FACTOR))
+    for _ in range(BISECTIONS):
+        middle = (low + high) / 2
+        if robust_scale(mean_m / np.sqrt(mean_m2 + np.exp(middle) * systematic_m2)) > 1:
+            low = middle
+        else:
+            high = middle
+    independent = blocks / CORRELATED_BLOCKS
+    return float(np.exp(low * independent / (independent + PRIOR_BLOCKS)))

@@ -1,0 +1,108 @@
+"""Variance factors of a scan: a model that is wrong by class, and systematic errors of stable ground."""
+
+import numpy as np
+import pytest
+
+from station.quantities import ChangeErrors, SharedParameters
+from station.science.geometry.robust_statistics import robust_scale
+from station.science.uncertainty.variance_factors import (
+    NOISE_CLASSES,
+    Residuals,
+    estimate_variance_factors,
+    noise_class,
+)
+
+SIDE_M, CELL_M, GROUP_M = 3000.0, 5.0, 50.0
+
+
+def residuals(seed, true_factor, systematic_sigma_m=0.0, stable_share=1.0, reference_share=0.125):
+    """Return residuals of a square of ground, modelled with 2 cm of noise, 1 mm of systematic error."""
+    rng = np.random.default_rng(seed)
+    x_m, y_m = (axis.ravel() for axis in np.meshgrid(*[np.arange(0, SIDE_M, CELL_M)] * 2))
+    classes = (x_m >= SIDE_M / 2).astype(np.uint8)
+    scan_m2 = np.full(len(x_m), 0.02**2)
+    reference_m2 = reference_share * scan_m2
+    truth_m2 = np.asarray(true_factor)[classes] * scan_m2 + reference_m2
+    blocks = rng.normal(0, systematic_sigma_m, (10, 10))  # correlated over 300 m
+    systematic_m = blocks[(y_m / 300).astype(int), (x_m / 300).astype(int)]
+    residual_m = rng.normal(0, np.sqrt(truth_m2)) + systematic_m
+    group = (y_m // GROUP_M).astype(int) * 60 + (x_m // GROUP_M).astype(int)
+    stable = y_m < stable_share * SIDE_M
+    model = scan_m2, reference_m2, np.full(len(x_m), 0.001**2)
+    return Residuals(x_m, y_m, group, classes, stable, residual_m, *model)
+
+
+@pytest.mark.parametrize("factors", [(1.0, 1.0), (4.0, 0.25), (0.5, 9.0)])
+def test_random_factors_are_found_by_class_in_both_directions(factors):
+    found = estimate_variance_factors(residuals(1, factors)).random
+    assert found[:2] == pytest.approx(factors, rel=0.03)
+    assert (found[2:] == 1).all()
+    assert len(found) == NOISE_CLASSES
+
+
+def test_systematic_factor_is_one_where_stable_ground_fits_better_than_expected():
+    assert estimate_variance_factors(residuals(1, (1.0, 1.0), 0.0002)).systematic == pytest.approx(
+        1.0, abs=1e-6
+    )
+
+
+@pytest.mark.parametrize("sigma_m", [0.0015, 0.004])
+def test_systematic_factor_is_found_from_blocks_of_stable_ground(sigma_m):
+    found = [estimate_variance_factors(residuals(seed, (1.0, 1.0), sigma_m)).systematic for seed in range(4)]
+    assert np.mean(np.log(found)) == pytest.approx(np.log((sigma_m / 0.001) ** 2), abs=0.4)
+
+
+def test_without_stable_ground_the_systematic_variance_stays_as_modelled():
+    assert estimate_variance_factors(residuals(1, (1.0, 1.0), 0.01, stable_share=0.0)).systematic == 1.0
+
+
+def test_a_hut_hardly_changes_the_systematic_variance():
+    found = estimate_variance_factors(residuals(1, (1.0, 1.0), 0.01, stable_share=0.034)).systematic
+    assert 1 < found < 20  # of 100: 30 blocks count as three independent ones, as many as the model
+
+
+def test_change_of_moving_ground_does_not_widen_the_noise_of_stable_ground():
+    quiet = residuals(3, (1.0, 1.0), stable_share=0.5)
+    drifts_m = np.where(quiet.stable, 0, np.random.default_rng(4).normal(0, 0.1, len(quiet.x_m)))
+    changed = Residuals(**{**vars(quiet), "residual_m": quiet.residual_m + drifts_m})
+    assert estimate_variance_factors(changed).random[:2] == pytest.approx([1, 1], rel=0.03)
+
+
+def test_a_few_cells_do_not_show_a_variance():
+    few = residuals(5, (9.0, 9.0))
+    few = Residuals(*(column[:20] for column in vars(few).values()))
+    assert (estimate_variance_factors(few).random == 1).all()
+
+
+def test_robust_scale_is_the_sigma_of_normal_values_and_covers_heavy_tails():
+    rng = np.random.default_rng(2)
+    assert robust_scale(rng.normal(0, 3, 100_000)) == pytest.approx(3, rel=0.01)
+    heavy = rng.standard_t(3, 100_000)
+    assert np.mean(np.abs(heavy) < 1.96 * robust_scale(heavy)) == pytest.approx(0.93, abs=0.015)
+
+
+def test_noise_classes_fit_a_byte_and_part_range_roughness_and_sampling():
+    range_m, ratio = (
+        axis.ravel() for axis in np.meshgrid(np.linspace(0, 20_000, 201), np.geomspace(1e-3, 9, 50))
+    )
+    classes = noise_class(range_m, ratio, np.ones(len(ratio), bool))
+    assert (classes.min(), classes.max() < NOISE_CLASSES) == (1, True)
+    one = np.array([1200.0]), np.array([0.07])
+    of_one = noise_class(*one, np.array([True]))
+    assert of_one == noise_class(one[0] + 200, one[1] + 0.02, np.array([True]))
+    for other in ((1600.0, 0.07, True), (1200.0, 0.12, True), (1200.0, 0.07, False)):
+        assert noise_class(*(np.array([value]) for value in other)) != of_one
+
+
+def test_scaled_parameters_have_the_factor_in_every_variance():
+    root = np.random.default_rng(1).normal(size=(4, 3))
+    errors = ChangeErrors(np.ones((4, 2)), np.zeros(3))
+    shared = SharedParameters(
+        tuple("abcd"), ("1",) * 4, np.arange(4.0), root @ root.T, np.full(4, 0.1), errors
+    )
+    scaled = shared.scaled(4.0)
+    assert np.array_equal(scaled.estimate, shared.estimate)
+    assert scaled.covariance == pytest.approx(4 * root @ root.T)
+    assert (scaled.line_tilt_variance == 0.4).all()
+    modes = scaled.change_errors.modes
+    assert modes @ modes.T == pytest.approx(4 * errors.modes @ errors.modes.T)
