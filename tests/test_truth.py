@@ -299,7 +299,7 @@ def sigma_too_large(value):
     [
         ("joint", "cell"),
         pytest.param("joint", "100 m", marks=pytest.mark.xfail(strict=False, reason="at the bound: 0.79")),
-        pytest.param("joint", "area", marks=pytest.mark.xfail(strict=False, reason="at the bound: 0.57 to 0.61")),
+        pytest.param("joint", "area", marks=pytest.mark.xfail(strict=False, reason="near 0.6")),
         pytest.param("none", "cell", marks=sigma_too_large(0.66)),
         pytest.param("none", "100 m", marks=sigma_too_large(0.68)),
         ("none", "area"),
