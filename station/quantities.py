@@ -219,6 +219,7 @@ class VarianceComponents:
     range_bias_m: float = 0.004
     range_scale_ppm: float = 0.8
     refraction: float = 0.08
+    refraction_moving: float = 0.02
     refraction_by_azimuth: float = 0.02
     tilt_drift_rad: float = radians(0.0018)
     tilt_jitter_rad: float = radians(0.0010)
@@ -334,6 +335,7 @@ class Reference:
     stable: Bools  # (ny, nx) steep and without change in the scans
     components: VarianceComponents  # of the station, estimated from its scans
     visibility: Floats32  # (ny, nx) share of its scans that observed the cell; NaN where unknown
+    time_s: float = np.nan  # mean start of its scans, since 1970; NaN if unknown
 
     @classmethod
     def from_elevation(

@@ -51,12 +51,12 @@ ALL_CELLS = np.ones(GRID.shape, bool)
 def random_parameters(seed, size):
     """Return shared parameters with a full covariance of realistic size."""
     rng = np.random.default_rng(seed)
-    scale = np.array([1e-4, 1e-4, 3e-5, 3e-3, 3e-3, 3e-3, 4e-3, 0.8, 0.05])
+    scale = np.array([1e-4, 1e-4, 3e-5, 3e-3, 3e-3, 3e-3, 4e-3, 0.8, 0.05, 0.02])
     counts = PARAMS.sight_tilt_knots, PARAMS.refraction_knots, PARAMS.refraction_knots
     sigma = np.concatenate([scale, np.repeat([3e-5, 0.02, 3e-5], counts)])
     root = sigma[:, None] * rng.normal(size=(len(sigma), 3 * len(sigma))) / np.sqrt(3 * len(sigma))
     line_tilt = np.zeros(len(sigma))
-    line_tilt[9 : 9 + PARAMS.knot_intervals] = rng.uniform(1e-10, 1e-9, PARAMS.knot_intervals)
+    line_tilt[10 : 10 + PARAMS.knot_intervals] = rng.uniform(1e-10, 1e-9, PARAMS.knot_intervals)
     estimate = sigma * rng.normal(size=len(sigma))
     return SharedParameters(
         PARAMS.names, PARAMS.units, estimate, size**2 * root @ root.T, size**2 * line_tilt
@@ -180,6 +180,7 @@ def dense_jacobian(ds, index):
         "range_bias": height_above_slope / np.hypot(distance, z),
         "range_scale": height_above_slope * 1e-6,
         "refraction": bending,
+        "refraction_moving": bending * ((ds.quality[index].values.astype(int) & 8) == 0),
     }
     rotations = derivatives["tilt_east"], derivatives["tilt_north"], -derivatives["heading"]
     cross_tilt = sum(rotation * part for rotation, part in zip(rotations, sight, strict=True))
@@ -213,7 +214,7 @@ def dense_variance(ds, weights, index, *, random_m2=None, reference=None):
     if reference is not None:
         covariance = covariance + reference.covariance
         line_tilt = line_tilt + reference.line_tilt_variance
-    by_line = line_tilt[9 + np.arange(line_design.shape[1]) // 5]
+    by_line = line_tilt[10 + np.arange(line_design.shape[1]) // 5]
     shared_m2 = design @ covariance @ design.T + (line_design * by_line) @ line_design.T
     return np.nansum(a**2 * random_m2.ravel()) + a @ shared_m2 @ a
 
@@ -564,10 +565,10 @@ def glacier_jacobian(azimuth_deg, range_m):
 
 
 def gradient_by_line(height_jacobian, weights):
-    """Return the derivatives (9 + lines + knots,) of a weighted sum by the state with tilt by line."""
+    """Return the derivatives (10 + lines + knots,) of a weighted sum by the state with tilt by line."""
     by_knot = height_jacobian.aggregate(weights)
     by_line = height_jacobian.aggregate_by_line(weights)
-    return np.concatenate([by_knot[:9], by_line, by_knot[9 + SECTOR.sight_tilt_knots :]])
+    return np.concatenate([by_knot[:10], by_line, by_knot[10 + SECTOR.sight_tilt_knots :]])
 
 
 @cache
@@ -589,6 +590,7 @@ def adjusted(scene):
     patches = Patches(
         height_jacobian,
         range_bin,
+        np.zeros(count),
         ground_class,
         rng.normal(0, 0.003, count),
         np.full(count, 9e-6),

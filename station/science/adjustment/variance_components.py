@@ -22,6 +22,7 @@ COMPONENT_SLICES = {  # variance components by the global parameters they descri
     "range_bias_m": slice(6, 7),
     "range_scale_ppm": slice(7, 8),
     "refraction": slice(8, 9),
+    "refraction_moving": slice(9, 10),
 }
 
 

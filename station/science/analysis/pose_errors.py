@@ -80,7 +80,9 @@ class PoseErrorModel:
         z_m, x_m = _rotate(z_m, x_m, -north_rad)
         y_m, z_m = _rotate(y_m, z_m, -east_rad)
         horizontal_m = np.hypot(x_m, y_m)
-        refraction_rad = (by_name["refraction"] + refraction) * horizontal_m / (2 * EARTH_RADIUS_M)
+        moving = self.jacobian.pose[-1] != 0
+        refraction = refraction + by_name["refraction"] + by_name["refraction_moving"] * moving
+        refraction_rad = refraction * horizontal_m / (2 * EARTH_RADIUS_M)
         bent_m, z_m = _rotate(horizontal_m, z_m, refraction_rad - sight_tilt_rad)
         x_m, y_m = x_m * bent_m / horizontal_m, y_m * bent_m / horizontal_m
         scale = 1 + by_name["range_bias"] / np.hypot(bent_m, z_m) + 1e-6 * by_name["range_scale"]

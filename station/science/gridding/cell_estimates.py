@@ -349,10 +349,10 @@ class CellEstimator:
         )
         params = parameters.parameter_layout(scan_geometry.grid, scan_geometry.position_m, scan_geometry.axis)
         east_m, north_m, up_m = (axis_m.astype(np.float32) for axis_m in observation.offset_m)
-        slopes = (
+        east, north = (
             slope.astype(np.float32) for slope in (observation.east_gradient, observation.north_gradient)
         )
-        jacobian = height_jacobian(params, (east_m, north_m, up_m), *slopes)
+        jacobian = height_jacobian(params, (east_m, north_m, up_m), east, north)
         shared_m2, correction_m = self._systematic(jacobian)
         terms = self._terms(jacobian, observation, count, sampling_m2) if scan_geometry.store_terms else {}
         sigma_m = self._sigma(random_m2 + shared_m2)

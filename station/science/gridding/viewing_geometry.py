@@ -207,6 +207,7 @@ class ViewingGeometry:
             sector.east_gradient,
             sector.north_gradient,
             sector.knot_position,
+            sector.in_class(CellClass.STABLE),
         )
 
     def observation(self, sector: AzimuthSector) -> Observation:

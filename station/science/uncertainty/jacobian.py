@@ -1,6 +1,7 @@
 """Jacobian of cell heights with respect to the parameters that all points of a scan share.
 
-Nine global parameters apply to all points. Three more depend on azimuth: tilt along the line of sight (knots
+Ten global parameters apply to all points, but for one: the refraction of paths to moving ground, in excess of
+that of paths to stable ground. Three more depend on azimuth: tilt along the line of sight (knots
 every 1°), refraction and tilt across the line of sight (knots every 5°). The Jacobian of a cell's height is
 analytic in the cell's position and the terrain gradient, so it is never stored. These functions and the
 covariance stored with an epoch give the uncertainty of a cell, a box, a volume or a difference.
@@ -47,12 +48,12 @@ class EnclosingKnots(NamedTuple):
 class HeightJacobian:
     """Jacobian J of n cell heights with respect to the shared parameters, without its zeros.
 
-    A cell's height depends on the nine globals, the tilt of its scan line, and the two enclosing knots of
+    A cell's height depends on the ten globals, the tilt of its scan line, and the two enclosing knots of
     refraction and of cross tilt.
     """
 
     params: ParameterLayout
-    pose: Reals  # (9, n)
+    pose: Reals  # (10, n)
     sight_tilt: Reals  # (n,) per rad
     refraction: Reals  # (n,) per unit of k
     cross_tilt: Reals  # (n,) per rad of rotation about the head's viewing direction
@@ -169,7 +170,7 @@ class HeightJacobian:
         return np.asarray(self.sight_tilt**2 * line_rad2[self.line - lines.start] + knot_m2)
 
     def _columns(self) -> Reals:
-        """Return the non-zero columns of J (15, n), in the order of `ParameterLayout.active_parameters`."""
+        """Return the non-zero columns of J (16, n), in the order of `ParameterLayout.active_parameters`."""
         pose_count = len(GLOBAL)
         columns = np.empty((pose_count + 6, len(self)), self.sight_tilt.dtype)
         columns[:pose_count] = self.pose
@@ -203,11 +204,12 @@ def height_jacobian(
     east_gradient: Reals,
     north_gradient: Reals,
     knot_position: Reals | None = None,
+    stable: Bools | None = None,
 ) -> HeightJacobian:
     """Return the Jacobian of the heights of cells at `offset_m` (each (n,)) from the scanner.
 
-    `knot_position` (n,) skips its computation where it is known already. Signs: scanner state minus assumed
-    state. Source: equations.md, 6.1.
+    `knot_position` (n,) skips its computation where it is known already. `stable` (n,) marks stable ground;
+    by default all ground is moving. Signs: scanner state minus assumed state. Source: equations.md, 6.1.
     """
     x_m, y_m, z_m = offset_m
     horizontal_m2 = x_m**2 + y_m**2  # np.hypot takes five times as long
@@ -239,6 +241,7 @@ def height_jacobian(
                 normal_m / np.sqrt(np.maximum(range_m2, 1e-12)),
                 normal_m * 1e-6,
                 refraction_m,
+                refraction_m * (True if stable is None else ~stable),
             ]
         ),
         sight_tilt=-rise_m,
@@ -255,8 +258,12 @@ def cell_jacobian(
     elevation_m: Floats | Floats32,
     gradient: tuple[Floats32, Floats32],
     selection: Bools,
+    stable: Bools | None = None,
 ) -> HeightJacobian:
-    """Return the Jacobian of the heights of the selected cells (ny, nx) of a surface, in row-major order."""
+    """Return the Jacobian of the heights of the selected cells (ny, nx) of a surface, in row-major order.
+
+    `stable` (n,) marks those of stable ground; by default all ground is moving.
+    """
     row, column = np.nonzero(selection)
     east, north = (np.nan_to_num(component[row, column].astype(np.float64)) for component in gradient)
     offset_m = (
@@ -264,7 +271,7 @@ def cell_jacobian(
         grid.y_m[row] - position_m[1],
         elevation_m[row, column].astype(np.float64) - position_m[2],
     )
-    return height_jacobian(params, offset_m, east, north)
+    return height_jacobian(params, offset_m, east, north, stable=stable)
 
 
 def sight_tilt_of(azimuth_rad: Floats) -> Floats:

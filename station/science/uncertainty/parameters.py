@@ -11,7 +11,7 @@ from functools import lru_cache
 
 import numpy as np
 
-from station.quantities import VERTICAL_AXIS, Floats, Grid, Ints, Reals
+from station.quantities import VERTICAL_AXIS, Bools, Floats, Grid, Ints, Reals
 
 GLOBAL = (
     ("tilt_east", "rad"),
@@ -23,6 +23,7 @@ GLOBAL = (
     ("range_bias", "m"),
     ("range_scale", "1e-6"),
     ("refraction", "1"),
+    ("refraction_moving", "1"),  # of paths to moving ground, in excess of those to stable ground
 )
 TILT_KNOT_RAD = math.radians(1.0)
 TILT_KNOTS_PER_REFRACTION = 5  # sight-tilt knots for each refraction knot
@@ -109,10 +110,16 @@ class ParameterLayout:
         cross_tilt, end = refraction + self.refraction_knots, refraction + 2 * self.refraction_knots
         return slice(tilt, refraction), slice(refraction, cross_tilt), slice(cross_tilt, end)
 
-    def active_parameters(self, knot: Ints) -> Ints:
-        """Return the indices (m, 15) of the non-zero columns of J just after sight-tilt knots (m,).
+    @property
+    def moves_beam(self) -> Bools:
+        """True for parameters (p,) that change the elevation at which beams reach the ground."""
+        chosen = np.array([name.startswith(("tilt", "refraction", "sight_tilt")) for name in self.names])
+        return np.asarray(chosen)
 
-        They are the nine globals and, of each of the three knot series, the two knots that enclose the cell.
+    def active_parameters(self, knot: Ints) -> Ints:
+        """Return the indices (m, 16) of the non-zero columns of J just after sight-tilt knots (m,).
+
+        They are the ten globals and, of each of the three knot series, the two knots that enclose the cell.
         """
         refraction_knot = knot // TILT_KNOTS_PER_REFRACTION
         refraction_pair = refraction_knot, (refraction_knot + 1) % self.refraction_knots

@@ -80,7 +80,7 @@ def align_to(params: ParameterLayout, shared: SharedParameters) -> SharedParamet
 def expand_covariance(params: ParameterLayout, covariance: Floats) -> Floats:
     """Expand a covariance by knot (p, p) to line groups (u, u).
 
-    The u parameters are the nine globals, the line groups and the knots of refraction and cross tilt.
+    The u parameters are the ten globals, the line groups and the knots of refraction and cross tilt.
     """
     expanded = expand_rows(params, covariance)
     return expand_rows(params, expanded.T)

@@ -80,7 +80,7 @@ def random_sample(count=120):
     sigma = np.full(len(PARAMS.names), 1e-4)
     root = sigma[:, None] * rng.normal(size=(len(sigma), 2 * len(sigma)))
     noise = np.zeros(len(sigma))
-    noise[9 : 9 + PARAMS.knot_intervals] = 1e-9
+    noise[10 : 10 + PARAMS.knot_intervals] = 1e-9
     return (
         x,
         y,

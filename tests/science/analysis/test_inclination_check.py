@@ -93,7 +93,9 @@ def make_adjustment(estimate, covariance, log):
         line_covariance=lambda: covariance,
         sight_tilt_covariance=lambda _: LINE_DESIGN @ covariance @ LINE_DESIGN.T,
     )
-    return Adjustment(PARAMS, estimate, posterior, 0.001, np.ones(9), (1.0, 1.0), log, LINE_DESIGN @ estimate)
+    return Adjustment(
+        PARAMS, estimate, posterior, 0.001, np.ones(9), (1.0, 1.0), 0.0, log, LINE_DESIGN @ estimate
+    )
 
 
 def test_prediction_of_the_log_equals_an_adjustment_without_it():

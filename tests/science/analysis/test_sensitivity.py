@@ -156,12 +156,12 @@ def test_mobile_lidar_shares_by_propagation_and_by_simulation():
 def random_parameters(seed, *, correlated):
     """Random shared parameters, correlated across groups as after an adjustment, or not."""
     rng = np.random.default_rng(seed)
-    scale = np.array([1e-4, 1e-4, 3e-4, 3e-2, 3e-2, 3e-2, 4e-2, 8.0, 0.5])
+    scale = np.array([1e-4, 1e-4, 3e-4, 3e-2, 3e-2, 3e-2, 4e-2, 8.0, 0.5, 0.3])
     counts = PARAMS.sight_tilt_knots, PARAMS.refraction_knots, PARAMS.refraction_knots
     sigma = np.concatenate([scale, np.repeat([5e-5, 0.2, 5e-5], counts)])
     root = sigma[:, None] * rng.normal(size=(len(sigma), 2 * len(sigma))) / np.sqrt(2 * len(sigma))
     noise = np.zeros(len(sigma))
-    noise[9 : 9 + PARAMS.knot_intervals] = 1e-9
+    noise[10 : 10 + PARAMS.knot_intervals] = 1e-9
     shared = SharedParameters(PARAMS.names, PARAMS.units, 0 * sigma, root @ root.T, noise)
     return shared if correlated else block_diagonal(shared)
 
@@ -260,13 +260,13 @@ def pose_model():
 def test_small_pose_errors_match_the_jacobian(pose_model):
     """The slope differs on either side of a cell's centre; their mean is the slope in J."""
     count = len(PARAMS.names)
-    for parameter in (0, 1, 2, 5, 6, 7, 8, 9 + 3, 9 + PARAMS.sight_tilt_knots + 1, count - 2):
+    for parameter in (0, 1, 2, 5, 6, 7, 8, 9, 10 + 3, 10 + PARAMS.sight_tilt_knots + 1, count - 2):
         step = 1e-3 * math.sqrt(pose_model.shared.covariance[parameter, parameter])
         inputs = np.zeros((count + 2, 2))
         inputs[parameter] = step, -step
         ends = pose_model(inputs)
         expected = pose_model.jacobian.aggregate(pose_model.weights)[parameter]
-        scale = abs(pose_model.jacobian.pose[:, 0]).max() if parameter < 9 else abs(expected)
+        scale = abs(pose_model.jacobian.pose[:, 0]).max() if parameter < 10 else abs(expected)
         assert (ends[0] - ends[1]) / (2 * step) == pytest.approx(expected, rel=0.05, abs=1e-2 * scale)
 
 

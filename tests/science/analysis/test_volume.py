@@ -264,9 +264,11 @@ def test_contributions_sum_to_the_variance():
     rng = np.random.default_rng(4)
     weights, random_m2 = rng.uniform(-0.2, 1, 60), rng.uniform(1e-4, 1e-3, 60)
     shared = shared_parameters(registration_errors=True)
-    tilt_slice = slice(9, 9 + PARAMS.sight_tilt_knots)
+    tilt_slice = slice(10, 10 + PARAMS.sight_tilt_knots)
     shared.covariance[tilt_slice, tilt_slice] += 1e-9 * (1 + np.eye(PARAMS.sight_tilt_knots))
-    shared.line_tilt_variance[9 : 9 + PARAMS.knot_intervals] = rng.uniform(1e-9, 3e-9, PARAMS.knot_intervals)
+    shared.line_tilt_variance[10 : 10 + PARAMS.knot_intervals] = rng.uniform(
+        1e-9, 3e-9, PARAMS.knot_intervals
+    )
     contributions = weights**2 * random_m2 + volume.shared_contributions(weights, jacobian, shared)
 
     def total(weights):

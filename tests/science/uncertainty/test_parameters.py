@@ -53,4 +53,4 @@ def test_azimuth_zero_is_the_same_on_both_sides_of_45_degrees(sign):
 def test_layout_of_a_head_that_points_north_is_a_full_circle():
     params = parameter_layout(GRID, (0.0, 0.0, 0.0), (0.0, 1.0, 0.0))
     assert params.full_circle
-    assert len(set(params.names)) == len(params.names) == 9 + 360 + 72 + 72
+    assert len(set(params.names)) == len(params.names) == 10 + 360 + 72 + 72

@@ -47,7 +47,9 @@ def moved(parameter, error, offset_m):
         sight = offset_m / horizontal_m * np.array([[1.0], [1.0], [0.0]])
         return Rotation.from_rotvec(-error * sight.T).apply(offset_m.T).T
     elevation = np.arctan2(offset_m[2], horizontal_m)
-    elevation_error_rad = error * horizontal_m / (2 * EARTH_RADIUS_M) if parameter == "refraction" else -error
+    elevation_error_rad = (
+        error * horizontal_m / (2 * EARTH_RADIUS_M) if parameter.startswith("refraction") else -error
+    )
     horizontal = offset_m[:2] / horizontal_m * (range_m * np.cos(elevation + elevation_error_rad))
     return np.vstack([horizontal, range_m * np.sin(elevation + elevation_error_rad)])
 
@@ -107,7 +109,7 @@ def random_shared_parameters(params, seed=1):
     size = len(params.names)
     root = rng.normal(size=(size, size)) * 1e-4
     line_variance = np.zeros(size)
-    line_variance[9 : 9 + params.knot_intervals] = rng.uniform(0, 1e-7, params.knot_intervals)
+    line_variance[10 : 10 + params.knot_intervals] = rng.uniform(0, 1e-7, params.knot_intervals)
     return SharedParameters(params.names, params.units, np.zeros(size), root @ root.T, line_variance)
 
 
@@ -122,7 +124,7 @@ def test_variance_equals_the_diagonal_of_jcjt(position_m):
     line_design = np.zeros((200, params.line_groups))
     line_design[np.arange(200), jacobian.line] = jacobian.sight_tilt
     line_rad2 = np.repeat(
-        shared.line_tilt_variance[9 : 9 + params.knot_intervals], parameters.LINE_GROUPS_PER_KNOT
+        shared.line_tilt_variance[10 : 10 + params.knot_intervals], parameters.LINE_GROUPS_PER_KNOT
     )
     knots = np.array([knot_weights(params, line) for line in range(params.line_groups)])
     line_design -= line_design @ knots @ np.linalg.solve(knots.T @ knots, knots.T)
@@ -155,7 +157,9 @@ def test_knots_cover_the_sector_of_the_grid():
     assert params.refraction_azimuth_rad[0] <= min(corners)
     assert params.refraction_azimuth_rad[-1] >= max(corners)
     assert params.line_azimuth_rad[0] < params.refraction_azimuth_rad[1]
-    assert len(params.names) == len(params.units) == 9 + params.sight_tilt_knots + 2 * params.refraction_knots
+    assert (
+        len(params.names) == len(params.units) == 10 + params.sight_tilt_knots + 2 * params.refraction_knots
+    )
 
 
 def test_scan_line_of_a_tilted_head_has_one_head_azimuth():
