@@ -274,7 +274,7 @@ VARIABLES: tuple[Variable, ...] = (
         "change_step",
         ("time",),
         "f8",
-        "standard deviation of the change of the moving ground between its knots",
+        "standard deviation of the change of the moving ground, as the adjustment finds it",
         "m",
     ),
     Variable(

@@ -240,7 +240,7 @@ class Posterior:
     line_tilt: LineTiltPosterior
     coupling: sparse.csr_array  # (lines, m) block of the normal matrix between line tilts and other unknowns
     factor: ScaledCholesky  # (m, m)
-    change_precision: Floats  # (k, k) prior precision of the change
+    change_bias: Floats  # (k, k) factor of the change's part of the covariance, from its block of N⁻¹
     mean_jtj: Floats  # (p, p) of the state by knots
     polar_change: Floats  # (sectors,)
 
@@ -313,15 +313,13 @@ class Posterior:
             params, condense_rows(params, estimate[:, None])[:, 0], covariance, residual_rad2
         )
         return (
-            shared
-            if not len(self.change_precision)
-            else replace(shared, change_errors=self._change_errors(half))
+            shared if not len(self.change_bias) else replace(shared, change_errors=self._change_errors(half))
         )
 
     def _change_errors(self, half: Floats) -> ChangeErrors:
         """Return the part of the covariance that the change causes, from L⁻¹ (m, p) of the state by knots."""
-        with_change = self.factor.back_solve_last(half, len(self.change_precision))
-        factor = np.tril(cholesky_inplace(self.change_precision.copy())).T @ with_change
+        with_change = self.factor.back_solve_last(half, len(self.change_bias))
+        factor = self.change_bias @ with_change
         return ChangeErrors(common_mode.dominant_modes(factor, self.mean_jtj), self.polar_change)
 
 

@@ -8,7 +8,7 @@ from enum import IntEnum
 
 import numpy as np
 
-from station.quantities import Bools, Floats, Floats32, Ints, Ints32
+from station.quantities import Bools, Floats, Floats32, Ints, Ints32, Reals
 from station.science.uncertainty.jacobian import HeightJacobian
 from station.science.uncertainty.parameters import GLOBAL, LINE_GROUPS_PER_KNOT, ParameterLayout
 
@@ -33,6 +33,7 @@ class CellObservations:
 
     jacobian: HeightJacobian
     range_m: Floats  # horizontal
+    height_m: Reals  # above the scanner
     ground_class: Ints
     residual_m: Floats
     variance_m2: Floats
@@ -45,6 +46,7 @@ class Patches:
 
     jacobian: HeightJacobian  # of the mean height of the patch
     range_bin: Ints  # (m,) index of the range bin
+    height_m: Floats  # (m,) above the scanner
     ground_class: Ints  # (m,)
     residual_m: Floats  # (m,) above the reference surface
     variance_m2: Floats  # (m,) random variance of the residual
@@ -60,6 +62,7 @@ class Patches:
         return Patches(
             self.jacobian.take(selection),
             self.range_bin[selection],
+            self.height_m[selection],
             self.ground_class[selection],
             self.residual_m[selection],
             self.variance_m2[selection],
@@ -78,7 +81,7 @@ def aggregate_patches(
     range_bins = int(max_range_m / RANGE_BIN_M) + 1
     class_size = params.line_groups * range_bins
     size = class_size * GroundClass.UNUSED
-    sums = np.zeros((len(GLOBAL) + 4, GroundClass.UNUSED, params.line_groups, range_bins))
+    sums = np.zeros((len(GLOBAL) + 5, GroundClass.UNUSED, params.line_groups, range_bins))
     collected: list[tuple[Ints32, Floats32, Floats32]] = []
     sampling_step = (1, 1)
     for cells in blocks:
@@ -92,9 +95,8 @@ def aggregate_patches(
         first, lines = int(line.min()), int(np.ptp(line)) + 1
         local_key = (ground_class * lines + line - first) * range_bins + range_bin
         total = sums[:, :, first : first + lines]
-        for row, effect in enumerate(
-            [*jacobian.pose, jacobian.sight_tilt, jacobian.refraction, jacobian.cross_tilt, None]
-        ):
+        effects = *jacobian.pose, jacobian.sight_tilt, jacobian.refraction, jacobian.cross_tilt
+        for row, effect in enumerate([*effects, cells.height_m, None]):
             weighted = precision if effect is None else precision * effect[used]
             total[row] += np.bincount(local_key, weighted, total[row].size).reshape(total[row].shape)
         key = ground_class * class_size + line * range_bins + range_bin
@@ -108,15 +110,20 @@ def aggregate_patches(
     patch_sums = sums.reshape(len(sums), size)
     occupied = np.flatnonzero(patch_sums[-1])
     mean_m, variance_m2, count = (values[occupied] for values in _robust_means(key, residual_m, weight, size))
-    effects = patch_sums[:-1, occupied] / patch_sums[-1, occupied]
+    means = patch_sums[:-1, occupied] / patch_sums[-1, occupied]
     patch_index = occupied % class_size
     knot_position = (patch_index // range_bins + 0.5) / LINE_GROUPS_PER_KNOT
-    sight_tilt, refraction, cross_tilt = effects[len(GLOBAL) :]
-    jacobian = HeightJacobian(
-        params, effects[: len(GLOBAL)], sight_tilt, refraction, cross_tilt, knot_position
-    )
+    sight_tilt, refraction, cross_tilt, height_m = means[len(GLOBAL) :]
+    jacobian = HeightJacobian(params, means[: len(GLOBAL)], sight_tilt, refraction, cross_tilt, knot_position)
     return Patches(
-        jacobian, patch_index % range_bins, occupied // class_size, mean_m, variance_m2, count, sampling_step
+        jacobian,
+        patch_index % range_bins,
+        height_m,
+        occupied // class_size,
+        mean_m,
+        variance_m2,
+        count,
+        sampling_step,
     )
 
 

@@ -77,6 +77,13 @@ def noise_class(range_m: Reals, sampling_ratio: Reals, dense: Bools) -> Ints:
     return np.asarray((range_class * (len(RATIO_EDGES) + 1) + ratio_class) * 2 + dense)
 
 
+def mean_sampling_ratio(noise_class: NDArray[np.uint8]) -> float:
+    """Return the mean sampling ratio of cells (n,) from their classes; zero without cells."""
+    edges = np.array([RATIO_EDGES[0] / 2, *RATIO_EDGES, 2 * RATIO_EDGES[-1]])
+    middle = np.sqrt(edges[1:] * edges[:-1])
+    return float(middle[noise_class // 2 % len(middle)].mean()) if len(noise_class) else 0.0
+
+
 def class_with_excess(noise_class: NDArray[np.uint8], excess: Bools) -> Ints:
     """Return the noise class (n,) of cells in a scan, 0 to 511, by `excess` of its scatter too."""
     return np.asarray(noise_class + np.where(excess, NOISE_CLASSES // 2, 0))

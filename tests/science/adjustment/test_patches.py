@@ -1,6 +1,7 @@
 """Aggregation of cells into patches, compared with plain loops and with simulated noise."""
 
 from collections import defaultdict
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -21,13 +22,16 @@ def random_cells(seed=0, count=4000):
     jacobian = height_jacobian(PARAMS, offset_m, *rng.uniform(-0.5, 0.5, (2, count)))
     sigma_m = rng.uniform(0.02, 0.1, count)
     ground_class = rng.integers(0, 4, count)
-    return CellObservations(jacobian, range_m, ground_class, rng.normal(0, sigma_m), sigma_m**2), azimuth
+    return CellObservations(
+        jacobian, range_m, offset_m[2], ground_class, rng.normal(0, sigma_m), sigma_m**2
+    ), azimuth
 
 
 def subset(cells, chosen):
     return CellObservations(
         cells.jacobian.take(chosen),
         cells.range_m[chosen],
+        cells.height_m[chosen],
         cells.ground_class[chosen],
         cells.residual_m[chosen],
         cells.variance_m2[chosen],
@@ -47,7 +51,7 @@ def cells_by_patch(per_patch, count=400, seed=1):
     )
     sigma_m = rng.uniform(0.02, 0.1, len(line))
     return CellObservations(
-        jacobian, range_m, np.ones(len(line), np.int64), rng.normal(0, sigma_m), sigma_m**2
+        jacobian, range_m, level, np.ones(len(line), np.int64), rng.normal(0, sigma_m), sigma_m**2
     )
 
 
@@ -72,6 +76,7 @@ def test_patches_match_a_plain_loop():
             *zip(patches.jacobian.pose[:, i], cells.jacobian.pose, strict=True),
             (patches.jacobian.sight_tilt[i], cells.jacobian.sight_tilt),
             (patches.jacobian.refraction[i], cells.jacobian.refraction),
+            (patches.height_m[i], cells.height_m),
         ):
             assert abs(actual - share @ effect[members]) < 1e-9 * np.abs(effect[members]).max()
         min_sigma_m = weight.sum() ** -0.5
@@ -105,9 +110,7 @@ def test_patches_of_four_cells_are_efficient_among_patches_of_one():
 def test_variance_grows_if_cells_scatter_more_than_stated():
     cells = cells_by_patch(50)
     expected = aggregate_patches(PARAMS, [cells], MAX_RANGE_M)
-    scattered = CellObservations(
-        cells.jacobian, cells.range_m, cells.ground_class, 3 * cells.residual_m, cells.variance_m2
-    )
+    scattered = replace(cells, residual_m=3 * cells.residual_m)
     actual = aggregate_patches(PARAMS, [scattered], MAX_RANGE_M)
     assert np.sqrt(actual.variance_m2 / expected.variance_m2).mean() == pytest.approx(3, rel=0.1)
 
@@ -119,7 +122,7 @@ def test_one_outlier_among_fifty_cells_hardly_moves_the_mean():
     residual_m[::50] += 5.0
     with_outliers = aggregate_patches(
         PARAMS,
-        [CellObservations(cells.jacobian, cells.range_m, cells.ground_class, residual_m, cells.variance_m2)],
+        [replace(cells, residual_m=residual_m)],
         MAX_RANGE_M,
     )
     moved_m = np.abs(with_outliers.residual_m - clean.residual_m)
@@ -154,9 +157,7 @@ def test_unused_cells_are_excluded():
 
 def test_unused_cells_only_give_no_patches():
     cells, _ = random_cells(4, 50)
-    unused = CellObservations(
-        cells.jacobian, cells.range_m, np.full(50, GroundClass.UNUSED), cells.residual_m, cells.variance_m2
-    )
+    unused = replace(cells, ground_class=np.full(50, GroundClass.UNUSED))
     assert len(aggregate_patches(PARAMS, [unused], MAX_RANGE_M)) == 0
 
 

@@ -1,0 +1,237 @@
+"""Change of the ground since the reference, as unknowns of the adjustment.
+
+Moving ground changes by trends over all of it (mean, east, north, distance, squared distance, height) and
+smoothly between knots. Stable ground is not quite at rest: it heaves, as a whole and by blocks, and where
+moving ground rises it may be under thin snow. The sizes of trends and of the change between knots are not
+known. A model is one choice of them; an adjustment weighs all models by their likelihood.
+Source: equations.md, 6.3; adjustment.md, 5.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import numpy as np
+from scipy import sparse
+
+from station.quantities import Bools, Floats, Reals
+from station.science.adjustment.normal_equations import ScaledCholesky
+from station.science.adjustment.patches import RANGE_BIN_M, Patches
+from station.science.uncertainty import common_mode
+from station.science.uncertainty.parameters import TILT_KNOT_RAD
+
+CHANGE_AZIMUTH_KNOTS = 4  # sight-tilt knots between two knots of the change
+CHANGE_RANGE_BINS = 3  # range bins between two knots of the change
+CHANGE_STEPS_M = tuple(float(step) for step in np.geomspace(0.5 / 2**11, 0.5, 12))
+TREND_SIZES_M = tuple(float(size) for size in np.geomspace(0.0005, 2.0, 8))
+TRENDS = 6
+TREND_RATIO = 0.6  # of a trend's size to that of the mean: melt or settling from zero to twice the mean
+# Sigma of the change that neighbouring knots share, in sigmas of one knot: no, some or strong correlation.
+CORRELATED_CHANGE_RATIOS = (0.0, 3.0, 10.0)
+# Log prior odds against each. Smooth errors of the air look like correlated change too, but raise its log
+# likelihood by tens at most; a smooth snowfall raises it by hundreds.
+CORRELATION_LOG_PRIORS = (0.0, 12.0, 24.0)
+SMALL_TREND_LOG_PRIOR = 2.0  # against each factor e by which trends are smaller than the change between knots
+CORRELATION_AZIMUTH_KNOTS, CORRELATION_RANGE_KNOTS = 4.0, 2.5  # correlation lengths, in knots
+# Where moving ground rises, stable ground may be under snow too thin to change its intensity.
+THIN_SNOW_M = 0.005  # upper bound of sigma; the change of moving ground bounds it too
+NO_SNOW_M = 1e-6
+MAX_SNOW_SLOPES = tuple(np.tan(np.radians((40.0, 50.0))))  # upper bounds (tan): full snow, some snow
+HEAVE_M = 0.002  # start value of sigma: frost and heat move rock by millimetres
+HEAVE_BLOCK_M = 500.0
+PRIOR_HEAVE_BLOCKS = 4.0  # weight of the start value, in blocks
+MIN_HEAVE_M = 1e-5
+
+
+class ChangeModel(NamedTuple):
+    """Indices into `CORRELATED_CHANGE_RATIOS`, `CHANGE_STEPS_M` and `TREND_SIZES_M`."""
+
+    ratio: int
+    step: int
+    trend: int
+
+    @property
+    def step_m(self) -> float:
+        """One sigma of the change between its knots [m]."""
+        return CHANGE_STEPS_M[self.step] * float(np.hypot(1.0, CORRELATED_CHANGE_RATIOS[self.ratio]))
+
+    @property
+    def size_m(self) -> float:
+        """One sigma of the change of moving ground [m]."""
+        return float(np.hypot(self.step_m, TREND_SIZES_M[self.trend]))
+
+    @property
+    def log_prior(self) -> float:
+        """Logarithm of the prior odds: correlation needs evidence, and so do trends below local change."""
+        below = max(float(np.log(self.step_m / TREND_SIZES_M[self.trend])), 0.0)
+        return -CORRELATION_LOG_PRIORS[self.ratio] - SMALL_TREND_LOG_PRIOR * below
+
+    def with_ratio(self, ratio: int) -> ChangeModel:
+        """Return the model of another correlation with about the same change between knots."""
+        steps_m = np.hypot(1.0, CORRELATED_CHANGE_RATIOS[ratio]) * np.array(CHANGE_STEPS_M)
+        return self._replace(ratio=ratio, step=int(np.argmin(np.abs(np.log(steps_m / self.step_m)))))
+
+    def neighbours(self, *, ratios: bool = False) -> list[ChangeModel]:
+        """Return the models that differ by one index, of step or trend only unless `ratios`."""
+        sizes = {"step": len(CHANGE_STEPS_M), "trend": len(TREND_SIZES_M)}
+        if ratios:
+            sizes["ratio"] = len(CORRELATED_CHANGE_RATIOS)
+        return [
+            self._replace(**{name: index})
+            for name, size in sizes.items()
+            for index in (getattr(self, name) - 1, getattr(self, name) + 1)
+            if 0 <= index < size
+        ]
+
+
+START_MODEL = ChangeModel(0, len(CHANGE_STEPS_M) // 2, len(TREND_SIZES_M) // 2)
+
+
+@dataclass(frozen=True)
+class GroundChange:
+    """Unknown change of patches (n,): trends, knots, depths of thin snow, heave, in this order.
+
+    Snow depths are free if `surface_rises`.
+    """
+
+    design: sparse.csr_array  # (n, k)
+    moving: Bools  # (n,)
+    knot_precisions: list[Floats]  # (knots, knots) for a unit step, one per correlation
+    knot_log_determinants: list[float]  # of their inverses
+    trend_columns: int
+    snow_columns: int
+    heave_columns: int
+    heave_m: float
+    surface_rises: bool = True
+
+    def precision_at(self, model: ChangeModel) -> tuple[Floats, float]:
+        """Return the precision (k, k) of a model, and log |precision⁻¹|."""
+        snow_m = min(model.size_m, THIN_SNOW_M) if self.surface_rises else NO_SNOW_M
+        trend_m = TREND_SIZES_M[model.trend] * np.array([1.0] + [TREND_RATIO] * (TRENDS - 1))
+        knots, step_m = len(self.knot_precisions[model.ratio]), CHANGE_STEPS_M[model.step]
+        first, last = self.trend_columns, self.trend_columns + knots
+        precision = np.zeros((self.design.shape[1],) * 2)
+        precision[first:last, first:last] = self.knot_precisions[model.ratio] / step_m**2
+        sigma_m = np.concatenate(
+            [
+                trend_m[: self.trend_columns],
+                np.full(self.snow_columns, snow_m),
+                np.full(self.heave_columns, self.heave_m),
+            ]
+        )
+        independent = np.r_[0:first, last : len(precision)]
+        precision[independent, independent] = 1 / sigma_m**2
+        log_determinant = self.knot_log_determinants[model.ratio] + 2 * knots * np.log(step_m)
+        return precision, float(log_determinant + 2 * np.log(sigma_m).sum())
+
+    def updated(self, estimate_m: Floats, heave_variance_m2: Floats) -> GroundChange:
+        """Return this change with the size of heave that an estimate (k,) shows, and whether snow may lie.
+
+        Its variance is the mean of estimate squared plus posterior variance (heave_columns,), shrunk towards
+        the start value (expectation-maximisation).
+        """
+        rises = float((self.design @ estimate_m)[self.moving].mean()) > 0 if self.moving.any() else False
+        heave_m = HEAVE_M
+        if self.heave_columns:
+            second_moment_m2 = float(np.sum(estimate_m[-self.heave_columns :] ** 2 + heave_variance_m2))
+            second_moment_m2 += PRIOR_HEAVE_BLOCKS * HEAVE_M**2
+            heave_m = max(np.sqrt(second_moment_m2 / (PRIOR_HEAVE_BLOCKS + self.heave_columns)), MIN_HEAVE_M)
+        return replace(self, heave_m=heave_m, surface_rises=rises)
+
+    def polar_mean(self, patches: Patches, estimate_m: Floats) -> Floats:
+        """Return the mean estimated change of moving ground by azimuth sector and range ring."""
+        moving = patches.take(self.moving)
+        azimuth_rad = patches.jacobian.params.start_rad + TILT_KNOT_RAD * moving.jacobian.knot_position
+        distance_m = (moving.range_bin + 0.5) * RANGE_BIN_M
+        return common_mode.polar_mean(azimuth_rad, distance_m, (self.design @ estimate_m)[self.moving])
+
+
+def ground_change(patches: Patches, moving: Bools) -> GroundChange:
+    """Return the unknown change of patches, of which `moving` (n,) are moving ground."""
+    knot_design, precisions, log_determinants = _knots(patches, moving)
+    trend_design = _trends(patches, moving)
+    snow_design = _thin_snow(patches, moving) if moving.any() else sparse.csr_array((len(moving), 0))
+    heave_design = _heave(patches, ~moving)
+    return GroundChange(
+        sparse.hstack([trend_design, knot_design, snow_design, heave_design], format="csr"),
+        moving,
+        precisions,
+        log_determinants,
+        trend_design.shape[1],
+        snow_design.shape[1],
+        heave_design.shape[1],
+        HEAVE_M,
+    )
+
+
+def _knots(patches: Patches, moving: Bools) -> tuple[sparse.csr_array, list[Floats], list[float]]:
+    """Return the design (n, knots) of the smooth change, its precisions and log determinants for a unit step.
+
+    Knots form a grid in azimuth and range; the change is bilinear between them.
+    """
+    u = patches.jacobian.knot_position / CHANGE_AZIMUTH_KNOTS
+    v = (patches.range_bin + 0.5) / CHANGE_RANGE_BINS
+    i, j = u.astype(np.int64), v.astype(np.int64)
+    u, v = u - i, v - j
+    range_knots = int(j.max(initial=0)) + 2
+    corners = [(a, b) for a in (0, 1) for b in (0, 1)]
+    columns = np.concatenate([(i + a) * range_knots + j + b for a, b in corners])
+    values = np.concatenate(
+        [np.where(moving, (u if a else 1 - u) * (v if b else 1 - v), 0) for a, b in corners]
+    )
+    rows = np.tile(np.arange(len(u)), len(corners))
+    nonzero = values > 0
+    knots, columns = np.unique(columns[nonzero], return_inverse=True)
+    design = sparse.csr_array((values[nonzero], (rows[nonzero], columns)), shape=(len(u), len(knots)))
+    azimuth_knot, range_knot = np.divmod(knots, range_knots)
+    distance = np.abs(np.subtract.outer(azimuth_knot, azimuth_knot)) / CORRELATION_AZIMUTH_KNOTS
+    distance += np.abs(np.subtract.outer(range_knot, range_knot)) / CORRELATION_RANGE_KNOTS
+    factors = [
+        ScaledCholesky(np.eye(len(knots)) + ratio**2 * np.exp(-distance))
+        for ratio in CORRELATED_CHANGE_RATIOS
+    ]
+    return design, [factor.inverse() for factor in factors], [factor.log_determinant() for factor in factors]
+
+
+def _position(patches: Patches) -> tuple[Reals, Reals, Reals]:
+    """Return the offset east and north of the scanner, and the distance of patches (n,) [m]."""
+    distance_m = (patches.range_bin + 0.5) * RANGE_BIN_M
+    azimuth_rad = patches.jacobian.params.start_rad + TILT_KNOT_RAD * patches.jacobian.knot_position
+    east_m, north_m = (distance_m * wave(azimuth_rad) for wave in (np.sin, np.cos))
+    return east_m, north_m, distance_m
+
+
+def _trends(patches: Patches, moving: Bools) -> sparse.csr_array:
+    """Return the design matrix (n, TRENDS) of the trends: a mean, and others of zero mean, unit variance."""
+    if not moving.any():
+        return sparse.csr_array((len(moving), 0))
+    east_m, north_m, distance_m = _position(patches)
+    weight = np.where(moving, patches.cell_count, 0.0)
+    weight /= weight.sum()
+    trends = np.stack(
+        [np.ones_like(east_m), east_m, north_m, distance_m, distance_m**2, patches.height_m], axis=1
+    )
+    trends[:, 1:] -= weight @ trends[:, 1:]
+    trends[:, 1:] /= np.maximum(np.sqrt(weight @ trends[:, 1:] ** 2), 1e-9)
+    return sparse.csr_array(trends * moving[:, None])
+
+
+def _thin_snow(patches: Patches, moving: Bools) -> sparse.csr_array:
+    """Return the design matrix (n, 2) of thin snow: stable patches that hold snow, and that hold some."""
+    tan_slope = np.hypot(*patches.jacobian.pose[3:5])
+    snow_class = np.digitize(tan_slope, MAX_SNOW_SLOPES)
+    return sparse.csr_array(np.stack([(snow_class == index) & ~moving for index in range(2)], axis=1) * 1.0)
+
+
+def _heave(patches: Patches, stable: Bools) -> sparse.csr_array:
+    """Return the design matrix (n, 1 + blocks) of the heave of stable patches: of all, and of each block."""
+    if not stable.any():
+        return sparse.csr_array((len(stable), 0))
+    rows = np.flatnonzero(stable)
+    east_m, north_m, _ = _position(patches.take(stable))
+    blocks = np.stack([np.floor(axis_m / HEAVE_BLOCK_M) for axis_m in (east_m, north_m)], axis=1)
+    _, block = np.unique(blocks, axis=0, return_inverse=True)
+    columns = np.concatenate([np.zeros(len(rows), np.int64), 1 + block.ravel()])
+    shape = len(stable), int(columns.max()) + 1
+    return sparse.csr_array((np.ones(len(columns)), (np.tile(rows, 2), columns)), shape=shape)

@@ -1,0 +1,160 @@
+"""Solution of the reduced normal equations, with the size of the ground's change integrated over.
+
+Each model of the change (`ground_change.ChangeModel`) has a likelihood. The most likely one serves while the
+adjustment iterates; the result is the mean over all models by their posterior probability, and its covariance
+holds their disagreement. Source: Hoeting et al. (1999), Eq. 1 to 4; equations.md, 6.3.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import linalg
+
+from station.quantities import Floats
+from station.science.adjustment.ground_change import (
+    CORRELATED_CHANGE_RATIOS,
+    START_MODEL,
+    ChangeModel,
+    GroundChange,
+)
+from station.science.adjustment.normal_equations import (
+    ReducedNormals,
+    ScaledCholesky,
+    cholesky_inplace,
+    log_determinant,
+)
+
+NEGLIGIBLE_LOG_ODDS = 4.0  # models so much less likely than the best are left out
+
+
+@dataclass(frozen=True)
+class Mixture:
+    """Mean of the unknowns (m,) over all models, and the normal matrix with the covariance of the mixture.
+
+    `change_bias` (k, k) times the block of N⁻¹ between change and state is a factor of the part of the
+    state's covariance that comes from the change. `size_m` is the mean sigma of the change.
+    """
+
+    estimate: Floats
+    factor: ScaledCholesky
+    change_bias: Floats
+    size_m: float
+
+
+class Solution:
+    """Solution with the most likely model of the change, whose unknowns are the last."""
+
+    def __init__(self, reduced: ReducedNormals, state_size: int, change: GroundChange) -> None:
+        self._reduced, self._change, self._state_size = reduced, change, state_size
+        normal, rhs = reduced.normal, reduced.rhs
+        self._state_factor = ScaledCholesky(normal[:state_size, :state_size])
+        half = self._state_factor.half_solve(normal[:state_size, state_size:])
+        self._normal = normal[state_size:, state_size:] - half.T @ half  # of the change, state eliminated
+        self._rhs = rhs[state_size:] - half.T @ self._state_factor.half_solve(rhs[:state_size, None])[:, 0]
+        self._log_odds: dict[ChangeModel, float] = {}
+        self.model = START_MODEL
+
+    def log_odds(self, model: ChangeModel) -> float:
+        """Return the logarithm of a model's posterior odds, up to a constant."""
+        if model not in self._log_odds:
+            if not len(self._rhs):
+                return model.log_prior
+            cholesky, determinant = self._factor(model)
+            change_m = linalg.cho_solve((cholesky, True), self._rhs, check_finite=False)
+            half_log_determinant = (log_determinant(cholesky) + determinant) / 2
+            self._log_odds[model] = float(self._rhs @ change_m / 2 - half_log_determinant)
+            self._log_odds[model] += model.log_prior
+        return self._log_odds[model]
+
+    def select(self, previous: ChangeModel | None) -> None:
+        """Select the most likely model; with a previous one only neighbouring correlations are tried."""
+        best = start = previous or START_MODEL
+        for ratio in range(len(CORRELATED_CHANGE_RATIOS)):
+            if previous is None or abs(ratio - previous.ratio) <= 1:
+                start = self._hill_climb(start.with_ratio(ratio))
+                best = max(best, start, key=self.log_odds)
+        self.model = best
+
+    def _hill_climb(self, model: ChangeModel) -> ChangeModel:
+        """Return a model whose neighbours of the same correlation are less likely."""
+        while (best := max([model, *model.neighbours()], key=self.log_odds)) != model:
+            model = best
+        return model
+
+    def _factor(self, model: ChangeModel) -> tuple[Floats, float]:
+        """Return the Cholesky factor of the change's normal matrix, and log |P⁻¹| of its prior."""
+        precision, determinant = self._change.precision_at(model)
+        return cholesky_inplace(self._normal + precision), determinant
+
+    @property
+    def change_m(self) -> Floats:
+        """Estimated change (k,) [m]."""
+        cholesky, _ = self._factor(self.model)
+        return np.asarray(linalg.cho_solve((cholesky, True), self._rhs, check_finite=False))
+
+    @property
+    def heave_variance_m2(self) -> Floats:
+        """Posterior variance of the heaves (heave_columns,) [m²]."""
+        cholesky, _ = self._factor(self.model)
+        columns = np.eye(len(cholesky))[:, len(cholesky) - self._change.heave_columns :]
+        half = linalg.solve_triangular(cholesky, columns, lower=True, check_finite=False)
+        return np.asarray(np.sum(half**2, axis=0))
+
+    @property
+    def estimate(self) -> Floats:
+        """Estimated unknowns (m,)."""
+        return self._with_change(self.change_m)
+
+    def _with_change(self, change_m: Floats) -> Floats:
+        """Return the unknowns (m,) that belong to a change (k,)."""
+        state_size = self._state_size
+        normal, rhs = self._reduced.normal[:state_size], self._reduced.rhs[:state_size]
+        return np.concatenate([self._state_factor.solve(rhs - normal[:, state_size:] @ change_m), change_m])
+
+    def mixture(self) -> Mixture:
+        """Return the mixture of all models that are not negligible."""
+        models = self._likely_models()
+        weight = np.exp([self.log_odds(model) - self.log_odds(self.model) for model in models])
+        weight /= weight.sum()
+        size = len(self._rhs)
+        mean_m, covariance, bias = np.zeros(size), np.zeros((size, size)), np.zeros((size, size))
+        for model, share in zip(models, weight, strict=True):
+            precision, _ = self._change.precision_at(model)
+            model_covariance = ScaledCholesky(self._normal + precision).inverse()
+            change_m = model_covariance @ self._rhs
+            mean_m += share * change_m
+            covariance += share * (model_covariance + np.outer(change_m, change_m))
+            bias += share * (model_covariance @ precision @ model_covariance)
+        covariance -= np.outer(mean_m, mean_m)
+        information = ScaledCholesky(covariance).inverse()
+        normal, first = self._reduced.normal.copy(), self._state_size
+        normal[first:, first:] += information - self._normal
+        size_m = float(np.sqrt(weight @ [model.size_m**2 for model in models]))
+        scale = np.sqrt(np.diag(bias))
+        change_bias = np.tril(cholesky_inplace(bias / np.outer(scale, scale))).T * scale @ information
+        return Mixture(self._with_change(mean_m), ScaledCholesky(normal), change_bias, size_m)
+
+    def _likely_models(self) -> list[ChangeModel]:
+        """Return the models that are not negligible and connected to the most likely of a correlation."""
+        limit = self.log_odds(self.model) - NEGLIGIBLE_LOG_ODDS
+        likely, frontier = set[ChangeModel](), list(self._log_odds or [self.model])
+        while frontier:
+            model = frontier.pop()
+            if model not in likely and self.log_odds(model) >= limit:
+                likely.add(model)
+                frontier += model.neighbours(ratios=True)
+        return sorted(likely)
+
+
+def solve(
+    reduced: ReducedNormals, state_size: int, change: GroundChange, previous: ChangeModel | None
+) -> Solution:
+    """Return the solution of the reduced normal equations; the first `state_size` unknowns are not change.
+
+    `previous` is the model of the last iteration.
+    """
+    solution = Solution(reduced, state_size, change)
+    solution.select(previous)
+    return solution

@@ -1,0 +1,124 @@
+"""Mixture over models of the ground's change, compared with dense algebra and with direct integration."""
+
+import math
+
+import numpy as np
+import pytest
+from scipy.stats import multivariate_normal
+
+from station.quantities import VarianceComponents
+from station.science.adjustment import ground_change, prior, solution
+from station.science.adjustment.ground_change import ChangeModel
+from station.science.adjustment.normal_equations import NormalEquations
+from station.science.adjustment.patches import GroundClass, Patches
+from station.science.uncertainty.jacobian import height_jacobian
+from station.science.uncertainty.parameters import ParameterLayout
+
+PARAMS = ParameterLayout(math.radians(10.0), 10, full_circle=False)
+PRIOR = prior.state_prior(
+    PARAMS, prior.line_times(PARAMS, np.eye(3), None), VarianceComponents(), weather_known=True
+)
+COUNT, STABLE, SIGMA_M = 150, 15, 0.004
+
+
+def make_patches(seed, change_m):
+    """Return patches of a scanner at rest, of which the first are stable ground; the others have changed."""
+    rng = np.random.default_rng(seed)
+    line, range_bin = rng.integers(0, PARAMS.line_groups, COUNT), rng.integers(8, 30, COUNT)
+    azimuth, range_m, height_m = (
+        np.radians(10.1 + 0.2 * line),
+        80 * (range_bin + 0.5),
+        rng.uniform(-500, 0, COUNT),
+    )
+    stable = np.arange(COUNT) < STABLE
+    offset_m = range_m * np.sin(azimuth), range_m * np.cos(azimuth), height_m
+    jacobian = height_jacobian(PARAMS, offset_m, *rng.uniform(-0.3, 0.3, (2, COUNT)), stable=stable)
+    residual_m = rng.normal(0, SIGMA_M, COUNT) + np.where(stable, 0.0, change_m)
+    ground_class = np.where(stable, GroundClass.STABLE, GroundClass.MOVING).astype(np.int64)
+    variance_m2, cells = np.full(COUNT, SIGMA_M**2), np.full(COUNT, 20.0)
+    return Patches(jacobian, range_bin, height_m, ground_class, residual_m, variance_m2, cells)
+
+
+def solve(seed, change_m):
+    patches = make_patches(seed, change_m)
+    change = ground_change.ground_change(patches, patches.ground_class == GroundClass.MOVING)
+    equations = NormalEquations(patches.jacobian, change.design, patches.residual_m, PRIOR, None)
+    reduced = equations.reduce(1 / patches.variance_m2)
+    return patches, change, equations.size, solution.solve(reduced, equations.size, change, None)
+
+
+def sigma_of(mixture, count):
+    """Return sigma of the first unknowns."""
+    half = mixture.factor.half_solve(np.eye(len(mixture.estimate))[:, :count])
+    return np.sqrt(np.sum(half**2, axis=0))
+
+
+@pytest.fixture(scope="module")
+def moderate():
+    return solve(1, 0.01)
+
+
+def test_odds_of_models_are_those_of_the_marginal_likelihood(moderate):
+    """With the line tilts and all unknowns integrated over, the residuals are normal."""
+    patches, change, _, solved = moderate
+    lines = np.zeros((COUNT, PARAMS.line_groups))
+    lines[np.arange(COUNT), patches.jacobian.line] = patches.jacobian.sight_tilt
+    state = patches.jacobian.to_sparse().toarray()
+    rest = state @ PRIOR.knot_covariance @ state.T + lines @ PRIOR.line_tilt.covariance() @ lines.T
+    rest += SIGMA_M**2 * np.eye(COUNT)
+    design = change.design.toarray()
+
+    def log_likelihood(model):
+        covariance = rest + design @ np.linalg.inv(change.precision_at(model)[0]) @ design.T
+        return multivariate_normal(cov=covariance).logpdf(patches.residual_m) + model.log_prior
+
+    first, second = ChangeModel(0, 3, 2), ChangeModel(1, 6, 5)
+    expected = log_likelihood(first) - log_likelihood(second)
+    assert solved.log_odds(first) - solved.log_odds(second) == pytest.approx(expected, abs=1e-5)
+
+
+def test_mixture_has_the_moments_of_all_models(moderate):
+    """Moments by the law of total variance, from one dense inverse per model."""
+    _, change, size, solved = moderate
+    reduced, moments = solved._reduced, []
+    models = [
+        ChangeModel(*index)
+        for index in np.ndindex(3, len(ground_change.CHANGE_STEPS_M), len(ground_change.TREND_SIZES_M))
+    ]
+    odds = np.array([solved.log_odds(model) for model in models])
+    weight = np.exp(odds - odds.max())
+    weight /= weight.sum()
+    for model in models:
+        normal = reduced.normal.copy()
+        normal[size:, size:] += change.precision_at(model)[0]
+        covariance = np.linalg.inv(normal)
+        moments.append((covariance @ reduced.rhs, covariance))
+    mean = sum(share * estimate for share, (estimate, _) in zip(weight, moments, strict=True))
+    covariance = sum(
+        share * (covariance + np.outer(estimate - mean, estimate - mean))
+        for share, (estimate, covariance) in zip(weight, moments, strict=True)
+    )
+    mixture, sigma = solved.mixture(), np.sqrt(np.diag(covariance))
+    assert np.abs((mixture.estimate - mean) / sigma).max() < 0.05  # models of little weight are left out
+    assert sigma_of(mixture, 6) == pytest.approx(sigma[:6], rel=0.05)
+
+
+def test_size_of_change_follows_the_change():
+    sizes_m = [solve(2, change_m)[3].mixture().size_m for change_m in (0.0, 0.03, 0.5)]
+    assert sizes_m[0] < 0.005 < sizes_m[1] < 0.15 < sizes_m[2] < 2.0
+
+
+def test_change_that_looks_like_tilt_widens_sigma():
+    """Settling in proportion to the distance, with a little stable ground on one side."""
+    patches = make_patches(3, 0.0)
+    distance_m = 80 * (patches.range_bin + 0.5)
+    far = distance_m > 2000
+    effect = patches.jacobian.aggregate(far / far.sum())
+
+    def far_sigma_m(change_m):
+        mixture = solve(3, change_m)[3].mixture()
+        on_all = np.zeros((len(mixture.estimate), 1))
+        on_all[: len(effect), 0] = effect
+        return np.linalg.norm(mixture.factor.half_solve(on_all))
+
+    assert far_sigma_m(-0.2 * distance_m / 2400) > 1.2 * far_sigma_m(0.0)
