@@ -128,7 +128,7 @@ def _inputs(
     azimuth_rad = params.line_azimuth_rad
     modes_rad = np.radians(0.0015) * np.stack([np.cos(azimuth_rad), np.sin(azimuth_rad)], axis=-1)
     log = LineInclination(tilt_rad, np.full(params.line_groups, np.radians(0.008) ** -2), modes_rad)
-    return AdjustmentInputs(params, lines, np.zeros((3, params.line_groups)), log, weather_known=True)
+    return AdjustmentInputs(params, lines, np.zeros((3, params.line_groups)), log, 0.0, weather_known=True)
 
 
 if __name__ == "__main__":

@@ -165,6 +165,7 @@ def _write(
     parameters = (shared.names, shared.units) if shared is not None else ((), ())
     create_file(file, series, f"Reference surface of {series.name or series.station_id}", None, parameters)
     file.setncatts({"reference_version": reference.version, "scan_ids": " ".join(reference.scan_ids)})
+    file.setncattr("mean_time", reference.time_s)
     file.setncatts({"base": provenance.base, "science_hash": provenance.science_hash})
     file.setncatts({"replaces": " ".join(provenance.replaces)})
     file.setncatts({"scan_provenance": json.dumps(provenance.scan_provenance)})
@@ -276,6 +277,7 @@ def _reference_from_file(file: netCDF4.Dataset, path: Path, series: Series) -> R
         version=str(file.reference_version),
         shared=shared,
         scan_ids=tuple(str(file.scan_ids).split()),
+        time_s=float(file.mean_time),
         components=_read_components(file),
         **rasters,
     )

@@ -20,6 +20,7 @@ from station.quantities import (
     SharedParameters,
     Shots,
     TiltSeries,
+    VarianceComponents,
 )
 from station.science.adjustment import ground_classes, prior
 from station.science.adjustment.ground_classes import SnowTest
@@ -41,6 +42,7 @@ from station.science.uncertainty.variance_factors import (
     VarianceFactors,
     class_with_excess,
     estimate_variance_factors,
+    mean_sampling_ratio,
 )
 
 MIN_STABLE_CELLS = 20  # fewer cells give no meaningful statistics
@@ -125,30 +127,47 @@ class AdjustmentInputs:
     """Inputs of the adjustment other than residuals: line timing, tilt already applied, log and weather.
 
     `assumed_rad` (3, lines) is the tilt already applied to the points, about east, north and up. `log` is the
-    inclination log by lines, None without one; `weather_known` is True if the weather was measured.
+    inclination log by lines, None without one; `time_s` is the start of the scan, since 1970; `weather_known`
+    is True if the weather was measured.
     """
 
     params: ParameterLayout
     lines: prior.LineTimes
     assumed_rad: Floats
     log: LineInclination | None
+    time_s: float
     weather_known: bool
 
 
 def adjust_to_reference(
     gridder: Gridder, scan_geometry: ScanGeometry, inputs: AdjustmentInputs, viewing: ViewingGeometry
 ) -> Adjustment:
-    """Return the scanner state estimated from a gridded scan: tilt, heading, position, range, refraction."""
-    components, reference_state = viewing.reference.components, viewing.reference.shared
-    state_prior = prior.state_prior(
-        inputs.params, inputs.lines, components, weather_known=inputs.weather_known
-    )
+    """Return the scanner state estimated from a gridded scan: tilt, heading, position, range, refraction.
+
+    If it has moved farther than expected, it is estimated again with a prior as wide as the motion.
+    """
+    components, reference_state = usual_motion(viewing.reference, inputs.time_s), viewing.reference.shared
     cells = _cells(gridder, viewing, snow_test(gridder, scan_geometry, viewing))
     patches = aggregate_patches(inputs.params, cells, scan_geometry.scanner.range_max_m)
-    log = inputs.log
-    if log is not None and reference_state is not None:
-        log = log.relative_to(inputs.params, state_prior.reference_covariance(reference_state))
-    return adjust_scan(patches, inputs.assumed_rad, state_prior.relative_to(reference_state), log)
+
+    def adjusted(components: VarianceComponents) -> Adjustment:
+        state_prior = prior.state_prior(
+            inputs.params, inputs.lines, components, weather_known=inputs.weather_known
+        )
+        log = inputs.log
+        if log is not None and reference_state is not None:
+            log = log.relative_to(inputs.params, state_prior.reference_covariance(reference_state))
+        return adjust_scan(patches, inputs.assumed_rad, state_prior.relative_to(reference_state), log)
+
+    adjustment = adjusted(components)
+    widened = prior.as_wide_as(components, adjustment.estimate)
+    return adjustment if widened == components else adjusted(widened)
+
+
+def usual_motion(reference: Reference, time_s: float) -> VarianceComponents:
+    """Return the variance components of a scan at a time [s since 1970] relative to a reference."""
+    elapsed_s = abs(time_s - reference.time_s)
+    return prior.after(reference.components, elapsed_s if np.isfinite(elapsed_s) else 0.0)
 
 
 def snow_test(gridder: Gridder, scan_geometry: ScanGeometry, viewing: ViewingGeometry) -> SnowTest:
@@ -192,10 +211,11 @@ def _cells(gridder: Gridder, viewing: ViewingGeometry, test: SnowTest) -> Iterat
             continue
         sector, sums = all_cells.take(observed), sums.take(observed)
         jacobian = viewing.jacobian(sector)
-        east_m, north_m, _ = viewing.offset_m(sector.cell, sector.height_m)
+        east_m, north_m, up_m = viewing.offset_m(sector.cell, sector.height_m)
         yield CellObservations(
             jacobian,
             np.hypot(east_m, north_m),
+            up_m,
             ground_classes.classify(
                 sector.in_class(CellClass.STABLE),
                 sector.in_class(CellClass.HOLDOUT),
@@ -250,6 +270,12 @@ def _correction(adjustment: tuple[AdjustmentInputs, Adjustment], jacobian: Heigh
     """Return the correction to subtract from heights (n,) [m]: effect of estimated minus assumed state."""
     inputs, estimated = adjustment
     return np.asarray(estimated.effect(jacobian) - tilt_effect(jacobian, inputs.assumed_rad))
+
+
+def stable_sampling_ratio(viewing: ViewingGeometry) -> float:
+    """Return the mean sampling ratio of the stable cells that an adjustment uses."""
+    cell_index = viewing.select(CellClass.STABLE, CellClass.EVEN)
+    return mean_sampling_ratio(viewing.cells["noise_class"][:].take(cell_index))
 
 
 def variance_factors(

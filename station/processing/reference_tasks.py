@@ -6,6 +6,8 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
+
 from station.archive.netcdf_layout import Series, roundtrip_text
 from station.archive.reference_files import (
     ReferenceProvenance,
@@ -121,10 +123,11 @@ def _surface_pass(
     """Return the surface after one pass over the scans."""
     stack, stacked = _stack_scans(site, scans, surface, progress, centred=True)
     scan_ids = tuple(scan.provenance.scan_id for scan in stacked)
-    shared = [scan.inputs.log_only_shared for scan in stacked]
     components = _estimate_components(surface.components if surface else VarianceComponents(), stacked)
+    shared = [scan.inputs.log_only_shared(components) for scan in stacked]
+    times_s = np.array([scan.provenance.start_s for scan in stacked])
     position_m = stacked[0].inputs.geometry.position_m
-    return build_surface(stack, surface, shared, position_m, version, scan_ids, components)
+    return build_surface(stack, surface, shared, position_m, version, scan_ids, times_s, components)
 
 
 def update_reference_version(

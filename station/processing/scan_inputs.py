@@ -8,7 +8,7 @@ import math
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from datetime import datetime, timedelta
-from functools import cached_property, partial
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -54,7 +54,7 @@ class ScanInputs:
 
     geometry: ScanGeometry
     pose: Pose
-    log_only_covariance: Callable[[], SharedParameters] | None
+    log_only_covariance: Callable[[VarianceComponents], SharedParameters] | None
     adjustment_inputs: AdjustmentInputs | None
     tilt_record: TiltRecord | None
     air: Air | None
@@ -62,10 +62,9 @@ class ScanInputs:
     provenance: dict[str, str]
     faults: tuple[str, ...] = ()  # that make the scan unusable
 
-    @cached_property
-    def log_only_shared(self) -> SharedParameters | None:
-        """Systematic errors of all points without an adjustment, from SOP and log; computed on first use."""
-        return self.log_only_covariance() if self.log_only_covariance else None
+    def log_only_shared(self, components: VarianceComponents) -> SharedParameters | None:
+        """Return the systematic errors of all points without an adjustment, from SOP and log."""
+        return self.log_only_covariance(components) if self.log_only_covariance else None
 
 
 def load_scan_inputs(
@@ -84,7 +83,7 @@ def load_scan_inputs(
     NotReadyError is raised if there is no weather yet.
     """
     if site.scans.frame == "map":
-        return _inputs_in_map_frame(site)
+        return _inputs_in_map_frame(site, start.timestamp())
     sop = valid_sop(site.sop, start)
     transform, sop_id = scanner_to_map(site, sop), sop_identity(sop)
     warnings: list[str] = []
@@ -133,10 +132,11 @@ def load_scan_inputs(
             lines,
             tilt_record,
             tilt_offset or NO_CYCLIC_ERROR,
-            VarianceComponents(),
             weather_known=weather_known,
         ),
-        AdjustmentInputs(params, lines, assumed_rad, line_inclination, weather_known=weather_known),
+        AdjustmentInputs(
+            params, lines, assumed_rad, line_inclination, start.timestamp(), weather_known=weather_known
+        ),
         tilt_record,
         air if weather_known else None,
         tuple(warnings),
@@ -145,7 +145,7 @@ def load_scan_inputs(
     )
 
 
-def _inputs_in_map_frame(site: Site) -> ScanInputs:
+def _inputs_in_map_frame(site: Site, start_s: float) -> ScanInputs:
     """Return the inputs of a scan that is already on the map."""
     position_m = _map_position(site)
     geometry, log_only_covariance, adjustment_inputs = scan_geometry(site, position_m), None, None
@@ -153,7 +153,7 @@ def _inputs_in_map_frame(site: Site) -> ScanInputs:
         params = parameters.parameter_layout(geometry.grid, position_m)
         lines = prior.line_times(params, np.eye(3), None)
         adjustment_inputs = AdjustmentInputs(
-            params, lines, np.zeros((3, params.line_groups)), None, weather_known=False
+            params, lines, np.zeros((3, params.line_groups)), None, start_s, weather_known=False
         )
         log_only_covariance = partial(
             prior.log_only_covariance,
@@ -161,7 +161,6 @@ def _inputs_in_map_frame(site: Site) -> ScanInputs:
             lines,
             None,
             NO_CYCLIC_ERROR,
-            VarianceComponents(),
             weather_known=False,
         )
     return ScanInputs(geometry, Pose(None, None), log_only_covariance, adjustment_inputs, None, None, (), {})

@@ -34,12 +34,14 @@ from station.processing.pipeline import (
     measure,
     new_gridder,
     reference_viewing_geometry,
+    stable_sampling_ratio,
+    usual_motion,
     variance_factors,
 )
 from station.processing.previews import PreviewRecorder
 from station.processing.scan_inputs import ScanInputs, load_scan_inputs
 from station.products.overview import Overview
-from station.quantities import Bools, Measurement, Quality, Reference, ScanGeometry
+from station.quantities import Bools, Measurement, Quality, Reference, ScanGeometry, VarianceComponents
 from station.queries.aggregates import LEVERAGE_VARIABLES
 from station.readers.flags import read_flags, reasons_for
 from station.readers.polygons import cells_inside, read_polygons
@@ -243,9 +245,10 @@ def _compute_epoch(
     attempt = adjustment[1] if adjustment else None
     if adjustment is not None and adjustment[1].rejected_share > UNUSABLE_REJECTED_SHARE:
         adjustment = None
-    shared, factors = inputs.log_only_shared, UNIT_FACTORS
+    components = usual_motion(reference, start.timestamp()) if reference else VarianceComponents()
+    shared, factors = inputs.log_only_shared(components), UNIT_FACTORS
     if adjustment is not None and viewing is not None:
-        shared = adjustment[1].to_shared_parameters()
+        shared = adjustment[1].to_shared_parameters(stable_sampling_ratio(viewing))
         if not inputs.geometry.published_budget:
             factors = variance_factors(gridder, inputs.geometry, viewing, adjustment, shared)
             shared = shared.scaled(factors.systematic)
@@ -256,7 +259,7 @@ def _compute_epoch(
     scalars = _scalar_variables(measurement, inputs, *point_counts)
     scalars["rejected_echo_share"] = gridder.rejected_echo_share
     if adjustment is not None and viewing is not None:
-        scalars |= holdout_statistics(measurement, viewing) | {"change_step": adjustment[1].change_step_m}
+        scalars |= holdout_statistics(measurement, viewing) | {"change_step": adjustment[1].change_size_m}
         scalars |= {
             "random_variance_factor": float(np.median(factors.random[viewing.cells["noise_class"][:]])),
             "systematic_variance_factor": factors.systematic,
@@ -272,6 +275,7 @@ def _compute_epoch(
         inputs.faults,
         has_brightness=brightness_known,
         rejected_echo_share=gridder.rejected_echo_share,
+        usual=components,
     )
     return epochs.Epoch(
         start_s=start.timestamp(),

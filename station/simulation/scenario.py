@@ -18,6 +18,8 @@ NAMES = (  # for `named`
 
 SCANNER_MODELS = {1064: "riegl-vz-6000", 1550: "riegl-vz-4000"}  # by wavelength [nm]
 
+SEASON_S = 120 * 86_400.0
+
 # Fields set to zero by without_errors(): every difference between a shot and its ideal point.
 ERRORS = (
     "air", "refraction_sigma", "refraction_azimuth_sigma", "lapse_sigma_k_per_m", "path_temperature_sigma_k",
@@ -136,7 +138,7 @@ class Scenario:
     avalanche_size: float = 1.0  # of release and deposit; at 1 the deposit is 300 m long
     settling_m_per_h: float = 0.0  # of ice at 3 km (times size), in proportion to its distance
     settling_from_hour: float = 0.0
-    season_hour: float = 0.0  # as if months had passed before this hour; 0 is never
+    season_hour: float = 0.0  # four months pass before this hour of the series; 0 is never
     season_deg: float = 0.0  # tilt and rotation of the scanner in these months
     winter_m: float = 0.0  # mean depth of the snow that fell in them, with drifts
     summer_melt_m: float = 0.0  # what melted in them at the end of the tongue; zero 450 m (times size) higher
@@ -181,7 +183,9 @@ class Scenario:
 
     def scan_start_utc_s(self, scan: int) -> float:
         """Return the start of one scan [s since 1970]."""
-        return self.start_utc_s + self.scan_start_s(scan)
+        start_s = self.scan_start_s(scan)
+        later = 0 < 3600 * self.season_hour <= start_s
+        return self.start_utc_s + start_s + later * SEASON_S
 
     def hours_at(self, scan: int) -> float:
         """Return the middle of one scan in hours since the series began; the ground is fixed at that time."""

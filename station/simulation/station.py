@@ -167,9 +167,10 @@ def simulate(folder: Path, scenario: Scenario) -> None:
 
 
 def _minutes(scenario: Scenario) -> Floats:
-    first = scenario.start_utc_s - WEATHER_MARGIN_S
-    last = scenario.scan_start_utc_s(scenario.hours - 1) + scenario.scan_s + WEATHER_MARGIN_S
-    return np.arange(np.ceil(first / 60) * 60, last, 60.0)
+    """Return the minutes of the weather log: those around any scan [s since 1970]."""
+    starts_s = np.array([scenario.scan_start_utc_s(scan) for scan in range(scenario.hours)])
+    around_s = np.arange(-WEATHER_MARGIN_S, scenario.scan_s + WEATHER_MARGIN_S, 60.0)
+    return np.asarray(np.unique(np.ceil((starts_s[:, None] + around_s) / 60) * 60))
 
 
 def _write_truth(path: Path, truth: xr.Dataset) -> None:

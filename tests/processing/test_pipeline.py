@@ -149,7 +149,9 @@ def test_reference_from_scans_equals_the_truth_within_its_uncertainty():
         if centred:
             reference = centre_reference(reference, stack, position_m, components)
         else:
-            reference = build_surface(stack, reference, [None], position_m, "1", ("a",), components)
+            reference = build_surface(
+                stack, reference, [None], position_m, "1", ("a",), np.zeros(1), components
+            )
     change_m = [process_shots(shots, reference)[0].change_m for shots in scans]
     assert np.nanmax(np.abs(np.nanmean(change_m, axis=0))) <= 2**-11  # changes are rounded to 2^-10 m
     error = reference.elevation_m + reference.mean_residual_m - height(x_m, y_m)
@@ -287,6 +289,7 @@ def test_adjustment_to_a_sample_of_stable_ground_agrees_with_all_of_it(monkeypat
         line_times(params, np.eye(3), None),
         np.zeros((3, params.line_groups)),
         None,
+        0.0,
         weather_known=True,
     )
     reference = replace(truth(), components=VarianceComponents(translation_m=0.1))

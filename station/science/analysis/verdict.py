@@ -23,6 +23,7 @@ from station.science.gridding.viewing_geometry import (
 from station.science.uncertainty.parameters import TILT_KNOT_RAD, TILT_KNOTS_PER_REFRACTION
 
 MAX_REJECTED_SHARE = 0.3  # of the stable ground, rejected by the adjustment
+MAX_MEAN_SIGMA_M = 0.05  # of the mean change of moving ground
 MOVED_SIGMAS = 4.0  # of the usual motion from scan to scan
 MIN_VISIBILITY = 0.75  # of the usual cells; less is not due to chance
 UNUSABLE_VISIBILITY = 0.02  # of the usual cells; less is unusable
@@ -117,6 +118,11 @@ def adjustment_warnings(adjustment: Adjustment, components: VarianceComponents) 
         reasons.append("no stable ground observed")
     elif adjustment.rejected_share > MAX_REJECTED_SHARE:
         reasons.append(f"stable ground is inconsistent: {adjustment.rejected_share:.0%} of it rejected")
+    elif adjustment.mean_sigma_m > MAX_MEAN_SIGMA_M:
+        reasons.append(
+            "stable ground cannot tell the change of the ground from motion of the scanner:"
+            f" sigma of its mean is {adjustment.mean_sigma_m:.2g} m"
+        )
     tilt_rad = float(np.hypot(*adjustment.estimate[:2]))
     if tilt_rad > MOVED_SIGMAS * components.tilt_rad:
         reasons.append(f"scanner tilted by {np.degrees(tilt_rad):.3f} degrees against its SOP: moved?")
@@ -159,6 +165,7 @@ def assess(
     *,
     has_brightness: bool = True,
     rejected_echo_share: float = 0.0,
+    usual: VarianceComponents | None = None,
 ) -> tuple[str, str]:
     """Return the verdict of an epoch and its reasons, the gravest first.
 
@@ -167,7 +174,8 @@ def assess(
     the end; `stable_z_std` is given only if it was used. `faults` are those of the inputs. `has_brightness`
     is False if the scan, or its reference, does not tell by brightness where snow lies; that degrades a scan
     only if its change is measured: first scans make the reference. `rejected_echo_share` is that of the
-    points on the grid that are not of the surface of their cell.
+    points on the grid that are not of the surface of their cell. `usual` is the motion to expect of the
+    scanner since the reference; by default that of a scan soon after it.
     """
     fatal = [*([f"flagged: {flag}"] if flag else []), *faults]
     reasons = [*warnings, *([] if has_brightness or viewing is None else [NO_BRIGHTNESS])]
@@ -179,7 +187,7 @@ def assess(
         visible = visibility(measurement.count, viewing)
         (fatal if visible.share < UNUSABLE_VISIBILITY else reasons).extend(obstructions(visible))
     if adjustment is not None and viewing is not None:
-        reasons += adjustment_warnings(adjustment, viewing.reference.components)
+        reasons += adjustment_warnings(adjustment, usual or viewing.reference.components)
     if stable_z_std is not None:
         if stable_z_std > MAX_HOLDOUT_Z_STD:
             reasons.append(f"hold-out stable ground scatters by {stable_z_std:.1f} sigma")

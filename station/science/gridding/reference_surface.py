@@ -11,6 +11,7 @@ from station.science.adjustment import ground_classes
 from station.science.geometry.terrain import HALO_ROWS, fit_planes, row_blocks, smooth_gradient
 from station.science.gridding.scan_stack import ScanStack
 
+REFRACTION_CORRELATION_S = 6 * 3600.0  # of the refraction of the air, from scan to scan
 MAX_DEVIATION_SIGMAS = 3.0  # of a mean over many scans, on stable ground
 MAX_VARIANCE_FACTOR = 3.0  # empirical over modelled variance from scan to scan, on stable ground
 
@@ -24,6 +25,7 @@ def build_surface(
     position_m: Position | None,
     version: str,
     scan_ids: tuple[str, ...],
+    times_s: Floats,
     components: VarianceComponents,
 ) -> Reference:
     """Return a reference whose surface follows the scans stacked on `base`, or their plain means without one.
@@ -31,8 +33,9 @@ def build_surface(
     A plain mean depends on where its points lie on the slope (equations.md, 4.10), which a later pass of
     residuals repairs. Where cells around are missing, a node of its own would give the surface the slope of
     its sampling error, which exceeds that of the terrain: there the surface is a plane through the cells
-    around. Errors shared within a scan are taken as independent between scans, so that the mean of n scans
-    has an nth of their mean covariance.
+    around. `times_s` (n,) are the starts of the scans. Errors shared within a scan are taken as independent
+    between scans, so that the mean of n scans has an nth of their mean covariance; but refraction is that of
+    the weather, which lasts for hours. Source: equations.md, 6.3.
     """
     mean_m = stack.mean_residual()
     if base is None:
@@ -46,10 +49,13 @@ def build_surface(
         total = known[0]
         for posterior in known[1:]:
             total = total + posterior
+        separation_s = np.abs(np.subtract.outer(times_s, times_s))
+        correlated = float(np.mean(np.exp(-separation_s / REFRACTION_CORRELATION_S)))
+        share = np.where([name.startswith("refraction") for name in total.names], correlated, 1 / len(known))
         shared = replace(
             total,
             estimate=np.zeros(len(total.names)),
-            covariance=total.covariance / len(known) ** 2,
+            covariance=total.covariance / len(known) * np.sqrt(np.outer(share, share)),
             line_tilt_variance=total.line_tilt_variance / len(known) ** 2,
         )
     roughness_m2 = stack.roughness()
@@ -67,6 +73,7 @@ def build_surface(
         stable=np.zeros(stack.grid.shape, bool),
         components=components,
         visibility=stack.visibility(),
+        time_s=float(np.mean(times_s)),
     )
 
 
