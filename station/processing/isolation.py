@@ -24,7 +24,7 @@ from multiprocessing import forkserver
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar
 
-from station.errors import NotReadyError, ScanError, StationError
+from station.errors import InconclusiveError, NotReadyError, StationError
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -102,10 +102,11 @@ def run_isolated(
 
     `on_progress` is called in this process while it waits, up to `timeout_s`.
 
-    Raises the StationError that the task raised. Raises ScanError if the worker ran out of memory or time,
-    panicked, or died by a signal that it caused. Raises NotReadyError if `should_stop()` returned true, or if
-    the worker repeatedly could not be started or was killed from outside. Raises RuntimeError with the
-    traceback of the worker for a bug.
+    Raises the StationError that the task raised. Raises InconclusiveError if the worker ran out of memory or
+    time, panicked, or died by a signal that it caused: a corrupt scan does that, and so do a machine without
+    memory and a disk that hangs. Raises NotReadyError if `should_stop()` returned true, or if the
+    worker repeatedly could not be started or was killed from outside. Raises RuntimeError with the traceback
+    of the worker for a bug.
     """
     hooks = on_progress, should_stop
     for delay_s in RETRY_DELAYS_S:
@@ -141,8 +142,9 @@ def _run_once(
         try:
             report = _await_report(parent_conn, time.monotonic() + timeout_s, on_progress, should_stop)
             if report is None:
-                raise ScanError(
-                    f"took longer than {timeout_s:g} s: the file is corrupt, or timeout_s is too short"
+                raise InconclusiveError(
+                    f"took longer than {timeout_s:g} s: a disk or mount hangs, the file is corrupt, or"
+                    " scans.timeout_s is too short"
                 )
         finally:
             exit_status = _terminate(process)
@@ -156,14 +158,15 @@ def _run_once(
     if kind == "died":
         raise _exit_error(exit_status)
     if kind == "memory":
-        raise ScanError(
-            f"needs more than {memory_gb:g} GB: the file is corrupt, or service.memory_gb is too small"
+        raise InconclusiveError(
+            f"needs more than {memory_gb:g} GB: the file is corrupt, service.memory_gb is too small, or the"
+            " machine has no memory to spare"
         )
     if kind == "error":
         assert isinstance(value, StationError)  # noqa: S101 - sent by _child_main
         raise value
     if kind == "panicked":
-        raise ScanError(f"the decoder panicked: {value}")
+        raise InconclusiveError(f"the decoder panicked: {value}")
     raise RuntimeError(f"a bug in {task.__name__}, in the worker process:\n{value}")
 
 
@@ -211,17 +214,15 @@ def _terminate(process: ForkServerProcess) -> int | None:
     return exit_status
 
 
-def _exit_error(exit_status: int | None) -> ScanError | NotReadyError:
-    """Return the error for a dead worker.
-
-    A crash of the decoder is a ScanError; a kill from outside is not the fault of the scan.
-    """
+def _exit_error(exit_status: int | None) -> NotReadyError:
+    """Return the error for a dead worker; a kill from outside is not the fault of the scan."""
     if exit_status is None or exit_status >= 0:
-        return ScanError(f"the decoder ended the process without a message (exit status {exit_status})")
+        message = f"the decoder ended the process without a message (exit status {exit_status})"
+        return InconclusiveError(message)
     name = signal.Signals(-exit_status).name
     if -exit_status in _EXTERNAL_SIGNALS:
         return _WorkerLostError(f"the process was killed ({name}): is the machine out of memory?")
-    return ScanError(f"the decoder died by {name}")
+    return InconclusiveError(f"the decoder died by {name}")
 
 
 def _child_main(

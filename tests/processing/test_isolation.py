@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from station.errors import NotReadyError, ScanError, StoreError
+from station.errors import InconclusiveError, NotReadyError, ScanError, StoreError
 from station.processing import isolation
 
 HERE = Path(__file__).parent
@@ -72,23 +72,23 @@ def test_full_disk_of_stderr_raises_not_ready(tasks, monkeypatch):
 
 
 @pytest.mark.parametrize("task", ["allocate", "allocate_in_numpy"])
-def test_memory_limit_raises_scan_error(tasks, task):
-    with pytest.raises(ScanError, match="needs more than 1 GB"):
+def test_memory_limit_raises_inconclusive_error(tasks, task):
+    with pytest.raises(InconclusiveError, match="needs more than 1 GB"):
         run(getattr(tasks, task), 10)
 
 
 @pytest.mark.integration
 def test_memory_of_preloaded_modules_does_not_count(tasks):
     assert run(tasks.allocate, 0.9, memory_gb=1.0) > 9e8
-    with pytest.raises(ScanError, match="needs more"):
+    with pytest.raises(InconclusiveError, match="needs more"):
         run(tasks.allocate, 1.1, memory_gb=1.0)
 
 
 @pytest.mark.parametrize(
     ("number", "error"),
     [
-        (signal.SIGABRT, ScanError),
-        (signal.SIGSEGV, ScanError),
+        (signal.SIGABRT, InconclusiveError),
+        (signal.SIGSEGV, InconclusiveError),
         (signal.SIGKILL, NotReadyError),  # not sent by a decoder: the machine is out of memory
         (signal.SIGTERM, NotReadyError),
     ],
@@ -128,21 +128,21 @@ def test_stop_ends_the_delay_before_a_restart(tasks, tmp_path, monkeypatch):
 @pytest.mark.parametrize(
     ("task", "message"), [("abort", "SIGABRT"), ("segfault", "SIGSEGV"), ("vanish", "without a message")]
 )
-def test_native_crash_raises_scan_error(tasks, task, message):
-    with pytest.raises(ScanError, match=message):
+def test_native_crash_raises_inconclusive_error(tasks, task, message):
+    with pytest.raises(InconclusiveError, match=message):
         run(getattr(tasks, task))
 
 
 @pytest.mark.parametrize("task", ["panic", "exit_task"])
-def test_base_exceptions_of_a_task_raise_scan_error(tasks, task):
-    with pytest.raises(ScanError, match=r"panicked: (Panic: called|SystemExit)"):
+def test_base_exceptions_of_a_task_raise_inconclusive_error(tasks, task):
+    with pytest.raises(InconclusiveError, match=r"panicked: (Panic: called|SystemExit)"):
         run(getattr(tasks, task))
 
 
 def test_hanging_worker_is_killed_at_its_timeout(tasks, tmp_path):
     reports = []
     start_s = time.monotonic()
-    with pytest.raises(ScanError, match="longer than 1 s"):
+    with pytest.raises(InconclusiveError, match="longer than 1 s"):
         run(
             tasks.hang_ignoring_signals,
             str(tmp_path / "pid"),
