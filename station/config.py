@@ -15,6 +15,7 @@ from typing import Any
 
 from pydantic import BaseModel, ValidationError
 
+from station._version import __version__
 from station.errors import ConfigError
 from station.quantities import Grid, Scanner
 from station.sections import Section, SiteFile
@@ -71,7 +72,30 @@ class Site(SiteFile):
             settings["adjustment"]["stable"] = _sha256(self.adjustment.stable)
         if isinstance(self.reference.scans, Path):
             settings["reference"]["scans"] = _sha256(self.reference.scans)
-        return hashlib.sha256(json.dumps(settings, sort_keys=True).encode()).hexdigest()[:16]
+        return _hash(settings)
+
+    @property
+    def judging_conditions(self) -> str:
+        """Version, and hash of the settings, limits and SOP files that decide whether a scan can be used."""
+        settings = self.model_dump(
+            mode="json",
+            include={
+                "scans": {"frame", "name", "point_time", "intensity", "timeout_s"},
+                "service": {"memory_gb"},
+                **dict.fromkeys(
+                    ("scanner", "sop", "map", "grid", "inclination", "weather", "air", "adjustment",
+                     "uncertainty", "reference"),
+                    True,
+                ),
+            },
+        )  # fmt: skip
+        files = [*(sop.file for sop in self.sop), *filter(None, [self.map.pop])]
+        settings["files"] = [_sha256(file) if file.is_file() else "" for file in files]
+        return f"{__version__} {_hash(settings)}"
+
+
+def _hash(settings: dict[str, Any]) -> str:
+    return hashlib.sha256(json.dumps(settings, sort_keys=True).encode()).hexdigest()[:16]
 
 
 def _sha256(path: Path) -> str:

@@ -22,7 +22,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from station.errors import NotReadyError
-from station.inbox.journal import MAX_RETRY_S, State
+from station.inbox.journal import LONGEST_RETRY_S, State
 from station.logs import logfmt
 
 if TYPE_CHECKING:
@@ -133,7 +133,7 @@ class Inbox:
                 to_precheck = to_precheck or scan
         self._journal.record_seen(waiting)
         self._drop_removed(summaries, scans)
-        stable.sort(key=lambda scan: (_start_from_name(scan.name, self._pattern), scan.name))
+        stable.sort(key=lambda scan: (start_from_name(scan.name, self._pattern), scan.name))
         first = next((scan for scan in stable if not _is_open_for_writing(scan)), None)
         if stable and first is None:
             next_s = min(next_s, _RECHECK_S)
@@ -184,7 +184,7 @@ class Inbox:
         if summary is None or summary.next_try_utc_s is None or not _is_unchanged(summary, status):
             return 0.0
         remaining_s = summary.next_try_utc_s - self._now_s()
-        return remaining_s if 0 < remaining_s <= MAX_RETRY_S else 0.0  # longer: the clock was set back
+        return remaining_s if 0 < remaining_s <= LONGEST_RETRY_S else 0.0  # longer: the clock was set back
 
     def _reject(self, name: str, status: os.stat_result, reason: str) -> None:
         safe = safe_name(name)
@@ -262,7 +262,7 @@ def _identity(status: os.stat_result) -> tuple[int, ...]:
     return status.st_ino, status.st_size, status.st_mtime_ns
 
 
-def _start_from_name(name: str, pattern: str) -> datetime:
+def start_from_name(name: str, pattern: str) -> datetime:
     """Return the start of a scan according to its name; datetime.max (sorted last) if the name has none."""
     try:
         return datetime.strptime(Path(name).stem, pattern).replace(tzinfo=UTC)

@@ -240,7 +240,11 @@ class Reprocessing:
         if isinstance(result, Rejected):
             self._report(f"  {task.name}: set aside: {result.reason}")
             self._journal.set_aside(
-                task.name, result.reason, sha256=result.sha256 or None, log_sha256=result.log_sha256
+                task.name,
+                result.reason,
+                sha256=result.sha256 or None,
+                log_sha256=result.log_sha256,
+                judged_under=self._site.judging_conditions,
             )
             return 1
         record_result(self._journal, task.name, result)

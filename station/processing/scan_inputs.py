@@ -77,11 +77,13 @@ def load_scan_inputs(
     *,
     save_tilt_offset: bool = True,
     wait_for_weather: bool = False,
+    waiting_before: str = "",
 ) -> ScanInputs:
     """Return the inputs of a scan; raise ScanError or ConfigError if it cannot be georeferenced.
 
-    With `save_tilt_offset`, a tilt offset estimated here is saved for later scans. With `wait_for_weather`,
-    NotReadyError is raised if there is no weather yet.
+    With `save_tilt_offset`, a tilt offset estimated here is saved for later scans. NotReadyError is raised if
+    that offset is to be of an earlier scan, the one in `waiting_before`; and, with `wait_for_weather`, if
+    there is no weather yet.
     """
     if site.scans.frame == "map":
         return _inputs_in_map_frame(site)
@@ -96,6 +98,10 @@ def load_scan_inputs(
     faults = _static_tilt_faults(site, log)
     tilt_offset = read_tilt_offset(site, sop_id)
     if tilt_offset is None:
+        if waiting_before and site.inclination and site.inclination.mode == "relative" and sop.scan is None:
+            raise NotReadyError(
+                f"waits for {waiting_before}: the first scan under an SOP defines its tilt offset"
+            )
         tilt_offset = _find_tilt_offset(site, sop, reader, log, track, warnings)
         # That of an absolute sensor is zero and need not be saved.
         if save_tilt_offset and tilt_offset is not None and tilt_offset != NO_CYCLIC_ERROR:

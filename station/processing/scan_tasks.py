@@ -24,6 +24,7 @@ from station.config import Site
 from station.errors import ScanError
 from station.inbox.file_hash import hash_if_unchanged, sha256_file
 from station.inbox.inbox import ScanFile
+from station.inbox.journal import Journal
 from station.processing.isolation import trim_heap
 from station.processing.pipeline import (
     AdjustmentInputs,
@@ -84,6 +85,7 @@ class ScanHistory:
     last_content: tuple[str, str] | None = None  # SHA-256 of scan and log last assessed under its name
     stored_scans: Mapping[str, str] = field(default_factory=dict)  # names of other stored scans by SHA-256
     wait_for_weather: bool = False  # if the weather log is not up to date yet
+    waiting_before: str = ""  # name of an earlier scan that will be processed soon
 
 
 @dataclass(frozen=True)
@@ -171,8 +173,17 @@ def process(
         is_recent = time.time() - scan.mtime_ns * 1e-9 < wait_s
         reference = load_reference(site, history.reference)
         epoch = _compute_epoch(
-            site, scan, scan_sha256, reference, progress, is_dry_run=False, wait_for_weather=is_recent
+            site,
+            scan,
+            scan_sha256,
+            reference,
+            progress,
+            is_dry_run=False,
+            wait_for_weather=is_recent,
+            waiting_before=history.waiting_before,
         )
+    if not history.revision:
+        _require_new_start(site, epoch.start_s)
     version, epoch_file = epoch.provenance["reference_version"], _identical_epoch(series, epoch)
     preview = PreviewRecorder(site, series, version if with_preview and epoch_file is None else "")
     epoch_file = epoch_file or epochs.write_epoch(series, epoch, history.revision, preview.add)
@@ -189,6 +200,18 @@ def process(
         epoch_sha256=sha256_file(epoch_file.path),
         overview=preview.overview,
     )
+
+
+def _require_new_start(site: Site, start_utc_s: float) -> None:
+    """Raise ScanError if a scan of another name with the same start is stored: it would be replaced."""
+    with Journal(site.station.data / "journal.sqlite", read_only=True) as journal:
+        stored = journal.starting_at(start_utc_s)
+    if stored:
+        start = datetime.fromtimestamp(start_utc_s, UTC)
+        raise ScanError(
+            f"begins at {start:%Y-%m-%d %H:%M:%S} UTC, as {stored[0]} does, which is stored: a series has one"
+            f" scan per start; to replace that one, copy this file over it"
+        )
 
 
 def check_header(site: Site, scan: ScanFile, progress: Progress) -> None:
@@ -215,6 +238,7 @@ def _compute_epoch(
     *,
     is_dry_run: bool,
     wait_for_weather: bool,
+    waiting_before: str = "",
 ) -> epochs.Epoch:
     with open_scan_for(site, scan.path) as reader:
         start, end, _ = utc_interval(reader, site.scans.name)
@@ -227,6 +251,7 @@ def _compute_epoch(
             end,
             save_tilt_offset=not is_dry_run,
             wait_for_weather=wait_for_weather,
+            waiting_before=waiting_before,
         )
         viewing = load_viewing_geometry(site, inputs.geometry, reference) if reference else None
         progress()

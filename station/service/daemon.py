@@ -181,7 +181,8 @@ class Daemon:
             raise
         except Exception as bug:  # a bug triggered by one scan must not block the others
             log.exception(logfmt(scan=scan.name, verdict="later", reason="a bug: please report it"))
-            self._open_journal().defer(scan.name, f"a bug: {type(bug).__name__}: {bug}"[:500])
+            reason = f"a bug: {type(bug).__name__}: {bug}"[:500]
+            self._open_journal().record_failure(scan.name, reason, self._site.judging_conditions)
 
     def _housekeeping(self, worker: ScanProcessor) -> None:
         """Run scheduled tasks while no scan is waiting; a failed task runs again at its next time."""

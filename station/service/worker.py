@@ -12,9 +12,16 @@ from typing import TypeVar
 from station.archive.reference_files import valid_versions
 from station.archive.series.index import series_in
 from station.config import Site
-from station.errors import ConfigError, NotReadyError, ScanError, StationError, StoreError
-from station.inbox.inbox import ScanFile
-from station.inbox.journal import Entry, Journal, State
+from station.errors import (
+    ConfigError,
+    InconclusiveError,
+    NotReadyError,
+    ScanError,
+    StationError,
+    StoreError,
+)
+from station.inbox.inbox import ScanFile, start_from_name
+from station.inbox.journal import SETTLING_S, Entry, Journal, State
 from station.inbox.scan_files import find_scan
 from station.logs import logfmt
 from station.monitoring.daily_digest import write_digest, yesterday
@@ -101,6 +108,11 @@ class Worker:
 
         Raises StoreError if the store cannot be written; the scan is then still waiting.
         """
+        is_stored = self._process(scan)
+        self._build_reference_if_due()  # also if the scan is not stored: the reference may have waited for it
+        return is_stored
+
+    def _process(self, scan: ScanFile) -> bool:
         self._processed[scan.name] = scan
         entry = self._journal.entry(scan.name)
         history = ScanHistory(
@@ -109,11 +121,14 @@ class Worker:
             last_content=_assessed_content(entry) if self._in_service else None,
             stored_scans=self._journal.others_stored(scan.name, scan.size),
             wait_for_weather=self._in_service,
+            waiting_before=self._unsettled_before(self._start_s(scan.name)) if self._in_service else "",
         )
         try:
             result = self._with_repair(process_new, scan, history)
         except ScanError as error:
             return self._set_aside(scan, str(error))
+        except InconclusiveError as error:
+            return record_failure(self._journal, self._site, scan.name, str(error))
         except NotReadyError as error:
             pause_s = self._journal.defer(scan.name, str(error))
             log.info("%s", logfmt(scan=scan.name, verdict="later", reason=error, retry_s=round(pause_s)))
@@ -126,7 +141,6 @@ class Worker:
         record_result(self._journal, scan.name, result)
         _log_result(scan.name, result)
         self.publish(scan.name, result)
-        self._build_reference_if_due()
         if self._in_service and uncompacted > MAX_UNCOMPACTED:
             self.start_compaction(in_backlog=True)
         return True
@@ -220,6 +234,7 @@ class Worker:
         for name in names:
             log.info("%s", logfmt(scan=name, reason="its log or weather arrived late: reprocessing"))
         self._journal.requeue(names)
+        self._judge_again()
         self._report_outdated()
         self._apply_retention()
 
@@ -275,7 +290,10 @@ class Worker:
     def _set_aside(
         self, scan: ScanFile, reason: str, sha256: str | None = None, log_sha256: str = ""
     ) -> bool:
-        self._journal.set_aside(scan.name, reason, sha256=sha256, log_sha256=log_sha256)
+        conditions = self._site.judging_conditions
+        self._journal.set_aside(
+            scan.name, reason, sha256=sha256, log_sha256=log_sha256, judged_under=conditions
+        )
         log.warning("%s", logfmt(scan=scan.name, verdict="set_aside", reason=reason))
         self.publish()
         return False
@@ -305,6 +323,15 @@ class Worker:
         log.info("%s", logfmt(scan=scan.name, verdict="same", reason="content unchanged"))
         entry = self._journal.entry(scan.name)
         return entry is not None and entry.state is State.STORED
+
+    def _judge_again(self) -> None:
+        """Queue scans that were set aside or failed under other settings, limits or another version."""
+        names = self._journal.judged_otherwise(self._site.judging_conditions)
+        names = [name for name in names if (self._site.scans.inbox / name).is_file()]
+        reason = "settings, limits or version have changed since it was set aside or failed"
+        for name in names:
+            log.info("%s", logfmt(scan=name, verdict="waiting", reason=reason))
+        self._journal.requeue(names, reason)
 
     def _report_outdated(self) -> None:
         """Log the number of epochs with outdated settings, whenever it changes."""
@@ -347,7 +374,11 @@ class Worker:
         if versions and not isinstance(setting, Path):
             self._requeue_without_reference()
         chosen = scans_for_version(self._site, usable, len(versions))
-        if isinstance(setting, Path) or not chosen or len(usable) < scans_needed(self._site, len(versions)):
+        needed = scans_needed(self._site, len(versions))
+        if isinstance(setting, Path) or not chosen or len(usable) < needed:
+            return
+        last_s = self._start_s(usable[needed - 1])
+        if self._unsettled_before(last_s):  # it may belong to the reference
             return
         scans = [self._find_scan(name) for name in chosen]
         available = [scan for scan in scans if scan is not None]
@@ -367,9 +398,36 @@ class Worker:
             return
         self.add_checksums()
         log.info("%s", logfmt(reference=version, scans=len(available)))
-        if not versions:
-            others = (row.name for row in self._journal.rows(State.STORED) if row.reference != version)
-            self._journal.requeue(others)
+        self._requeue_for_version(version, last_s if versions else None)
+
+    def _requeue_for_version(self, version: str, update_s: float | None) -> None:
+        """Requeue epochs that were not measured from a version of the reference, but should have been.
+
+        These are all epochs of a first version; of an update, to the scans before `update_s`, those of later
+        scans that were processed while the update waited for an earlier one.
+        """
+        outdated = (
+            row.name
+            for row in self._journal.rows()
+            if row.epoch and row.outcome is not State.SET_ASIDE and row.reference != version
+            if update_s is None
+            or ((row.start_utc_s or 0.0) > update_s and row.changed_utc_s > time.time() - SETTLING_S)
+        )
+        self._journal.requeue(outdated, keep_reference=False)
+
+    def _unsettled_before(self, start_utc_s: float) -> str:
+        """Return the name of an earlier scan that will be judged soon, '' if there is none."""
+        for name, known_s in self._journal.unsettled().items():
+            if (known_s or start_from_name(name, self._site.scans.name).timestamp()) < start_utc_s:
+                return name
+        return ""
+
+    def _start_s(self, name: str) -> float:
+        """Return the start of a scan, from its epoch or else its name; the year 9999 if neither tells it."""
+        entry = self._journal.entry(name)
+        if entry is not None and entry.start_utc_s is not None:
+            return entry.start_utc_s
+        return start_from_name(name, self._site.scans.name).timestamp()
 
     def _requeue_without_reference(self) -> None:
         """Requeue epochs without change: power failed between building the reference and its first use."""
@@ -409,6 +467,14 @@ def _assessed_content(entry: Entry | None) -> tuple[str, str] | None:
     if entry is None or entry.outcome is None or not entry.sha256:
         return None
     return entry.sha256, entry.log_sha256
+
+
+def record_failure(journal: Journal, site: Site, name: str, reason: str) -> bool:
+    """Record and log an attempt that failed although the scan may be good; return False: it is not stored."""
+    pause_s = journal.record_failure(name, reason, site.judging_conditions)
+    verdict, extra = ("set_aside", {}) if pause_s is None else ("later", {"retry_s": round(pause_s)})
+    log.warning("%s", logfmt(scan=name, verdict=verdict, reason=reason, **extra))
+    return False
 
 
 def record_result(journal: Journal, name: str, result: StoredResult) -> None:
