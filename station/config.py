@@ -27,6 +27,11 @@ class Site(SiteFile):
     """A checked site file whose paths are absolute."""
 
     path: Path
+    input_faults: tuple[str, ...] = ()  # why optional files cannot be used; see processing/usable_inputs.py
+
+    def last_good(self, key: str) -> Path:
+        """Return the path of the last good copy of an optional file: `areas`, `flags` or `stable`."""
+        return self.station.data / "last_good" / key
 
     @property
     def grid_cells(self) -> Grid:
@@ -149,7 +154,7 @@ def read_site(path: str | Path) -> Site:
     except (tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as error:
         raise ConfigError(f"{path}: not valid TOML: {error}") from error
     try:
-        site = Site.model_validate({**document, "path": path})
+        site = Site.model_validate({**document, "path": path, "input_faults": ()})
     except ValidationError as error:
         faults = [_explain(fault) for fault in error.errors()]
         raise ConfigError("\n".join([f"{path}: {len(faults)} to fix", *faults])) from error
@@ -186,13 +191,16 @@ def _required_files(site: Site) -> list[tuple[str, Path]]:
         files.append(("map.pop", site.map.pop))
     if isinstance(site.reference.scans, Path):
         files.append(("reference.scans", site.reference.scans))
-    if isinstance(site.adjustment.stable, Path):
-        files.append(("adjustment.stable", site.adjustment.stable))
-    if site.areas:
-        files.append(("areas.file", site.areas.file))
-    if site.flags:
-        files.append(("flags.file", site.flags.file))
-    return files
+    optional = [
+        ("stable", "adjustment.stable", site.adjustment.stable),
+        ("areas", "areas.file", site.areas and site.areas.file),
+        ("flags", "flags.file", site.flags and site.flags.file),
+    ]
+    return files + [
+        (name, path)
+        for key, name, path in optional
+        if isinstance(path, Path) and not site.last_good(key).is_file()
+    ]
 
 
 def _explain(fault: Any) -> str:  # noqa: ANN401 - pydantic's ErrorDetails, a plain dict

@@ -26,7 +26,9 @@ def status(site: Site) -> Status:
 
     Works with or without a running service. Raises StoreError if the journal cannot be read.
     """
-    data = site.station.data
+    from station.processing.usable_inputs import usable_site  # noqa: PLC0415 - a second of imports
+
+    site, data = usable_site(site), site.station.data
     with Journal(data / "journal.sqlite", read_only=True) as journal:
         queue = _queue_status(site, journal)
         counts = journal.counts()
@@ -49,7 +51,10 @@ def status(site: Site) -> Status:
 
 
 def queue_status(site: Site) -> Status:
-    """Return the part of `status` that needs no series: waiting scans, scans set aside, faults."""
+    """Return the part of `status` that needs no series: waiting scans, scans set aside, faults.
+
+    `input_faults` of the site are among the faults.
+    """
     with Journal(site.station.data / "journal.sqlite", read_only=True) as journal:
         return _queue_status(site, journal)
 
@@ -71,7 +76,15 @@ def _queue_status(site: Site, journal: Journal) -> Status:
         {"scan": name, "state": "new", "for": new_scans_wait_for, "next_try": None}
         for name in journal.unrecorded(names)
     ]
-    faults = (inbox_problem, _disk_space_problem(site), clock_problem(site.station.data, time.time()))
+    from station.processing.usable_inputs import weather_fault  # noqa: PLC0415 - as in `status`
+
+    faults = (
+        inbox_problem,
+        _disk_space_problem(site),
+        clock_problem(site.station.data, time.time()),
+        *site.input_faults,
+        weather_fault(site),
+    )
     return {"waiting": waiting, "set_aside": set_aside, "faults": [fault for fault in faults if fault]}
 
 

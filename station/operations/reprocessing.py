@@ -46,6 +46,7 @@ from station.processing.scan_tasks import (
     series_for,
 )
 from station.processing.staleness import Plan, Task, plan_reprocessing, usable_scans
+from station.processing.usable_inputs import usable_site
 from station.readers.scan import utc_interval
 from station.readers.sop import valid_sop
 from station.service.worker import Worker, record_result
@@ -63,7 +64,9 @@ def reprocess(
     The status is 3 if a scan is missing or was set aside, 75 if interrupted; finished epochs are kept. Raises
     NotReadyError if the service is running, or if the reference has to be rebuilt and its scans are missing.
     """
-    data = site.station.data
+    site, data = usable_site(site, save=not dry_run), site.station.data
+    for fault in site.input_faults:
+        report(f"fault: {fault}")
     if dry_run:
         with Journal(data / "journal.sqlite", read_only=True) as journal:
             return Reprocessing(site, journal, report, threading.Event()).dry_run(_seconds(span))

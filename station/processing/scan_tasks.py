@@ -39,6 +39,7 @@ from station.processing.pipeline import (
 )
 from station.processing.previews import PreviewRecorder
 from station.processing.scan_inputs import ScanInputs, load_scan_inputs
+from station.processing.usable_inputs import usable_site
 from station.products.overview import Overview
 from station.quantities import Bools, Measurement, Quality, Reference, ScanGeometry
 from station.queries.aggregates import LEVERAGE_VARIABLES
@@ -223,7 +224,7 @@ def check_header(site: Site, scan: ScanFile, progress: Progress) -> None:
 
 def dry_run(site: Site, scan: ScanFile, progress: Progress) -> tuple[str, str, dict[str, float | str]]:
     """Return verdict, reason and metrics of a scan; nothing is stored."""
-    began_s = time.monotonic()
+    began_s, site = time.monotonic(), usable_site(site)
     reference = None if isinstance(site.reference.scans, Path) else load_reference(site)
     epoch = _compute_epoch(site, scan, "", reference, progress, is_dry_run=True, wait_for_weather=False)
     return epoch.verdict, epoch.verdict_reason, _log_metrics(epoch, time.monotonic() - began_s)

@@ -62,6 +62,7 @@ from station.processing.store_tasks import (
     delete_expired,
     update_series,
 )
+from station.processing.usable_inputs import with_usable_inputs
 from station.service.background_compaction import BackgroundCompaction
 from station.service.publishing import publish
 from station.service.retention import apply_retention, expired_scans
@@ -101,6 +102,7 @@ class Worker:
         self._processed: dict[str, ScanFile] = {}
         self._last_verified_s = -math.inf
         self._reported_outdated = 0
+        self._reported_faults: tuple[str, ...] = ()
         self._compaction = BackgroundCompaction(site, on_compacted)
 
     def process(self, scan: ScanFile) -> bool:
@@ -308,6 +310,10 @@ class Worker:
         except (StationError, RuntimeError) as error:
             log.warning("%s", logfmt(page="failed", reason=error))
             return
+        if published.input_faults != self._reported_faults:
+            for fault in published.input_faults:
+                log.warning("%s", logfmt(input="broken", reason=fault))
+            self._reported_faults = published.input_faults
         if published.warning:
             log.warning("%s", logfmt(scan=name, moved=published.warning))
         if published.fault:
@@ -451,7 +457,8 @@ class Worker:
         """Run a task in a worker process, limited to `timeout_s` per scan; without scans, unlimited."""
         items = [item for arg in args for item in (arg if isinstance(arg, list) else [arg])]
         scan_count = sum(isinstance(item, ScanFile) for item in items)
-        return isolation.run_isolated(
+        result: T = isolation.run_isolated(
+            with_usable_inputs,
             task,
             self._site,
             *args,
@@ -460,6 +467,7 @@ class Worker:
             on_progress=self._on_progress,
             should_stop=self._should_stop,
         )
+        return result
 
 
 def _assessed_content(entry: Entry | None) -> tuple[str, str] | None:

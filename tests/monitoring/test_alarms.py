@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import subprocess
 import sys
 import time
@@ -329,7 +330,8 @@ def test_digest_is_sent_once(make_site, credentials, webhook):
 
 def test_change_is_assessed_once_per_epoch_and_always_at_the_newest(make_site, tmp_path, write_series):
     """A step at hour 20; all scans until hour 40 are processed between two evaluations."""
-    (tmp_path / "areas.geojson").write_text("{}")
+    triangle = {"type": "Polygon", "coordinates": [[[0, 0], [500, 0], [0, 500], [0, 0]]]}
+    (tmp_path / "areas.geojson").write_text(json.dumps(triangle))
     rules = f'[areas]\nfile = "areas.geojson"\n[alarms]\n{NO_RULES}[alarms.change]\nareas = ["tongue"]\n'
     site = make_site(more=rules)
     hours = np.arange(40)

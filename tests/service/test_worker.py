@@ -40,7 +40,7 @@ class PretendingWorker(Worker):
         if task.__name__ == "build_reference_version":
             self.references.append([scan.name for scan in args[0]])
         results = {"update_series": 0, "delete_expired": (), "late_inputs": (), "_count_outdated": 0}
-        nothing = SimpleNamespace(warning="", fault="", damaged=(), new_checksums={})
+        nothing = SimpleNamespace(warning="", fault="", input_faults=(), damaged=(), new_checksums={})
         return results.get(task.__name__, nothing)
 
     def measure(self, scan, history):
@@ -222,7 +222,7 @@ class Station:
 def simulated(tmp_path_factory):
     """Return the folder of a station to which no scan has arrived; its reference needs two."""
     isolation.start_forkserver((*isolation.PRELOAD, "pytest"))  # workers load the main module, pytest
-    folder = build(tmp_path_factory.mktemp("tiny") / "station", hours=3, method="joint")
+    folder = build(tmp_path_factory.mktemp("tiny") / "station", hours=4, method="joint")
     path = folder / "site.toml"
     path.write_text(path.read_text() + "[products]\npage = false\n")
     return folder
@@ -309,3 +309,29 @@ def test_scan_refused_by_a_wrong_setting_is_stored_once_that_is_corrected(make_s
     station.edit("range_max_m = 300 # ", "range_max_m = ")
     station.finish()
     assert station.row(0).state is State.STORED
+
+
+@integration
+def test_broken_optional_inputs_change_no_value(make_station):
+    """Areas, flags and stable ground break, and the weather log becomes a pipe, while the service runs."""
+    undisturbed, station = make_station(), make_station()
+    for each in (undisturbed, station):
+        (each.folder / "flags.csv").write_text("from,to,reason\n")
+        each.edit("[products]", '[flags]\nfile = "flags.csv"\n[products]')
+    for hour in range(3):
+        undisturbed.drop(hour)
+        undisturbed.finish()
+        if hour == 2:
+            for name in ("areas.geojson", "flags.csv", "stable.geojson"):
+                (station.folder / name).write_text("{")
+        station.drop(hour)
+        station.finish()
+    assert_same_store(station, undisturbed)
+    assert len(station.worker._reported_faults) == 3
+    (station.folder / "weather.dat").unlink()
+    os.mkfifo(station.folder / "weather.dat")
+    station.drop(3)
+    os.utime(station.path(3), (1.7e9, 1.7e9))  # it arrived long ago: weather is not waited for
+    station.finish()
+    assert (station.row(3).state, station.row(3).verdict) == (State.STORED, "degraded")
+    assert "weather unusable: weather.dat cannot be read: it is a pipe" in station.row(3).reason
