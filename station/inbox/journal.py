@@ -395,11 +395,11 @@ class Journal:
     def unsettled(self) -> dict[str, float | None]:
         """Return the starts [s], if known, of scans that will be judged soon, for which others may wait."""
         query = (
-            "SELECT name, start_utc_s FROM scan WHERE (state = 'waiting' AND changed_utc_s > ?)"
+            "SELECT name, start_utc_s FROM scan WHERE (state = 'waiting' AND abs(changed_utc_s - ?) < ?)"
             " OR (state = 'later' AND attempts < ?) ORDER BY name"
         )
         with self._store_errors():
-            parameters = self._now_s() - SETTLING_S, SETTLING_ATTEMPTS
+            parameters = self._now_s(), SETTLING_S, SETTLING_ATTEMPTS
             return dict(self._connection.execute(query, parameters).fetchall())
 
     def starting_at(self, start_utc_s: float) -> list[str]:
