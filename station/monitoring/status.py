@@ -33,6 +33,7 @@ def status(site: Site) -> Status:
         queue = _queue_status(site, journal)
         counts = journal.counts()
         last = journal.last_stored()
+        queued = [entry.epoch for entry in journal.waiting() if entry.epoch]
     return {
         "station": site.station.id,
         "name": site.station.name,
@@ -43,7 +44,7 @@ def status(site: Site) -> Status:
         "last": _last_scan(last) if last else None,
         "moved": _last_pose_step(site),
         "alarms": active(data),
-        "stale": _count_outdated(site),
+        "stale": _count_outdated(site, queued),
         "series": str(data / "series.nc") if (data / "series.nc").exists() else None,
         "disk_free_gb": round(shutil.disk_usage(data).free / 1e9, 2) if data.is_dir() else None,
         "faults": [*queue["faults"], *filter(None, [_log_clock_problem(site)])],
@@ -162,14 +163,14 @@ def _log_clock_problem(site: Site) -> str:
         return str(error)
 
 
-def _count_outdated(site: Site) -> int | None:
+def _count_outdated(site: Site, queued: list[str]) -> int | None:
     """Return the number of epochs whose settings are outdated; None if it cannot be determined now."""
     if not (site.station.data / "series.nc").is_file():
         return 0
     from station.processing.staleness import count_outdated  # noqa: PLC0415 - a second of imports
 
     try:
-        return count_outdated(site)
+        return count_outdated(site, queued)
     except StationError:
         return None
 

@@ -181,7 +181,8 @@ class Daemon:
             raise
         except Exception as bug:  # a bug triggered by one scan must not block the others
             log.exception(logfmt(scan=scan.name, verdict="later", reason="a bug: please report it"))
-            reason = f"a bug: {type(bug).__name__}: {bug}"[:500]
+            cause = f"{type(bug).__name__}: {bug}".strip().splitlines()[-1]  # of a traceback the last line
+            reason = f"a bug: {cause}"[:500]
             self._open_journal().record_failure(scan.name, reason, self._site.judging_conditions)
 
     def _housekeeping(self, worker: ScanProcessor) -> None:

@@ -341,7 +341,8 @@ class Worker:
 
     def _report_outdated(self) -> None:
         """Log the number of epochs with outdated settings, whenever it changes."""
-        count = self.run(_count_outdated)
+        queued = [entry.epoch for entry in self._journal.waiting() if entry.epoch]
+        count = self.run(_count_outdated, queued)
         if count and count != self._reported_outdated:
             reason = "outdated SOP, setting, flag or reference: run station reprocess"
             log.warning("%s", logfmt(epochs=count, reason=reason))
@@ -525,9 +526,9 @@ def _require_same_grid(site: Site) -> None:
         )
 
 
-def _count_outdated(site: Site, progress: Progress) -> int:
+def _count_outdated(site: Site, queued: list[str], progress: Progress) -> int:
     progress()
-    return count_outdated(site)
+    return count_outdated(site, queued)
 
 
 def _log_result(name: str, result: StoredResult) -> None:

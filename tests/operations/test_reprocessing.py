@@ -18,6 +18,7 @@ from station.errors import ConfigError, NotReadyError
 from station.inbox.journal import Journal, State
 from station.inbox.lock import exclusive_lock
 from station.inbox.scan_files import scan_file
+from station.monitoring.status import status
 from station.operations import reprocessing
 from station.operations.batch import process_scans
 from station.operations.reprocessing import Reprocessing, reprocess
@@ -370,6 +371,15 @@ def test_late_log_and_weather_requeue_their_scan(processed, tmp_path):
         worker.run_maintenance()
         assert journal.waiting() == []
     assert differences(read_series(folder), expected) == []
+
+
+@integration
+def test_epoch_that_waits_to_be_processed_again_is_not_outdated(folder):
+    site = edited_site(folder, ("min_points = 1", "min_points = 2"))
+    with Journal(site.station.data / "journal.sqlite") as journal:
+        assert status(site)["stale"] == 5
+        journal.requeue([f"{LAST}.laz"])
+        assert status(site)["stale"] == 4
 
 
 @integration

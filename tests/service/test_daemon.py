@@ -182,6 +182,19 @@ def test_bad_scans_and_bugs_do_not_stop_the_service(write_site, start):
 
 
 @pytest.mark.integration
+def test_retry_beside_the_running_service(write_site, start):
+    path = write_site(settle_s=0.0)
+    drop(path, "261120_bad.laz")
+    start(path, period_s=0.2)
+    wait_for(lambda: "process 261120_bad.laz" in calls(path))
+    result = subprocess.run(
+        [sys.executable, "-m", "station", "retry", str(path)], capture_output=True, text=True, check=True
+    )
+    assert result.stdout == "261120_bad.laz: queued\n1 scans, tried again within a minute\n"
+    wait_for(lambda: calls(path).count("process 261120_bad.laz") == 2)
+
+
+@pytest.mark.integration
 def test_bug_in_housekeeping_is_logged_and_survived(write_site, start):
     path = write_site(settle_s=0.0)
     (path.parent / "data").mkdir(exist_ok=True)
