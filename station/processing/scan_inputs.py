@@ -98,11 +98,7 @@ def load_scan_inputs(
     faults = _static_tilt_faults(site, log)
     tilt_offset = read_tilt_offset(site, sop_id)
     if tilt_offset is None:
-        if waiting_before and site.inclination and site.inclination.mode == "relative" and sop.scan is None:
-            raise NotReadyError(
-                f"waits for {waiting_before}: the first scan under an SOP defines its tilt offset"
-            )
-        tilt_offset = _find_tilt_offset(site, sop, reader, log, track, warnings)
+        tilt_offset = _find_tilt_offset(site, sop, reader, log, track, warnings, waiting_before)
         # That of an absolute sensor is zero and need not be saved.
         if save_tilt_offset and tilt_offset is not None and tilt_offset != NO_CYCLIC_ERROR:
             write_tilt_offset(site, sop_id, tilt_offset)
@@ -380,15 +376,21 @@ def _find_tilt_offset(
     log: InclinationLog | None,
     track: AzimuthTrack | None,
     warnings: list[str],
+    waiting_before: str,
 ) -> CyclicError | None:
     """Return the tilt offset contained in an SOP: the tilt of the scan from which the SOP was determined.
 
-    Without `sop.scan`, that is the scan at hand, the first one processed under the SOP.
+    Without `sop.scan`, that is the scan at hand, the first one under the SOP. Raises NotReadyError if an
+    earlier one, `waiting_before`, is still to be processed.
     """
     if site.inclination is None:
         return None
     if site.inclination.mode == "absolute":
         return NO_CYCLIC_ERROR
+    if sop.scan is None and waiting_before:
+        raise NotReadyError(
+            f"waits for {waiting_before}: the first scan under an SOP defines its tilt offset"
+        )
     if sop.scan is not None and sop.scan != reader.path.stem:
         log, track = _load_earlier_log(site, sop.scan)
         if log is None:
