@@ -23,6 +23,7 @@ Checksums = dict[str, str]  # SHA-256 by file, relative to the data folder
 
 # Source files of the series: beyond the limit of open files some readers return wrong data.
 MAX_SOURCES = 250
+MAX_STORE_TASK_S = 12 * 3600.0  # verifying terabytes takes hours; a task beyond this is in an endless loop
 LOWEST_PRIORITY = 19  # nice value
 MAX_UNCOMPACTED = 48  # of closed days, before they are compacted during a backlog
 

@@ -11,20 +11,20 @@ import logging
 import math
 import signal
 import time
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from dataclasses import dataclass
 from queue import Empty, SimpleQueue
 from typing import TYPE_CHECKING, Protocol
 
 from station.config import Site, read_site
-from station.errors import ConfigError, StationError
+from station.errors import ConfigError, NotReadyError, StationError
 from station.inbox.inbox import Inbox, ScanFile
 from station.inbox.journal import Journal, State
 from station.inbox.lock import exclusive_lock
 from station.logs import log_to_stderr, logfmt
 from station.monitoring.metrics import Metrics
 from station.monitoring.preconditions import EARLIEST_S, clock_problem, require_disk_space
-from station.processing import isolation
+from station.processing import fork_server, isolation
 from station.readers.scan import suffixes
 from station.service.inbox_watcher import InboxWatcher
 from station.service.scheduler import JobScheduler, LoopEvent
@@ -57,6 +57,7 @@ class LoopTiming:
     debounce_s: float = 1.0  # minimum between two polls, however many events arrive
     grace_s: float = 60.0  # for the running scan when the service is to stop
     first_pause_s: float = 5.0  # after a store error; doubled up to period_s
+    give_up_s: float = 300.0  # without any worker process, after which systemd is to restart the service
     clock_wait_s: float = 3600.0  # for a doubtful clock; an impossible one is waited for without limit
 
 
@@ -73,7 +74,8 @@ def run(
     """
     log_to_stderr()
     if make_worker is None:
-        isolation.start_forkserver()  # the fork server imports modules while this process does
+        with suppress(OSError):  # the first scan tries again
+            fork_server.ensure_running()  # it imports modules while this process does
         from station.service.worker import Worker  # noqa: PLC0415 - a second of imports that tests avoid
 
         make_worker = Worker
@@ -125,7 +127,7 @@ class Daemon:
         self._events.put(LoopEvent.STOP)
 
     def serve(self) -> None:
-        """Run the loop until `stop` is called."""
+        """Run the loop until `stop` is called; raise NotReadyError if no work can be started for long."""
         self._wait_for_clock()
         with exclusive_lock(self._site.station.data), self._metrics.serving(), self._exit_stack:
             self._exit_stack.callback(self._close_components)
@@ -136,6 +138,7 @@ class Daemon:
                 except StationError as error:
                     wait_s = self._pause(error)
                     self._systemd.ready()  # up although paused: a restart would gain nothing
+                self._require_workers()
                 self._wait(wait_s)
             log.info(logfmt(service="stopped"))
 
@@ -268,6 +271,12 @@ class Daemon:
             self._open_components = None
 
     # ---- faults, waiting, stopping
+
+    def _require_workers(self) -> None:
+        """Raise NotReadyError if no worker process could be started for `give_up_s`."""
+        lost_s = isolation.seconds_without_worker()
+        if lost_s > self._timing.give_up_s and not self._is_stopping():
+            raise NotReadyError(f"no worker process could be started for {lost_s:.0f} s: restart the service")
 
     def _pause(self, error: StationError) -> float:
         """Log the first of consecutive faults; return the pause before the next attempt [s]."""

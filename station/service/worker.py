@@ -49,6 +49,7 @@ from station.processing.scan_tasks import (
 )
 from station.processing.staleness import count_outdated, late_inputs
 from station.processing.store_tasks import (
+    MAX_STORE_TASK_S,
     MAX_UNCOMPACTED,
     Checksums,
     compact_epochs,
@@ -390,7 +391,7 @@ class Worker:
         return find_scan(self._site, name, entry.start_utc_s if entry else None)
 
     def run(self, task: Callable[..., T], *args: object) -> T:
-        """Run a task in a worker process, limited to `timeout_s` per scan; without scans, unlimited."""
+        """Run a task in a worker process, limited to `timeout_s` per scan; without scans, to hours."""
         items = [item for arg in args for item in (arg if isinstance(arg, list) else [arg])]
         scan_count = sum(isinstance(item, ScanFile) for item in items)
         return isolation.run_isolated(
@@ -398,7 +399,7 @@ class Worker:
             self._site,
             *args,
             memory_gb=self._site.service.memory_gb,
-            timeout_s=self._site.scans.timeout_s * scan_count if scan_count else math.inf,
+            timeout_s=self._site.scans.timeout_s * scan_count or MAX_STORE_TASK_S,
             on_progress=self._on_progress,
             should_stop=self._should_stop,
         )

@@ -15,14 +15,23 @@ from contextlib import suppress
 from pathlib import Path
 
 import pytest
+from support.fake_service import FakeWorker
 
-from station.errors import ConfigError
+from station.errors import ConfigError, NotReadyError
 from station.inbox.journal import Journal, State
 from station.monitoring.status import status
 from station.service import daemon
 
 FAKE = Path(__file__).parents[1] / "support" / "fake_service.py"
 FIRST, SECOND, THIRD = "261121_010000.laz", "261121_020000.laz", "261121_030000.laz"
+
+
+def test_service_without_worker_processes_ends_for_systemd(write_site, monkeypatch):
+    """A restart gives it a new fork server and a new place in its control group."""
+    monkeypatch.setattr(daemon.isolation, "seconds_without_worker", lambda: 301.0)
+    service = daemon.Daemon(write_site(), FakeWorker, daemon.LoopTiming())
+    with pytest.raises(NotReadyError, match="no worker process could be started for 301 s"):
+        service.serve()
 
 
 class Service:
