@@ -136,7 +136,7 @@ def _last_pose_step(site: Site) -> str:
 
     try:
         return latest_step(site) if (site.station.data / "series.nc").is_file() else ""
-    except StoreError as error:
+    except (StoreError, ValueError) as error:
         return str(error)
 
 
@@ -145,7 +145,7 @@ def _log_clock_problem(site: Site) -> str:
 
     try:
         return log_clock_offset(site) if site.adjusts and (site.station.data / "series.nc").is_file() else ""
-    except StoreError as error:
+    except (StoreError, ValueError) as error:  # of a text, if series.nc is damaged
         return str(error)
 
 
@@ -157,7 +157,7 @@ def _count_outdated(site: Site) -> int | None:
 
     try:
         return count_outdated(site)
-    except StationError:
+    except (StationError, ValueError):
         return None
 
 

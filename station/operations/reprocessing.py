@@ -35,7 +35,7 @@ from station.processing.reference_tasks import (
     scans_for_version,
     update_reference_version,
 )
-from station.processing.scan_inputs import load_scan_inputs, read_tilt_offset, sop_identity
+from station.processing.scan_inputs import load_scan_inputs, sop_identity
 from station.processing.scan_tasks import Progress as Tick
 from station.processing.scan_tasks import (
     Rejected,
@@ -46,6 +46,7 @@ from station.processing.scan_tasks import (
     series_for,
 )
 from station.processing.staleness import Plan, Task, plan_reprocessing, usable_scans
+from station.processing.tilt_offsets import read_tilt_offset
 from station.readers.scan import utc_interval
 from station.readers.sop import valid_sop
 from station.service.worker import Worker, record_result

@@ -26,10 +26,10 @@ from station.inbox.inbox import ScanFile
 from station.inbox.journal import Entry
 from station.processing.scan_inputs import (
     air_from_log,
-    read_tilt_offset,
     scanner_height_m,
     sop_identity,
 )
+from station.processing.tilt_offsets import read_tilt_offset
 from station.quantities import Air
 from station.readers.flags import read_flags, reasons_for
 from station.readers.sop import valid_sop

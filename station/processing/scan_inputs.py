@@ -14,10 +14,10 @@ from pathlib import Path
 import numpy as np
 from pyproj import CRS, Transformer
 
-from station.archive.atomic_files import atomic_write
 from station.config import Site
 from station.errors import ConfigError, NotReadyError, ScanError
 from station.processing.pipeline import AdjustmentInputs, Pose
+from station.processing.tilt_offsets import read_tilt_offset, stored_tilt_offsets, write_tilt_offset
 from station.quantities import (
     VERTICAL_AXIS,
     Air,
@@ -96,7 +96,9 @@ def load_scan_inputs(
     faults = _static_tilt_faults(site, log)
     tilt_offset = read_tilt_offset(site, sop_id)
     if tilt_offset is None:
-        tilt_offset = _find_tilt_offset(site, sop, reader, log, track, warnings)
+        tilt_offset = stored_tilt_offsets(site).get(sop_id)
+        if tilt_offset is None:
+            tilt_offset = _find_tilt_offset(site, sop, reader, log, track, warnings)
         # That of an absolute sensor is zero and need not be saved.
         if save_tilt_offset and tilt_offset is not None and tilt_offset != NO_CYCLIC_ERROR:
             write_tilt_offset(site, sop_id, tilt_offset)
@@ -343,28 +345,6 @@ def _tilt_record(
     if track is None:
         return inclination.mean_tilt(tilt_record)
     return tilt_record
-
-
-def _tilt_offset_file(site: Site, sop_id: str) -> Path:
-    return site.station.data / "sop_tilt_offset" / f"{sop_id}.json"
-
-
-def read_tilt_offset(site: Site, sop_id: str) -> CyclicError | None:
-    """Return the saved tilt offset of an SOP, None if there is none yet."""
-    if site.inclination is None or site.inclination.mode == "absolute":
-        return None
-    path = _tilt_offset_file(site, sop_id)
-    if not path.is_file():
-        return None
-    content = json.loads(path.read_text())
-    return CyclicError(tuple(content["roll_rad"]), tuple(content["pitch_rad"]))
-
-
-def write_tilt_offset(site: Site, sop_id: str, tilt_offset: CyclicError) -> None:
-    """Save the tilt offset of an SOP."""
-    path = _tilt_offset_file(site, sop_id)
-    with atomic_write(path) as tmp_path:
-        tmp_path.write_text(json.dumps(asdict(tilt_offset)))
 
 
 def _find_tilt_offset(

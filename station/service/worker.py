@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TypeVar
 
 from station.archive.reference_files import valid_versions
-from station.archive.series.index import series_in
+from station.archive.series.index import stored_series
 from station.config import Site
 from station.errors import ConfigError, NotReadyError, ScanError, StationError, StoreError
 from station.inbox.inbox import ScanFile
@@ -214,7 +214,12 @@ class Worker:
             log.warning("%s", logfmt(digest="failed", reason=error))
 
     def run_maintenance(self) -> None:
-        """Delete expired files, requeue scans with late inputs, report outdated epochs, apply retention."""
+        """Rebuild damaged files, delete expired ones, requeue scans with late inputs, report outdated epochs.
+
+        Then apply retention.
+        """
+        if holds_epochs(self._series):
+            self._with_repair(update_series)
         self._journal.drop_checksums(self._with_repair(delete_expired))
         affected = self._with_repair(late_inputs, self._journal.rows(State.STORED))
         names = [name for name in affected if (self._site.scans.inbox / name).is_file()]
@@ -431,10 +436,10 @@ def record_result(journal: Journal, name: str, result: StoredResult) -> None:
 
 def _require_same_grid(site: Site) -> None:
     """Raise ConfigError if the stored series has another grid: a series has only one."""
-    try:
-        stored = series_in(site.station.data).grid
-    except StoreError:  # nothing stored yet, or to be rebuilt
+    series = stored_series(series_for(site))
+    if series is None:
         return
+    stored = series.grid
     configured = site.grid_cells
     deviation_m = max(
         abs(stored_m - configured_m)

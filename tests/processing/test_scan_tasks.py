@@ -14,7 +14,7 @@ from station.config import read_site
 from station.errors import ConfigError, NotReadyError, ScanError
 from station.inbox.scan_files import scan_file
 from station.operations import site_check
-from station.processing import provenance, reference_tasks, scan_tasks
+from station.processing import provenance, reference_tasks, scan_tasks, tilt_offsets
 from station.processing.pipeline import to_map
 from station.processing.scan_inputs import load_scan_inputs, pressure_fault
 from station.quantities import Air, Quality
@@ -65,6 +65,28 @@ def log_file(folder, scan=1):
 def test_complete_inputs_give_verdict_good(folder):
     result, _ = process(folder)
     assert (result.verdict, result.reason) == ("good", "")
+
+
+@pytest.mark.parametrize(
+    "content",
+    ["one digit", *(pytest.param(text, marks=pytest.mark.integration) for text in ("", "[]", None))],
+)
+def test_damaged_tilt_offset_is_restored_from_the_epochs(folder, content):
+    process(folder, scan=0)
+    (path,) = (folder / "data" / "sop_tilt_offset").glob("*.json")
+    intact = path.read_text()
+    path.unlink()
+    if content is not None:
+        path.write_text(content if content != "one digit" else intact.replace("0.000", "0.001", 1))
+        assert path.read_text() != intact
+        assert tilt_offsets.damaged_tilt_offsets(folder / "data") == [path]
+    site = edited_site(folder)
+    scan = scan_file(site, max(site.scans.inbox.glob("*.laz")))
+    with scan_tasks.open_scan_for(site, scan.path) as reader:
+        start, end, _ = utc_interval(reader, site.scans.name)
+        load_scan_inputs(site, reader, scan.log, start, end)
+    assert path.read_text() == intact
+    assert tilt_offsets.damaged_tilt_offsets(folder / "data") == []
 
 
 def test_line_times_match_the_shots(folder):

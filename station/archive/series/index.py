@@ -21,12 +21,15 @@ from station.archive.epochs import (
     compacted_revision,
     epoch_files,
     epochs_in_file,
+    list_files,
     parse_epoch_filename,
 )
 from station.archive.netcdf_layout import Series
 from station.archive.schema import TEXT_LENGTH
 from station.errors import StoreError
 from station.quantities import Grid
+
+MAX_TRIED = 5  # files of the store, if the newest are damaged
 
 
 def list_epochs(series: Series) -> list[EpochRef]:
@@ -146,7 +149,28 @@ def series_in(site_or_folder: str | Path) -> Series:
     """Return the store of a site file or data folder; raise StoreError if there is no series yet."""
     folder = data_folder(site_or_folder)
     try:
-        with netCDF4.Dataset(folder / "series.nc") as file:
+        return _read_header(folder, folder / "series.nc")
+    except StoreError as error:
+        raise StoreError(f"{folder}: holds no readable series (see station status): {error}") from error
+
+
+def stored_series(series: Series) -> Series | None:
+    """Return the station, grid and map of the stored epochs; None if nothing readable is stored.
+
+    They are read from the newest files of epochs, because a derived file may be damaged.
+    """
+    for name in sorted(list_files(series), key=lambda name: Path(name).name, reverse=True)[:MAX_TRIED]:
+        try:
+            return _read_header(series.folder, series.folder / name)
+        except StoreError:
+            continue
+    return None
+
+
+def _read_header(folder: Path, path: Path) -> Series:
+    """Return the store in a folder as one of its files describes it; raise StoreError if that is damaged."""
+    try:
+        with netCDF4.Dataset(path) as file:
             x_m, y_m = (np.asarray(file[axis][:], dtype=np.float64) for axis in "xy")
             x_bounds, y_bounds = (file[f"{axis}_bnds"][0] for axis in "xy")
             west_m, north_m = float(x_bounds.min()), float(y_bounds.max())
@@ -154,4 +178,4 @@ def series_in(site_or_folder: str | Path) -> Series:
             crs = str(file["crs"].crs_wkt) if "crs" in file.variables else None
             return Series(folder, str(file.station_id), grid, crs)
     except (OSError, RuntimeError, KeyError, IndexError, AttributeError) as error:
-        raise StoreError(f"{folder}: holds no readable series (see station status): {error}") from error
+        raise StoreError(f"{path}: cannot be read: {error}") from error
