@@ -9,10 +9,12 @@ from __future__ import annotations
 import faulthandler
 import logging
 import math
+import os
 import signal
 import time
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass
+from pathlib import Path
 from queue import Empty, SimpleQueue
 from typing import TYPE_CHECKING, Protocol
 
@@ -20,7 +22,7 @@ from station.config import Site, read_site
 from station.errors import ConfigError, NotReadyError, StationError
 from station.inbox.inbox import Inbox, ScanFile
 from station.inbox.journal import Journal, State
-from station.inbox.lock import exclusive_lock
+from station.inbox.lock import LockedFolder, exclusive_lock, require_known
 from station.logs import log_to_stderr, logfmt
 from station.monitoring.metrics import Metrics
 from station.monitoring.preconditions import EARLIEST_S, clock_problem, require_disk_space
@@ -32,7 +34,6 @@ from station.service.systemd import SystemdNotifier
 
 if TYPE_CHECKING:
     from collections.abc import Callable
-    from pathlib import Path
 
 log = logging.getLogger("station")
 
@@ -110,6 +111,7 @@ class Daemon:
         self._is_overdue = False
         self._site_file_fault = ""  # why the last reload was rejected
         self._exit_stack = ExitStack()
+        self._folder: LockedFolder
         self._journal: Journal | None = None
         self._open_components: tuple[ScanProcessor, Inbox, InboxWatcher, JobScheduler] | None = None
         self._is_reconciled = False
@@ -127,9 +129,12 @@ class Daemon:
         self._events.put(LoopEvent.STOP)
 
     def serve(self) -> None:
-        """Run the loop until `stop` is called; raise NotReadyError if no work can be started for long."""
+        """Run the loop until `stop` is called; raise NotReadyError if only a restart helps."""
         self._wait_for_clock()
-        with exclusive_lock(self._site.station.data), self._metrics.serving(), self._exit_stack:
+        data = self._site.station.data
+        if state_folder := os.environ.get("STATE_DIRECTORY", "").partition(":")[0]:
+            require_known(data, Path(state_folder))
+        with exclusive_lock(data) as self._folder, self._metrics.serving(), self._exit_stack:
             self._exit_stack.callback(self._close_components)
             while not self._is_stopping():
                 try:
@@ -138,7 +143,7 @@ class Daemon:
                 except StationError as error:
                     wait_s = self._pause(error)
                     self._systemd.ready()  # up although paused: a restart would gain nothing
-                self._require_workers()
+                self._require_no_restart()
                 self._wait(wait_s)
             log.info(logfmt(service="stopped"))
 
@@ -150,6 +155,7 @@ class Daemon:
         if LoopEvent.RELOAD in self._due:
             self._due.discard(LoopEvent.RELOAD)
             self._reload()
+        self._folder.require_same()
         require_disk_space(self._site)
         worker, inbox, watcher, scheduler = self._components()
         watcher.ensure_watching()
@@ -226,6 +232,7 @@ class Daemon:
             site,
             journal,
             on_progress=self._systemd.watchdog,
+            before_task=self._folder.require_same,
             should_stop=lambda: time.monotonic() > self._stop_deadline_s,
             on_compacted=lambda: self.post(LoopEvent.COMPACTED),
             in_service=True,
@@ -272,11 +279,15 @@ class Daemon:
 
     # ---- faults, waiting, stopping
 
-    def _require_workers(self) -> None:
-        """Raise NotReadyError if no worker process could be started for `give_up_s`."""
+    def _require_no_restart(self) -> None:
+        """Raise NotReadyError if only a restart by systemd helps."""
+        if self._is_stopping():
+            return
         lost_s = isolation.seconds_without_worker()
-        if lost_s > self._timing.give_up_s and not self._is_stopping():
+        if lost_s > self._timing.give_up_s:
             raise NotReadyError(f"no worker process could be started for {lost_s:.0f} s: restart the service")
+        if self._folder.is_mounted_anew():
+            raise NotReadyError(f"{self._site.station.data} was mounted anew: restart the service")
 
     def _pause(self, error: StationError) -> float:
         """Log the first of consecutive faults; return the pause before the next attempt [s]."""

@@ -76,9 +76,12 @@ class Worker:
         on_progress: Progress = lambda: None,
         should_stop: Callable[[], bool] = lambda: False,
         on_compacted: Callable[[], None] = lambda: None,
+        before_task: Callable[[], None] = lambda: None,
         in_service: bool = False,
     ) -> None:
         """`on_compacted` is called, in another thread, when `publish_compacted` has something to do.
+
+        `before_task` raises StoreError if the data folder cannot be used now.
 
         `in_service`: scans may wait for weather, and one with a new mtime but the same bytes is not processed
         again.
@@ -91,6 +94,7 @@ class Worker:
         self._journal = journal
         self._on_progress = on_progress
         self._should_stop = should_stop
+        self._before_task = before_task
         self._in_service = in_service
         self._processed: dict[str, ScanFile] = {}
         self._last_verified_s = -math.inf
@@ -398,6 +402,7 @@ class Worker:
     def run(self, task: Callable[..., T], *args: object) -> T:
         """Run a task in a worker process, limited to `timeout_s` per scan; without scans, to hours."""
         items = [item for arg in args for item in (arg if isinstance(arg, list) else [arg])]
+        self._before_task()
         scan_count = sum(isinstance(item, ScanFile) for item in items)
         return isolation.run_isolated(
             task,

@@ -19,6 +19,7 @@ from support.fake_service import FakeWorker
 
 from station.errors import ConfigError, NotReadyError
 from station.inbox.journal import Journal, State
+from station.inbox.lock import is_locked
 from station.monitoring.status import status
 from station.service import daemon
 
@@ -164,6 +165,33 @@ def test_inbox_may_be_removed_and_recreated(write_site, start):
         drop(path, name)
         wait_for(lambda: name in stored(path))  # noqa: B023 - called at once
     assert service.process.poll() is None
+
+
+def test_service_pauses_while_another_folder_is_in_place_of_its_data(write_site, start):
+    """As after `umount -l`: the mount point, an empty folder, comes to light."""
+    path = write_site(settle_s=0.0)
+    service = start(path, period_s=0.1)
+    drop(path, FIRST)
+    wait_for(lambda: "STATUS=1 stored, 0 waiting, 0 set aside" in service.notifications())
+    data = path.parent / "data"
+    data.rename(path.parent / "elsewhere")
+    data.mkdir()
+    drop(path, SECOND)
+    wait_for(lambda: "another folder is in its place" in service.log())
+    time.sleep(0.3)
+    assert list(data.iterdir()) == []
+    data.rmdir()
+    (path.parent / "elsewhere").rename(data)
+    wait_for(lambda: stored(path) == [FIRST, SECOND])
+    wait_for(lambda: "service=resumed" in service.log())
+
+
+def test_deleted_lock_is_taken_again(write_site, start):
+    path = write_site(settle_s=0.0)
+    start(path, period_s=0.1)
+    lock = path.parent / "data" / "service.lock"
+    lock.unlink()
+    wait_for(lambda: lock.exists() and is_locked(lock.parent))
 
 
 @pytest.mark.integration
