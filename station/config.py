@@ -10,6 +10,7 @@ import difflib
 import hashlib
 import json
 import tomllib
+from datetime import date, datetime, time
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +20,12 @@ from station.errors import ConfigError
 from station.quantities import Grid, Scanner
 from station.sections import Section, SiteFile
 
+PLAIN_MESSAGES = {  # instead of those of pydantic, which name Python classes
+    "path_type": "give a path in quotes",
+    "timezone_aware": "give the time zone: Z at the end for UTC",
+    "model_type": "give a table of keys",
+    "model_attributes_type": "give a table of keys",
+}
 SCHEMA_NAME = "station-site.schema.json"  # next to the site file, whose first line refers to it
 
 
@@ -127,10 +134,13 @@ def read_site(path: str | Path) -> Site:
     try:
         site = Site.model_validate({**document, "path": path})
     except ValidationError as error:
-        faults = [_explain(fault) for fault in error.errors()]
+        faults = [_explain(fault) for fault in _merge_branches(error.errors())]
         raise ConfigError("\n".join([f"{path}: {len(faults)} to fix", *faults])) from error
     site = _absolute(site, path.parent)
-    faults = [f"  {key}: no such file: {file}" for key, file in _required_files(site) if not file.is_file()]
+    faults = [
+        *(f"  {key}: {fault}" for key, file in _required_files(site) if (fault := _file_fault(file))),
+        *_folder_faults(site),
+    ]
     if faults:
         raise ConfigError("\n".join([f"{path}: {len(faults)} to fix", *faults]))
     return site
@@ -154,6 +164,25 @@ def _absolute(site: Site, folder: Path) -> Site:
     resolved = resolve(site)
     assert isinstance(resolved, Site)  # noqa: S101 - resolve keeps the type
     return resolved
+
+
+def _file_fault(file: Path) -> str:
+    """Return why a file cannot be used, '' if it can."""
+    try:
+        with file.open("rb"):
+            return ""
+    except FileNotFoundError:
+        return f"no such file: {file}"
+    except OSError as error:
+        return f"{file}: cannot be read: {error.strerror}"
+
+
+def _folder_faults(site: Site) -> list[str]:
+    """Return a fault if the data folder and the inbox, which is not to be changed, contain each other."""
+    inbox, data = site.scans.inbox.resolve(), site.station.data.resolve()
+    if inbox.is_relative_to(data) or data.is_relative_to(inbox):
+        return [f"  station.data: {data} and the inbox, {inbox}, must be separate folders"]
+    return []
 
 
 def _required_files(site: Site) -> list[tuple[str, Path]]:
@@ -180,14 +209,39 @@ def _explain(fault: Any) -> str:  # noqa: ANN401 - pydantic's ErrorDetails, a pl
         return f"  {location}: no such key; {hint}"
     if fault["type"] == "missing":
         return f"  {location}: missing"
-    message = fault["msg"].removeprefix("Value error, ")
-    given_text = "" if isinstance(fault["input"], dict) else f" (given: {fault['input']!r})"
+    message = PLAIN_MESSAGES.get(fault["type"], fault["msg"].removeprefix("Value error, "))
+    message = message.replace("Input should", "should")
+    given = fault["input"]
+    given_text = "" if isinstance(given, (dict, BaseModel)) else f" (given: {_as_toml(given)})"
     return f"  {location or 'site file'}: {message}{given_text}"
+
+
+def _as_toml(value: object) -> str:
+    """Return a value much as it stands in the site file."""
+    if isinstance(value, (datetime, date, time)):
+        return value.isoformat()
+    return str(value).lower() if isinstance(value, bool) else repr(value)
+
+
+def _merge_branches(faults: list[Any]) -> list[Any]:
+    """Return the faults with one for each key: a key with several types reports a fault for each of them."""
+    best: dict[tuple[object, ...], Any] = {}
+    for fault in faults:
+        location = tuple(part for part in fault["loc"] if not _is_union_branch(part))
+        if location not in best or fault["type"] == "literal_error":
+            best[location] = fault
+    nested = {location[:n] for location in best for n in range(len(location))}
+    return [fault for location, fault in best.items() if not location or location not in nested]
 
 
 def _is_union_branch(part: object) -> bool:
     """Return True for path steps of pydantic (class and constraint names), False for keys of the file."""
-    return isinstance(part, str) and (not part.islower() or "[" in part or part in {"float", "int", "path"})
+    return isinstance(part, str) and (
+        not part.islower()
+        or "[" in part
+        or part.startswith("constrained-")
+        or part in {"float", "int", "path"}
+    )
 
 
 def _sibling_keys(location: tuple[str | int, ...]) -> list[str]:

@@ -48,6 +48,7 @@ from station.readers.scan import ScanReader, open_scan, reject_future, utc_inter
 from station.science.adjustment import ground_classes
 from station.science.adjustment.joint import Adjustment
 from station.science.analysis import inclination_check, verdict
+from station.science.geometry.pose import horizontal_crs, is_same_map
 from station.science.geometry.terrain import nodes_from_means
 from station.science.gridding.gridder import Gridder
 from station.science.gridding.viewing_geometry import ViewingGeometry
@@ -427,7 +428,16 @@ def open_scan_for(site: Site, path: Path) -> Iterator[ScanReader]:
     """Yield a reader of a scan with the settings of the site; raises ScanError or NotReadyError."""
     range_max_m = site.scanner.range_max_m if site.scans.frame == "scanner" else None
     with open_scan(path, range_max_m=range_max_m) as reader:
+        if site.scans.frame == "map" and site.map.crs and reader.header.crs_wkt:
+            _require_same_map(reader.header.crs_wkt, site.map.crs)
         yield reader
+
+
+def _require_same_map(declared_wkt: str, crs: str) -> None:
+    """Raise ScanError if a scan declares another projected or geographic CRS than the site."""
+    declared, expected = horizontal_crs(declared_wkt), horizontal_crs(crs)
+    if (declared.is_projected or declared.is_geographic) and not is_same_map(declared, expected):
+        raise ScanError(f"the file is in {declared.name}, map.crs is {expected.name}: export it to that map")
 
 
 def sha256_log(scan: ScanFile) -> str:

@@ -56,6 +56,7 @@ from station.processing.store_tasks import (
     delete_expired,
     update_series,
 )
+from station.science.geometry.pose import horizontal_crs, is_same_map
 from station.service.background_compaction import BackgroundCompaction
 from station.service.publishing import publish
 from station.service.retention import apply_retention, expired_scans
@@ -86,9 +87,9 @@ class Worker:
         `in_service`: scans may wait for weather, and one with a new mtime but the same bytes is not processed
         again.
 
-        Raises ConfigError if the stored series has another grid.
+        Raises ConfigError if the stored series has another map or grid.
         """
-        _require_same_grid(site)
+        _require_same_map(site)
         self._site = site
         self._series = series_for(site)
         self._journal = journal
@@ -439,11 +440,20 @@ def record_result(journal: Journal, name: str, result: StoredResult) -> None:
     )
 
 
-def _require_same_grid(site: Site) -> None:
-    """Raise ConfigError if the stored series has another grid: a series has only one."""
+def _require_same_map(site: Site) -> None:
+    """Raise ConfigError if the stored series has another map or grid: a series has only one."""
     series = stored_series(series_for(site))
     if series is None:
         return
+    crs = site.map.crs
+    if (crs is None) != (series.crs is None) or (
+        crs and series.crs and not is_same_map(horizontal_crs(series.crs), horizontal_crs(crs))
+    ):
+        stored_name = horizontal_crs(series.crs).name if series.crs else "a local frame, without map.crs"
+        raise ConfigError(
+            f"map.crs = {crs!r} differs from that of {site.station.data}, {stored_name}: restore it, or give"
+            " station.data a new folder"
+        )
     stored = series.grid
     configured = site.grid_cells
     deviation_m = max(

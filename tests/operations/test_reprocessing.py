@@ -458,6 +458,15 @@ def test_lost_journal_is_rebuilt_from_the_epochs(folder):
 
 
 @integration
+@pytest.mark.parametrize("crs", ["EPSG:25832", "EPSG:32633"])
+def test_store_of_another_map_is_rejected(folder, crs):
+    """ETRS89 differs from WGS84 by less than a metre, but other pairs do not."""
+    site = edited_site(folder, ('crs = "EPSG:32632"', f'crs = "{crs}"'))
+    with pytest.raises(ConfigError, match=r"map\.crs = .* differs from that of .* zone 32N: restore it"):
+        run(site)
+
+
+@integration
 def test_store_of_another_grid_is_rejected(folder):
     site = edited_site(folder, ("cell_m = 5.0", "cell_m = 10.0"))
     with pytest.raises(ConfigError, match=r"192 x 92 cells of 5 m .* new folder"):

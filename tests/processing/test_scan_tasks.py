@@ -3,12 +3,14 @@
 import os
 import re
 import shutil
+from contextlib import nullcontext
 from dataclasses import replace
 
 import laspy
 import netCDF4
 import numpy as np
 import pytest
+from pyproj import CRS
 
 from station.config import read_site
 from station.errors import ConfigError, NotReadyError, ScanError
@@ -87,6 +89,16 @@ def test_damaged_tilt_offset_is_restored_from_the_epochs(folder, content):
         load_scan_inputs(site, reader, scan.log, start, end)
     assert path.read_text() == intact
     assert tilt_offsets.damaged_tilt_offsets(folder / "data") == []
+
+
+@pytest.mark.parametrize(
+    ("declared", "is_same"),
+    [("EPSG:32632", True), ("EPSG:32632+5773", True), ("EPSG:32633", False), ("EPSG:4326", False)],
+)
+def test_map_that_a_scan_declares_must_be_that_of_the_site(declared, is_same):
+    wkt = CRS.from_user_input(declared).to_wkt()
+    with nullcontext() if is_same else pytest.raises(ScanError, match="map.crs is WGS 84 / UTM zone 32N"):
+        scan_tasks._require_same_map(wkt, "EPSG:32632")
 
 
 def test_line_times_match_the_shots(folder):

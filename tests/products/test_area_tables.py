@@ -9,7 +9,15 @@ import pytest
 
 import station
 from station.errors import ConfigError, StationError
-from station.products.area_tables import Span, area_records, as_csv, as_text, find_epoch, parse_time
+from station.products.area_tables import (
+    Span,
+    area_records,
+    as_csv,
+    as_text,
+    describe_epoch,
+    find_epoch,
+    parse_time,
+)
 
 ALL = Span.parse(None, None)
 
@@ -96,6 +104,10 @@ def test_epochs_are_found_by_scan_or_time(site, series, small):
     assert find_epoch(series, "2025-11-21T01:20").start.hour == 1
     assert find_epoch(series, "2025-11-21T02:20+01:00").start.hour == 1
     assert find_epoch(series, "last").start.hour == 5
+    assert describe_epoch(site, "2025-11-21T01:20").endswith("epoch of 2025-11-21 01:00:00 UTC")
+    assert describe_epoch(site, "reference") == describe_epoch(site, "previous") == ""
+    with pytest.raises(StationError, match="no epoch within 12 h of 2024-01-01"):
+        find_epoch(series, "2024-01-01")
     with pytest.raises(StationError, match="neither a stored scan"):
         find_epoch(series, "yesterday")
     with pytest.raises(StationError, match="is not a time"):

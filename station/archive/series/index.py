@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from bisect import bisect_right
 from collections.abc import Sequence
-from datetime import datetime
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import overload
 
@@ -26,9 +26,10 @@ from station.archive.epochs import (
 )
 from station.archive.netcdf_layout import Series
 from station.archive.schema import TEXT_LENGTH
-from station.errors import StoreError
+from station.errors import StationError, StoreError
 from station.quantities import Grid
 
+NEAREST_TOLERANCE_S = 12 * 3600.0  # so that a date finds the first or last epoch of its day
 MAX_TRIED = 5  # files of the store, if the newest are damaged
 
 
@@ -54,6 +55,28 @@ def list_epochs(series: Series) -> list[EpochRef]:
     return _drop_simultaneous(
         sorted((epoch for _, epoch in best.values()), key=lambda epoch: (epoch.time_s, epoch.start))
     )
+
+
+def nearest_epoch(epochs: Sequence[EpochRef], time_s: float) -> EpochRef:
+    """Return the epoch whose start or middle is nearest to a time [s since 1970].
+
+    Raises StationError, with the nearest time, if there is none within NEAREST_TOLERANCE_S.
+    """
+
+    def distance_s(epoch: EpochRef) -> float:
+        return min(abs(epoch.start.timestamp() - time_s), abs(epoch.time_s - time_s))
+
+    nearest = min(epochs, key=distance_s)
+    if distance_s(nearest) > NEAREST_TOLERANCE_S:
+        raise StationError(
+            f"no epoch within {NEAREST_TOLERANCE_S / 3600:g} h of {_format_utc(time_s)}:"
+            f" the nearest is that of {_format_utc(nearest.start.timestamp())}"
+        )
+    return nearest
+
+
+def _format_utc(time_s: float) -> str:
+    return f"{datetime.fromtimestamp(time_s, UTC):%Y-%m-%d %H:%M} UTC"
 
 
 def _drop_simultaneous(refs: list[EpochRef]) -> list[EpochRef]:
