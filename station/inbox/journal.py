@@ -140,6 +140,25 @@ class Journal:
                 [(*file, now_s, now_s) for file in files],
             )
 
+    def reject(self, files: Iterable[tuple[str, int, int, str]]) -> None:
+        """Set files aside that cannot be scans, (name, size, mtime_ns, reason), in one transaction."""
+        files = list(files)
+        for name, _, _, reason in files:
+            self._write_reason(name, reason)
+        now_s = self._now_s()
+        with self._transaction():
+            self._connection.executemany(
+                """INSERT INTO scan (name, size, mtime_ns, reason, state, outcome, first_seen_utc_s,
+                       changed_utc_s)
+                   VALUES (?, ?, ?, ?, 'set_aside', 'set_aside', ?, ?)
+                   ON CONFLICT (name) DO UPDATE SET
+                       size = excluded.size, mtime_ns = excluded.mtime_ns, reason = excluded.reason,
+                       state = 'set_aside', outcome = 'set_aside', sha256 = NULL, log_sha256 = '',
+                       waiting_reason = '', attempts = 0, next_try_utc_s = NULL,
+                       changed_utc_s = excluded.changed_utc_s""",
+                [(*file, now_s, now_s) for file in files],
+            )
+
     def record_removed(self, names: Iterable[str]) -> None:
         """Drop scans removed from the inbox before they were processed; their stored epochs stay."""
         parameters = [(name,) for name in names]
@@ -200,13 +219,7 @@ class Journal:
 
     def set_aside(self, name: str, reason: str, *, sha256: str | None = None, log_sha256: str = "") -> None:
         """Record that a scan cannot be used, and why; write the reason to `set_aside/<name>.txt` too."""
-        try:
-            self._reasons_folder.mkdir(exist_ok=True)
-            self._reason_file(name).write_text(f"{name}: {reason}\n", encoding="utf-8")
-        except OSError as error:
-            raise StoreError(
-                f"{self._reasons_folder}: the reason for {name} cannot be written: {error}"
-            ) from error
+        self._write_reason(name, reason)
         with self._transaction():
             self._update(
                 name,
@@ -386,6 +399,15 @@ class Journal:
         return {state.value: int(counts.get(state.value, 0)) for state in State}
 
     # ---- SQLite
+
+    def _write_reason(self, name: str, reason: str) -> None:
+        try:
+            self._reasons_folder.mkdir(exist_ok=True)
+            self._reason_file(name).write_text(f"{name}: {reason}\n", encoding="utf-8")
+        except OSError as error:
+            raise StoreError(
+                f"{self._reasons_folder}: the reason for {name} cannot be written: {error}"
+            ) from error
 
     def _reason_file(self, name: str) -> Path:
         return self._reasons_folder / f"{name}.txt"

@@ -18,6 +18,7 @@ from station.readers.scan import suffixes
 if TYPE_CHECKING:
     from station.config import Site
 
+MAX_LISTED = 50  # scans of a kind, in the text
 Status = dict[str, Any]  # printed by `station status --json`
 
 
@@ -97,10 +98,14 @@ def format_status(report: Status) -> str:
     lines += [f"moved    {report['moved']}"] if report["moved"] else []
     lines += [f"alarm    {text}" for text in report["alarms"].values()]
     lines += [f"fault    {fault}" for fault in report["faults"]]
-    for scan in report["waiting"]:
+    for scan in report["waiting"][:MAX_LISTED]:
         next_try = f", next try {scan['next_try']}" if scan["next_try"] else ""
         lines.append(f"waits    {scan['scan']}: {scan['for'] or 'its turn'}{next_try}")
-    lines += [f"aside    {scan['scan']}: {scan['reason']}" for scan in report["set_aside"]]
+    if (left_out := waiting - MAX_LISTED) > 0:
+        lines.append(f"waits    and {left_out} more: station status --json")
+    lines += [f"aside    {scan['scan']}: {scan['reason']}" for scan in report["set_aside"][-MAX_LISTED:]]
+    if (left_out := len(report["set_aside"]) - MAX_LISTED) > 0:
+        lines.append(f"aside    and {left_out} more: station status --json")
     return "\n".join(lines)
 
 

@@ -201,7 +201,7 @@ def test_disk_space_alarm_and_unreadable_disk(station_at, monkeypatch):
 
     monkeypatch.setattr(alarm_rules.shutil, "disk_usage", lambda _: SimpleNamespace(free=3e9))
     assert active(0) == {}
-    full = SimpleNamespace(f_bavail=10**6, f_frsize=4096, f_files=1000, f_favail=3)
+    full = SimpleNamespace(f_bavail=10**6, f_frsize=4096, f_files=1000, f_favail=3, f_flag=0)
     monkeypatch.setattr("station.monitoring.preconditions.os.statvfs", lambda _: full)
     assert "no inodes left" in active(0)["disk"]
 
@@ -293,6 +293,14 @@ def test_secrets_are_not_printed(make_site, credentials, capfd):
     credentials(hook="json://user:geheim@127.0.0.1:9/geheim")
     assert alarms.test(site, print) == 1
     assert "geheim" not in "".join(capfd.readouterr())
+
+
+@pytest.mark.parametrize("url", ["mailto//user:geheim@example.org", "geheim", "slack://geheim%2Fx/a"])
+def test_secrets_in_a_misspelt_url_are_not_printed(make_site, credentials, capfd, caplog, url):
+    site = make_site(more='[alarms]\ntargets = ["hook"]\n')
+    credentials(hook=url)
+    assert alarms.test(site, print) == 1
+    assert "geheim" not in "".join([*capfd.readouterr(), caplog.text])
 
 
 @pytest.mark.parametrize(

@@ -97,7 +97,7 @@ def test_damaged_tilt_offset_is_restored_from_the_epochs(folder, content):
 )
 def test_map_that_a_scan_declares_must_be_that_of_the_site(declared, is_same):
     wkt = CRS.from_user_input(declared).to_wkt()
-    with nullcontext() if is_same else pytest.raises(ScanError, match="map.crs is WGS 84 / UTM zone 32N"):
+    with nullcontext() if is_same else pytest.raises(ScanError, match=r"map\.crs is WGS 84 / UTM zone 32N"):
         scan_tasks._require_same_map(wkt, "EPSG:32632")
 
 
