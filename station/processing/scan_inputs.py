@@ -149,7 +149,7 @@ def load_scan_inputs(
 
 def _inputs_in_map_frame(site: Site) -> ScanInputs:
     """Return the inputs of a scan that is already on the map."""
-    position_m = _map_position(site)
+    position_m = map_position(site)
     geometry, log_only_covariance, adjustment_inputs = scan_geometry(site, position_m), None, None
     if position_m is not None:  # registered elsewhere, with unknown accuracy
         params = parameters.parameter_layout(geometry.grid, position_m)
@@ -228,7 +228,8 @@ def _require_on_map(crs: str, position_m: list[float], file: Path) -> None:
         )
 
 
-def _map_position(site: Site) -> tuple[float, float, float] | None:
+def map_position(site: Site) -> tuple[float, float, float] | None:
+    """Return easting, northing and height of `map.origin` [m]; None without it."""
     if site.map.origin is None or site.map.crs is None:
         return None
     to_map = Transformer.from_crs(pose.GEOGRAPHIC, pose.horizontal_crs(site.map.crs), always_xy=True)
