@@ -53,7 +53,7 @@ class LockedFolder:
         finally:
             os.close(new_fd)
 
-    def is_mounted_anew(self) -> bool:
+    def is_remounted(self) -> bool:
         """Return True if the path leads to the same store through another mount than when it was locked."""
         return _file_id(self._data) != self._folder and self._identity == read_identity(self._data) != ""
 

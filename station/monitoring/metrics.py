@@ -9,7 +9,9 @@ import threading
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
+from ipaddress import ip_address
 from typing import TYPE_CHECKING, Any
+from urllib.parse import urlsplit
 from wsgiref.simple_server import WSGIRequestHandler, WSGIServer
 
 from station.config import Site
@@ -70,6 +72,26 @@ class _Server(WSGIServer):
         self._threads.shutdown(cancel_futures=True)
 
 
+def _is_loopback(host: str) -> bool:
+    try:
+        return ip_address(host).is_loopback
+    except ValueError:
+        return host == "localhost"
+
+
+def _only_for_loopback(app: Any) -> Any:  # noqa: ANN401 - WSGI
+    """Return a WSGI app that refuses requests to other host names: a web page may point one at loopback."""
+
+    def answer(environ: dict[str, Any], start_response: Any) -> Any:  # noqa: ANN401
+        host = urlsplit(f"//{environ.get('HTTP_HOST', '')}").hostname or ""
+        if _is_loopback(host):
+            return app(environ, start_response)
+        start_response("403 Forbidden", [("Content-Type", "text/plain")])
+        return [b"only for this machine\n"]
+
+    return answer
+
+
 class _RequestHandler(WSGIRequestHandler):
     timeout = CONNECTION_TIMEOUT_S
 
@@ -96,7 +118,7 @@ class Metrics:
 
         host, _, port = address.rpartition(":")
         try:
-            server = _Server((host.strip("[]"), int(port)), make_wsgi_app(registry))
+            server = _Server((host.strip("[]"), int(port)), _only_for_loopback(make_wsgi_app(registry)))
         except OSError as error:
             raise ConfigError(f"service.metrics = {address!r}: cannot listen: {error.strerror}") from error
         thread = threading.Thread(target=server.serve_forever, daemon=True)

@@ -30,7 +30,7 @@ def require_disk_space(site: Site) -> None:
         raise StoreError(f"{folder}: the data folder cannot be reached: {error.strerror}") from error
     if disk.f_flag & os.ST_RDONLY:
         raise StoreError(
-            f"{folder}: its disk has gone read-only: check it and mount it anew, the service then resumes"
+            f"{folder}: its disk has gone read-only: check it and mount it again, the service then resumes"
         )
     free = disk.f_bavail * disk.f_frsize
     if free < required:

@@ -208,7 +208,7 @@ def as_text(records: Iterable[AreaRecord]) -> str:
     body = [
         (
             f"{record.start:%Y-%m-%d %H:%M}",
-            record.area,
+            "".join(character if character.isprintable() else "�" for character in record.area),
             f"{statistics['mean_change']:+.4f}",
             f"±{statistics['mean_change_high'] - statistics['mean_change']:.4f}",
             f"{statistics['median_change']:+.4f}",

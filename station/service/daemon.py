@@ -286,8 +286,8 @@ class Daemon:
         lost_s = isolation.seconds_without_worker()
         if lost_s > self._timing.give_up_s:
             raise NotReadyError(f"no worker process could be started for {lost_s:.0f} s: restart the service")
-        if self._folder.is_mounted_anew():
-            raise NotReadyError(f"{self._site.station.data} was mounted anew: restart the service")
+        if self._folder.is_remounted():
+            raise NotReadyError(f"{self._site.station.data} was mounted again: restart the service")
 
     def _pause(self, error: StationError) -> float:
         """Log the first of consecutive faults; return the pause before the next attempt [s]."""

@@ -58,10 +58,10 @@ def test_locked_folder_knows_its_place(data):
         moved = data.rename(data.with_name("moved"))
         with pytest.raises(StoreError, match="another folder is in its place, or none"):
             folder.require_same()
-        assert not folder.is_mounted_anew()
+        assert not folder.is_remounted()
         shutil.copytree(moved, data)  # as a new mount: the same identity, other inodes
         assert read_identity(data) == read_identity(moved)
-        assert folder.is_mounted_anew()
+        assert folder.is_remounted()
 
 
 def test_deleted_lock_is_taken_again_unless_another_process_has_it(data):

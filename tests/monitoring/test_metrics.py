@@ -9,6 +9,7 @@ import subprocess
 import sys
 import threading
 import time
+import urllib.error
 import urllib.request
 from contextlib import ExitStack, suppress
 from pathlib import Path
@@ -106,6 +107,13 @@ def test_occupied_port_and_missing_folder_are_reported(station, port, make_site,
     metrics.write()
     metrics.write()
     assert len([record for record in caplog.records if "metrics_file" in record.message]) == 1
+
+
+@pytest.mark.parametrize("host", ["evil.example", "127.0.0.1.evil.example", ""])
+def test_requests_to_other_hosts_are_refused(station, port, host):
+    request = urllib.request.Request(f"http://127.0.0.1:{port}/metrics", headers={"Host": host})
+    with Metrics(lambda: station).serving(), pytest.raises(urllib.error.HTTPError, match="403"):
+        urllib.request.urlopen(request)  # noqa: S310 - an address of this test
 
 
 def test_idle_connections_take_neither_threads_nor_the_service(station, port, monkeypatch):

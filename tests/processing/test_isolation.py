@@ -8,6 +8,7 @@ import shutil
 import signal
 import subprocess
 import sys
+import tempfile
 import time
 from contextlib import suppress
 from multiprocessing import forkserver, util
@@ -223,15 +224,12 @@ if __name__ == "__main__":
 
 
 def test_socket_is_in_the_runtime_folder_of_the_service(tmp_path):
-    runtime = tmp_path / "runtime"
-    runtime.mkdir()
     script = tmp_path / "service.py"
     script.write_text(SOCKET_FOLDER)
-    environment = os.environ | {"RUNTIME_DIRECTORY": str(runtime)}
-    process = subprocess.run(
-        [sys.executable, script], env=environment, check=True, capture_output=True, text=True
-    )
-    assert Path(process.stdout.strip()).parent == runtime
+    with tempfile.TemporaryDirectory() as runtime:  # the path of a socket has at most 107 characters
+        environment = os.environ | {"RUNTIME_DIRECTORY": runtime}
+        printed = subprocess.check_output([sys.executable, script], env=environment, text=True)
+    assert str(Path(printed.strip()).parent) == runtime
 
 
 def test_stop_ends_the_worker_with_not_ready(tasks):

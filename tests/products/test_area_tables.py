@@ -3,6 +3,7 @@
 import csv
 import io
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -95,6 +96,8 @@ def test_csv_of_areas(site, small):
         assert float(row["mean_change_low95_m"]) == pytest.approx(mean - 1.96 * sigma, rel=1e-4)
         assert float(row["volume_change_m3"]) == pytest.approx(mean * float(row["area_size_m2"]), rel=1e-4)
     assert "rises" in as_text(area_records(site, None, ALL, "reference"))
+    record = next(iter(area_records(site, None, ALL, "reference")))
+    assert "\x1b" not in as_text([replace(record, area="\x1b[2Jtongue")])
     assert as_text([]) == "no epoch with a change in this span"
 
 
