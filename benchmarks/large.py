@@ -19,7 +19,7 @@ import laspy
 import numpy as np
 
 from benchmarks.process_cost import Cost, job_cost
-from station.processing import isolation
+from station.processing.fork_server import WORKER_ENV
 from station.quantities import Floats, WeatherLog
 from station.simulation import files
 from station.simulation.instrument import motion
@@ -112,7 +112,7 @@ def referenced(site: Path) -> ScanCost:
 
 
 def _scan_cost(module: str, job: str, folder: Path, **arguments: object) -> ScanCost:
-    cost, result = job_cost(module, job, folder, isolation.WORKER_ENV, **arguments)
+    cost, result = job_cost(module, job, folder, WORKER_ENV, **arguments)
     if result.get("verdict") == "unusable":  # too few points observe less than the scans of the reference
         raise RuntimeError(f"{arguments['scan']}: unusable")
     return ScanCost(**vars(cost), points=int(result.get("points", 0)))

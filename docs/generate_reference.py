@@ -75,6 +75,7 @@ LOG_KEYS = {
     "expected_every_s": "interval at which scans are expected [s]",
     "failed": "event whose processing failed",
     "events": "`none`: no file events, the inbox is polled",
+    "input": "`broken`: an optional input file cannot be used; its last good version is",
 }
 
 

@@ -39,9 +39,9 @@ def variance(
 
     The sum is over one epoch, or over its difference to a second epoch. `weights` (y, x), rows from north to
     south, are zero outside the area: 1/n in each of n cells gives a mean, the cell size a volume. An epoch is
-    an index in the series or a time (the nearest epoch is used). Errors that all cells of a scan share are
-    included at every scale. Raises StoreError if there is no series or no reference yet, ValueError if the
-    weights do not fit the grid.
+    an index in the series or a time, which stands for the nearest epoch within 12 h. Errors that all cells of
+    a scan share are included at every scale. Raises StoreError if there is no series or no reference yet,
+    StationError if there is no epoch near a time, ValueError if the weights do not fit the grid.
     Source: equations.md, 6.2.
     """
     import numpy as np

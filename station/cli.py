@@ -15,6 +15,7 @@ from station.commands import (
     process,
     products,
     reprocess,
+    retry,
     run,
     sensitivity,
     simulate,
@@ -32,7 +33,7 @@ app = typer.Typer(
     rich_markup_mode=None,
 )
 COMMANDS = (
-    check.init, check.check, process.process, reprocess.reprocess, run.run, run.status,
+    check.init, check.check, process.process, retry.retry, reprocess.reprocess, run.run, run.status,
     simulate.simulate, simulate.demo, products.areas, products.plot, products.export, products.serve,
     calibrate.calibrate, sensitivity.sensitivity, papers.papers,
 )  # fmt: skip

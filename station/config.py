@@ -10,15 +10,23 @@ import difflib
 import hashlib
 import json
 import tomllib
+from datetime import date, datetime, time
 from pathlib import Path
 from typing import Any
 
 from pydantic import BaseModel, ValidationError
 
+from station._version import __version__
 from station.errors import ConfigError
 from station.quantities import Grid, Scanner
 from station.sections import Section, SiteFile
 
+PLAIN_MESSAGES = {  # instead of those of pydantic, which name Python classes
+    "path_type": "give a path in quotes",
+    "timezone_aware": "give the time zone: Z at the end for UTC",
+    "model_type": "give a table of keys",
+    "model_attributes_type": "give a table of keys",
+}
 SCHEMA_NAME = "station-site.schema.json"  # next to the site file, whose first line refers to it
 
 
@@ -26,6 +34,11 @@ class Site(SiteFile):
     """A checked site file whose paths are absolute."""
 
     path: Path
+    input_faults: tuple[str, ...] = ()  # why optional files cannot be used; see processing/usable_inputs.py
+
+    def last_good(self, key: str) -> Path:
+        """Return the path of the last good copy of an optional file: `areas`, `flags` or `stable`."""
+        return self.station.data / "last_good" / key
 
     @property
     def grid_cells(self) -> Grid:
@@ -71,7 +84,30 @@ class Site(SiteFile):
             settings["adjustment"]["stable"] = _sha256(self.adjustment.stable)
         if isinstance(self.reference.scans, Path):
             settings["reference"]["scans"] = _sha256(self.reference.scans)
-        return hashlib.sha256(json.dumps(settings, sort_keys=True).encode()).hexdigest()[:16]
+        return _hash(settings)
+
+    @property
+    def judging_conditions(self) -> str:
+        """Version, and hash of the settings, limits and SOP files that decide whether a scan can be used."""
+        settings = self.model_dump(
+            mode="json",
+            include={
+                "scans": {"frame", "name", "point_time", "intensity", "timeout_s"},
+                "service": {"memory_gb"},
+                **dict.fromkeys(
+                    ("scanner", "sop", "map", "grid", "inclination", "weather", "air", "adjustment",
+                     "uncertainty", "reference"),
+                    True,
+                ),
+            },
+        )  # fmt: skip
+        files = [*(sop.file for sop in self.sop), *filter(None, [self.map.pop])]
+        settings["files"] = [_sha256(file) if file.is_file() else "" for file in files]
+        return f"{__version__} {_hash(settings)}"
+
+
+def _hash(settings: dict[str, Any]) -> str:
+    return hashlib.sha256(json.dumps(settings, sort_keys=True).encode()).hexdigest()[:16]
 
 
 def _sha256(path: Path) -> str:
@@ -125,12 +161,15 @@ def read_site(path: str | Path) -> Site:
     except (tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as error:
         raise ConfigError(f"{path}: not valid TOML: {error}") from error
     try:
-        site = Site.model_validate({**document, "path": path})
+        site = Site.model_validate({**document, "path": path, "input_faults": ()})
     except ValidationError as error:
-        faults = [_explain(fault) for fault in error.errors()]
+        faults = [_explain(fault) for fault in _merge_branches(error.errors())]
         raise ConfigError("\n".join([f"{path}: {len(faults)} to fix", *faults])) from error
     site = _absolute(site, path.parent)
-    faults = [f"  {key}: no such file: {file}" for key, file in _required_files(site) if not file.is_file()]
+    faults = [
+        *(f"  {key}: {fault}" for key, file in _required_files(site) if (fault := _file_fault(file))),
+        *_folder_faults(site),
+    ]
     if faults:
         raise ConfigError("\n".join([f"{path}: {len(faults)} to fix", *faults]))
     return site
@@ -156,19 +195,41 @@ def _absolute(site: Site, folder: Path) -> Site:
     return resolved
 
 
+def _file_fault(file: Path) -> str:
+    """Return why a file cannot be used, '' if it can."""
+    try:
+        with file.open("rb"):
+            return ""
+    except FileNotFoundError:
+        return f"no such file: {file}"
+    except OSError as error:
+        return f"{file}: cannot be read: {error.strerror}"
+
+
+def _folder_faults(site: Site) -> list[str]:
+    """Return a fault if the data folder and the inbox, which is not to be changed, contain each other."""
+    inbox, data = site.scans.inbox.resolve(), site.station.data.resolve()
+    if inbox.is_relative_to(data) or data.is_relative_to(inbox):
+        return [f"  station.data: {data} and the inbox, {inbox}, must be separate folders"]
+    return []
+
+
 def _required_files(site: Site) -> list[tuple[str, Path]]:
     files = [(f"sop[{i}].file", sop.file) for i, sop in enumerate(site.sop)]
     if site.map.pop:
         files.append(("map.pop", site.map.pop))
     if isinstance(site.reference.scans, Path):
         files.append(("reference.scans", site.reference.scans))
-    if isinstance(site.adjustment.stable, Path):
-        files.append(("adjustment.stable", site.adjustment.stable))
-    if site.areas:
-        files.append(("areas.file", site.areas.file))
-    if site.flags:
-        files.append(("flags.file", site.flags.file))
-    return files
+    optional = [
+        ("stable", "adjustment.stable", site.adjustment.stable),
+        ("areas", "areas.file", site.areas and site.areas.file),
+        ("flags", "flags.file", site.flags and site.flags.file),
+    ]
+    return files + [
+        (name, path)
+        for key, name, path in optional
+        if isinstance(path, Path) and not site.last_good(key).is_file()
+    ]
 
 
 def _explain(fault: Any) -> str:  # noqa: ANN401 - pydantic's ErrorDetails, a plain dict
@@ -180,14 +241,39 @@ def _explain(fault: Any) -> str:  # noqa: ANN401 - pydantic's ErrorDetails, a pl
         return f"  {location}: no such key; {hint}"
     if fault["type"] == "missing":
         return f"  {location}: missing"
-    message = fault["msg"].removeprefix("Value error, ")
-    given_text = "" if isinstance(fault["input"], dict) else f" (given: {fault['input']!r})"
+    message = PLAIN_MESSAGES.get(fault["type"], fault["msg"].removeprefix("Value error, "))
+    message = message.replace("Input should", "should")
+    given = fault["input"]
+    given_text = "" if isinstance(given, (dict, BaseModel)) else f" (given: {_as_toml(given)})"
     return f"  {location or 'site file'}: {message}{given_text}"
+
+
+def _as_toml(value: object) -> str:
+    """Return a value much as it stands in the site file."""
+    if isinstance(value, (datetime, date, time)):
+        return value.isoformat()
+    return str(value).lower() if isinstance(value, bool) else repr(value)
+
+
+def _merge_branches(faults: list[Any]) -> list[Any]:
+    """Return the faults with one for each key: a key with several types reports a fault for each of them."""
+    best: dict[tuple[object, ...], Any] = {}
+    for fault in faults:
+        location = tuple(part for part in fault["loc"] if not _is_union_branch(part))
+        if location not in best or fault["type"] == "literal_error":
+            best[location] = fault
+    nested = {location[:n] for location in best for n in range(len(location))}
+    return [fault for location, fault in best.items() if not location or location not in nested]
 
 
 def _is_union_branch(part: object) -> bool:
     """Return True for path steps of pydantic (class and constraint names), False for keys of the file."""
-    return isinstance(part, str) and (not part.islower() or "[" in part or part in {"float", "int", "path"})
+    return isinstance(part, str) and (
+        not part.islower()
+        or "[" in part
+        or part.startswith("constrained-")
+        or part in {"float", "int", "path"}
+    )
 
 
 def _sibling_keys(location: tuple[str | int, ...]) -> list[str]:

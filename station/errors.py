@@ -19,7 +19,7 @@ class ConfigError(StationError):
 
 
 class ScanError(StationError):
-    """The scan cannot be used: it is set aside with the reason and not tried again until it changes."""
+    """The scan cannot be used: it is set aside with the reason until it or the settings change."""
 
     exit_status = 3
 
@@ -28,6 +28,10 @@ class NotReadyError(StationError):
     """The scan, its log or the disk is not ready: the scan is tried again later, without limit."""
 
     exit_status = 75
+
+
+class InconclusiveError(NotReadyError):
+    """An attempt failed, by scan or machine: it is repeated ever more rarely, then given up for now."""
 
 
 class StoreError(StationError):

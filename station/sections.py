@@ -6,6 +6,7 @@ The commented files in `config/` explain the keys.
 from __future__ import annotations
 
 import math
+import re
 from datetime import UTC, datetime
 from ipaddress import ip_address
 from pathlib import Path
@@ -31,6 +32,36 @@ def _in_utc(time: datetime) -> datetime:
     return time.astimezone(UTC)
 
 
+def require_projected(crs: str) -> str:
+    """Return a CRS; raise ValueError unless it is known, projected, and in metres."""
+    from pyproj import CRS  # noqa: PLC0415 - a tenth of a second that not every command needs
+    from pyproj.exceptions import CRSError  # noqa: PLC0415
+
+    advice = "name a projected CRS in metres, such as EPSG:32632"
+    try:
+        parsed = CRS.from_user_input(crs)
+    except CRSError as error:
+        raise ValueError(f"unknown to PROJ: {advice}") from error
+    horizontal = parsed.sub_crs_list[0] if parsed.is_compound else parsed
+    if not horizontal.is_projected:
+        in_degrees = ", in degrees" if horizontal.is_geographic else ""
+        raise ValueError(f"is a {horizontal.type_name}{in_degrees}: {advice}")
+    units = {axis.unit_name for axis in horizontal.axis_info if axis.unit_conversion_factor != 1.0}
+    if units:
+        raise ValueError(f"is in {' and '.join(sorted(units))}: {advice}")
+    return crs
+
+
+def _require_time_pattern(pattern: str) -> str:
+    """Return a pattern of scan names; raise ValueError unless times survive being written and read by it."""
+    time = datetime(2025, 7, 15, 13, 14, 15, tzinfo=UTC)
+    try:
+        datetime.strptime(time.strftime(pattern), pattern)  # noqa: DTZ007 - the pattern may contain a zone
+    except (ValueError, re.error, OverflowError) as error:
+        raise ValueError(f"not a pattern of times, such as %y%m%d_%H%M%S: {error}") from error
+    return pattern
+
+
 Utc = Annotated[AwareDatetime, AfterValidator(_in_utc)]
 
 
@@ -53,7 +84,7 @@ class ScansSection(Section):
     """Where scans arrive and how they are named."""
 
     inbox: Path
-    name: str = "%y%m%d_%H%M%S"
+    name: Annotated[str, AfterValidator(_require_time_pattern)] = "%y%m%d_%H%M%S"
     frame: Literal["scanner", "map"] = "scanner"
     point_time: Literal["auto", "none"] = "auto"
     intensity: IntensityScale = "auto"
@@ -130,7 +161,7 @@ class Origin(Section):
 class MapSection(Section):
     """The map of the products, and how the project frame is placed on it."""
 
-    crs: str | None = None
+    crs: Annotated[str, AfterValidator(require_projected)] | None = None
     origin: Origin | None = None
     pop: Path | None = None
     vertical_datum: str = ""
@@ -358,6 +389,9 @@ class SiteFile(Section):
     def _chain_is_complete(self) -> SiteFile:
         if self.scans.frame == "scanner" and not self.sop:
             raise ValueError('scans.frame = "scanner" needs an [[sop]] to transform the points to the map')
+        starts = [sop.from_ for sop in self.sop]
+        if len(set(starts)) < len(starts):
+            raise ValueError("two [[sop]] have the same from: which of them is valid then?")
         if self.map.crs is None and (self.map.pop or self.map.origin):
             raise ValueError("map.pop and map.origin need map.crs, the map they refer to")
         if self.map.pop and self.map.origin and self.scans.frame == "scanner":

@@ -1,6 +1,7 @@
 """The site file: all faults at once, each with its remedy; its JSON Schema."""
 
 import json
+import re
 import tomllib
 from datetime import datetime
 from pathlib import Path
@@ -37,6 +38,60 @@ def test_paths_are_relative_to_the_file(tmp_path):
     assert site.instrument.beam_divergence_rad == pytest.approx(0.12e-3)
 
 
+@pytest.mark.parametrize(
+    ("crs", "message"),
+    [
+        ("EPSG:99999", "unknown to PROJ: name a projected CRS in metres"),
+        ("EPSG:4326", "is a Geographic 2D CRS, in degrees"),
+        ("EPSG:4978", "is a Geocentric CRS"),
+        ("EPSG:2263", "is in US survey foot"),
+        ("+proj=utm +zone=32 +units=ft", "is in foot"),
+    ],
+)
+def test_map_must_be_projected_and_in_metres(tmp_path, crs, message):
+    with pytest.raises(ConfigError, match=re.escape(f"map.crs: {message}")):
+        read(tmp_path, f'{GOOD}[map]\ncrs = "{crs}"\n')
+    assert read(tmp_path, f'{GOOD}[map]\ncrs = "EPSG:32632+5773"\n').map.crs
+
+
+@pytest.mark.parametrize("name", ["%y_%y", "%q", "%Y%m%d%", "%H(%M"])
+def test_name_that_is_no_pattern_of_times_is_a_fault(tmp_path, name):
+    text = GOOD.replace("frame", f'name = "{name}"\nframe')
+    if name == "%H(%M":
+        assert read(tmp_path, text).scans.name == name
+        return
+    with pytest.raises(ConfigError, match=r"scans\.name: not a pattern of times, such as %y%m%d_%H%M%S"):
+        read(tmp_path, text)
+
+
+@pytest.mark.parametrize("data", ["inbox", "inbox/data", ".", "other/../inbox"])
+def test_data_and_inbox_must_be_separate(tmp_path, data):
+    with pytest.raises(ConfigError, match="must be separate folders"):
+        read(tmp_path, GOOD.replace('data = "data"', f'data = "{data}"'))
+
+
+@pytest.mark.parametrize(
+    ("more", "message"),
+    [
+        ('[[sop]]\nfrom = 2025-07-15T00:00:00\nfile = "s"\n', "sop.0.from: give the time zone: Z at the end"),
+        ("[flags]\nfile = 3\n", "flags.file: give a path in quotes (given: 3)"),
+        ('[air]\nscanner_setting = "wether"\n', "air.scanner_setting: should be 'weather' (given: 'wether')"),
+        ('[[sop]]\nfrom = 2025-07-15T00:00:00Z\nfile = "s"\n' * 2, "two [[sop]] have the same from"),
+    ],
+)
+def test_faults_are_told_once_and_without_python_classes(tmp_path, more, message):
+    with pytest.raises(ConfigError) as error:
+        read(tmp_path, GOOD + more)
+    assert "1 to fix" in str(error.value)
+    assert message in str(error.value)
+
+
+def test_unreadable_file_is_a_fault_not_a_traceback(tmp_path):
+    (tmp_path / "flags.csv").mkdir()
+    with pytest.raises(ConfigError, match=r"flags\.file: .*flags\.csv: cannot be read: Is a directory"):
+        read(tmp_path, GOOD + '[flags]\nfile = "flags.csv"\n')
+
+
 def test_all_faults_are_listed_with_the_closest_valid_key(tmp_path):
     text = (
         GOOD.replace('id = "x"', 'id = "a b"')
@@ -60,7 +115,7 @@ def test_all_faults_are_listed_with_the_closest_valid_key(tmp_path):
         (('frame = "map"', 'frame = "scanner"'), "needs an"),
         (("[grid]", '[scanner]\nmodel = "vz"\n[grid]'), "choose from riegl-vz-6000"),
         (("[grid]", "[scanner]\nmodel = []\n[grid]"), "scanner.model: .* string"),
-        (("[station]", "scanner = 5\n[station]"), "scanner: .* dictionary"),
+        (("[station]", "scanner = 5\n[station]"), "scanner: give a table of keys"),
         (("[grid]", '[reference]\nscans = "there.tif"\n[grid]'), "no such file"),
         (("[grid]", '[adjustment]\nstable = "there.geojson"\n[grid]'), r"adjustment.stable: no such file"),
         (("[grid]", '[adjustment]\nmethod = "best"\n[grid]'), "adjustment.method"),

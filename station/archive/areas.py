@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import astuple, dataclass
 from pathlib import Path
 from typing import Any, Protocol
@@ -14,6 +15,12 @@ import netCDF4
 import numpy as np
 
 from station.archive.atomic_files import atomic_write
+from station.archive.checksums import (
+    fingerprint,
+    matches_fingerprint,
+    read_checked_json,
+    to_checked_json,
+)
 from station.archive.epochs import EpochRef
 from station.archive.netcdf_layout import (
     TIMES_PER_CHUNK,
@@ -31,6 +38,8 @@ from station.science.gridding.significance import SIGNIFICANT_SIGMAS
 
 Columns = dict[str, np.ndarray[Any, Any]]  # variables over time, as stored
 
+FILE_NAME = "areas.nc"
+_FINGERPRINTS = ".areas.json"  # of the file, and of the one it replaces
 MASKS_ATTRIBUTE = "area_masks_sha256"
 MISSING = -1
 _OVER_TIME = ("time", "area")
@@ -95,16 +104,18 @@ def update_areas(
 ) -> Path | None:
     """Bring `areas.nc` up to date with `series.nc` and return its path; `areas` are masks (ny, nx) by name.
 
-    Epochs already in the file are not computed again unless an area has changed. Returns None and writes
-    nothing if there is no area or no epoch. `progress` is called after each epoch computed. Raises
-    StoreError if an epoch is damaged or the file cannot be written; the old file then remains.
+    Epochs already in the file are not computed again unless an area has changed or the file is damaged.
+    Returns None and writes nothing if there is no area or no epoch. `progress` is called after each epoch
+    computed. Raises StoreError if an epoch is damaged or the file cannot be written; the old file remains.
     """
     epochs = SeriesIndex(series) if areas else ()
     if not epochs:
         return None
-    path = series.folder / "areas.nc"
-    masks = fingerprint(series, areas)
-    unchanged, known = _read_known(path, masks, len(areas), epochs)
+    path = series.folder / FILE_NAME
+    masks = masks_hash(series, areas)
+    unchanged, known = 0, _blank(0, len(areas))
+    if is_intact(series):
+        unchanged, known = _read_known(path, masks, len(areas), epochs)
     known_row = {
         key: index
         for index, key in enumerate(_epoch_keys(known["time"], _join_characters(known["epoch_file"])))
@@ -132,10 +143,27 @@ def update_areas(
         if unchanged:
             with h5py.File(path, "r") as old_file, h5py.File(tmp_path, "r+", libver=LIBVER_COMPAT) as file:
                 copy_unchanged(old_file, file, tuple(columns), unchanged)
+        _write_fingerprints(series, tmp_path)
     return path
 
 
-def fingerprint(series: Series, areas: dict[str, Bools]) -> str:
+def is_intact(series: Series) -> bool:
+    """Return True if `areas.nc` is as it was written."""
+    path = series.folder / FILE_NAME
+    expected = read_checked_json(series.folder / _FINGERPRINTS)
+    return bool(expected) and any(matches_fingerprint(path, known) for known in expected)
+
+
+def _write_fingerprints(series: Series, tmp_path: Path) -> None:
+    """Record the fingerprint of the new file and, because the process may be killed, that of the old one."""
+    known = [fingerprint(tmp_path)]
+    with suppress(OSError):
+        known.append(fingerprint(series.folder / FILE_NAME))
+    with atomic_write(series.folder / _FINGERPRINTS) as tmp_json:
+        tmp_json.write_text(to_checked_json(known), encoding="ascii")
+
+
+def masks_hash(series: Series, areas: dict[str, Bools]) -> str:
     """Return a hash of the areas: names, order, cells and grid."""
     digest = hashlib.sha256(json.dumps([astuple(series.grid), list(areas)]).encode())
     for cells in areas.values():
@@ -147,7 +175,7 @@ def matches(path: Path, series: Series, areas: dict[str, Bools]) -> bool:
     """Return True if a file contains the series of exactly these areas."""
     try:
         with h5py.File(path, "r") as file:
-            return bool(file.attrs[MASKS_ATTRIBUTE] == np.bytes_(fingerprint(series, areas)))
+            return bool(file.attrs[MASKS_ATTRIBUTE] == np.bytes_(masks_hash(series, areas)))
     except (OSError, RuntimeError, KeyError):
         return False
 

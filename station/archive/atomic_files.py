@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import os
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from station.errors import StoreError
+
+DAMAGED = ".damaged"  # appended to the name of a damaged file, which is never read and never deleted
 
 
 @contextmanager
@@ -24,6 +27,7 @@ def atomic_write(path: Path) -> Iterator[Path]:
         yield tmp_path
         with tmp_path.open("rb") as file:
             os.fsync(file.fileno())
+        move_folder_away(path)
         tmp_path.replace(path)
         _sync_folders(path.parent)
     except (OSError, RuntimeError) as error:  # netCDF reports a full disk as RuntimeError, without errno
@@ -31,6 +35,12 @@ def atomic_write(path: Path) -> Iterator[Path]:
     finally:
         with suppress(OSError):  # if this fails too, `delete_expired` removes the file later
             tmp_path.unlink(missing_ok=True)
+
+
+def move_folder_away(path: Path) -> None:
+    """Rename a folder that some accident left in the place of a file; nothing is deleted."""
+    if path.is_dir() and not path.is_symlink():
+        path.rename(path.with_name(f"{path.name}.{time.time_ns()}{DAMAGED}"))
 
 
 def _sync_folders(folder: Path) -> None:

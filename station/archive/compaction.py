@@ -35,7 +35,8 @@ from station.archive.series.epoch_reader import (
     has_same_encoding,
     read_source,
 )
-from station.archive.series.index import SeriesIndex, list_epochs, source_files
+from station.archive.series.index import SeriesIndex, list_epochs
+from station.archive.series.manifest import listed_sources
 from station.archive.series.virtual import write_scalars
 
 DAY_CLOSED = timedelta(hours=6)  # after its end; a later scan causes a new revision
@@ -101,7 +102,7 @@ def latest_start(series: Series) -> datetime:
 
     It replaces the clock during a backlog, when days that ended long ago are still being filled.
     """
-    return datetime.fromtimestamp(float(SeriesIndex(series).start_s[-1]), UTC)
+    return max(epoch.start for epoch in list_epochs(series))
 
 
 def count_compactable(series: Series) -> int:
@@ -174,11 +175,13 @@ def _copy_epochs(file: Any, source: EpochSource, progress: Callable[[], None]) -
 def delete_expired(series: Series, now: datetime) -> list[Path]:
     """Delete files not in use for the grace period, and temporary files of killed processes; return them.
 
-    A file is in use while `series.nc` refers to it, will refer to it, or has the only copy of an epoch.
+    A file is in use while `series.nc` refers to it, will refer to it, or has the only copy of an epoch; all
+    are while `series.nc` is damaged.
     """
     limit_s = (now - GRACE).timestamp()
     refs = list_epochs(series)
-    in_use = {epoch.path for epoch in refs} | source_files(series.path)
+    in_series = listed_sources(series)
+    in_use = {epoch.path for epoch in refs} | (in_series or set())
     starts = {epoch.start for epoch in refs}
     expired = [path for path in series.folder.glob("**/.*.part") if path.stat().st_mtime < limit_s]
     for path in [
@@ -186,7 +189,7 @@ def delete_expired(series: Series, now: datetime) -> list[Path]:
         *compacted_files(series, "days"),
         *compacted_files(series, "months"),
     ]:
-        if path in in_use or path.stat().st_mtime >= limit_s:
+        if in_series is None or path in in_use or path.stat().st_mtime >= limit_s:
             continue
         if all(epoch.start in starts for epoch in epochs_in_file(path)):
             expired.append(path)

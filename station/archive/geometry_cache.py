@@ -7,7 +7,6 @@ because on a full disk HDF5 may leave a half-closed file and terminate the proce
 
 from __future__ import annotations
 
-import json
 import math
 import os
 import shutil
@@ -19,9 +18,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from isal import isal_zlib
 
 from station._version import __version__
+from station.archive.checksums import fingerprint, read_checked_json, to_checked_json
 from station.archive.netcdf_layout import Series
 from station.archive.reference_files import reference_path
 from station.errors import StoreError
@@ -38,7 +37,6 @@ from station.science.uncertainty.parameters import parameter_layout
 PREFIX = ".viewing_geometry-"
 MANIFEST = "manifest.json"  # size and CRC-32 of each file
 MAX_CACHED = 2  # folders per station: scans from before a relocation may still be reprocessed
-BLOCK_BYTES = 2**18  # read at once for a checksum: fits into the cache of the processor
 SMALL_ARRAYS = ("datum_m", "sector_bounds", "sampling_step")
 GRID_ARRAYS = ("height_above_datum_m", "cell_index")
 
@@ -88,9 +86,9 @@ def _read(
     Every byte is read, so that a failing disk raises an error here, not a signal at a later access.
     """
     try:
-        manifest = json.loads((folder / MANIFEST).read_text(encoding="ascii"))
+        manifest = read_checked_json(folder / MANIFEST)
         for name in (*SMALL_ARRAYS, *GRID_ARRAYS, *CELL_ARRAYS):
-            if _fingerprint(folder / f"{name}.npy") != manifest[name]:
+            if fingerprint(folder / f"{name}.npy") != manifest[name]:
                 return None
         small = {name: np.load(folder / f"{name}.npy") for name in SMALL_ARRAYS}
         large: dict[str, Any] = {
@@ -162,8 +160,8 @@ def _write(folder: Path, geometry: ViewingGeometry) -> None:
         for name, values in arrays.items():
             path = tmp_folder / f"{name}.npy"
             _save(path, np.asarray(values, order="C"))
-            manifest[name] = _fingerprint(path)
-        (tmp_folder / MANIFEST).write_text(json.dumps(manifest), encoding="ascii")
+            manifest[name] = fingerprint(path)
+        (tmp_folder / MANIFEST).write_text(to_checked_json(manifest), encoding="ascii")
         tmp_folder.rename(folder)
         cached = sorted(folder.parent.glob(f"{PREFIX}*"), key=lambda path: path.stat().st_mtime_ns)
         for old in cached[:-MAX_CACHED]:
@@ -179,18 +177,11 @@ def _save(path: Path, values: Array) -> None:
         file.write(values.reshape(-1).data)
 
 
-def _fingerprint(path: Path) -> list[int]:
-    """Return size [bytes] and CRC-32 of a file."""
-    size, crc, block = 0, 0, memoryview(bytearray(BLOCK_BYTES))
-    with path.open("rb", buffering=0) as file:
-        while count := file.readinto(block):
-            size, crc = size + count, isal_zlib.crc32(block[:count], crc)
-    return [size, crc]
-
-
 def _delete(folder: Path) -> None:
     """Delete a cache; renamed first, because deleting takes several steps."""
     tmp_folder = folder.with_name(f".{folder.name}.{os.getpid()}.part")
     with suppress(OSError):
         folder.rename(tmp_folder)
     shutil.rmtree(tmp_folder, ignore_errors=True)
+    with suppress(OSError):
+        tmp_folder.unlink()  # if a file had its name

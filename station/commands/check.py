@@ -28,11 +28,13 @@ def check(
     store: Annotated[
         bool, typer.Option("--store", help="Check the store against its journal and checksums instead.")
     ] = False,
+    strict: Annotated[bool, typer.Option("--strict", help="Exit with 1 for warnings too.")] = False,
     json_: Json = False,
 ) -> None:
     """Check the site file, SOP, folders, weather and newest scan.
 
-    Everything that can be known before going live. Exits with 1 if something has to be fixed.
+    Everything that can be known before going live. Exits with 1 if something has to be fixed. As root it also
+    tells what the user `station` may not read or write.
     """
     from station.operations.site_check import site_findings, store_findings
 
@@ -42,5 +44,5 @@ def check(
     else:
         for finding in findings:
             print(f"{finding['level']:7} {finding['what']}: {finding['message']}")
-    if any(finding["level"] == "fault" for finding in findings):
+    if any(finding["level"] == "fault" or (strict and finding["level"] == "warning") for finding in findings):
         sys.exit(1)

@@ -5,11 +5,14 @@ from __future__ import annotations
 import sys
 from enum import StrEnum
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from station.commands._options import Against, FromOption, SiteArgument, ToOption, progress_bar
+
+if TYPE_CHECKING:
+    from station.config import Site
 
 
 class PlotKind(StrEnum):
@@ -60,14 +63,24 @@ def areas(
     from station.config import read_site
     from station.products.area_tables import Span, area_records, as_csv, as_text
 
-    span = Span.parse(first, last)
-    records = area_records(read_site(site), polygons, span, against, progress_bar("summing up"))
+    settings, span = read_site(site), Span.parse(first, last)
+    _print_epochs(settings, against)
+    records = area_records(settings, polygons, span, against, progress_bar("summing up"))
     if table is None:
         print(as_text(records))
     elif table == "-":
         print(as_csv(records), end="")
     else:
         Path(table).write_text(as_csv(records), encoding="utf-8")
+
+
+def _print_epochs(settings: Site, *texts: str) -> None:
+    """Print which epochs are meant: of a time the nearest is taken."""
+    from station.products.area_tables import describe_epoch
+
+    for text in texts:
+        if description := describe_epoch(settings, text):
+            print(description, file=sys.stderr)
 
 
 def plot(
@@ -104,6 +117,7 @@ def plot(
 
     settings, span = read_site(site), Span.parse(first, last)
     out = out or Path(f"{settings.station.id}_{kind.value}.{'webp' if kind is PlotKind.film else 'png'}")
+    _print_epochs(settings, against, *([epoch] if kind is PlotKind.map else []))
     if kind is PlotKind.map:
         plots.plot_map(settings, epoch, against, show.value, out, width, limit)
     elif kind is PlotKind.film:

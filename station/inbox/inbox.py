@@ -22,7 +22,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from station.errors import NotReadyError
-from station.inbox.journal import MAX_RETRY_S, State
+from station.inbox.journal import LONGEST_RETRY_S, State
 from station.logs import logfmt
 
 if TYPE_CHECKING:
@@ -35,6 +35,8 @@ log = logging.getLogger("station")
 
 # Names that need no quotes in a log line or a shell, short enough for `<name>.txt` to be a valid file name.
 _SAFE_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._,+=@~()-]{0,99}")
+MAX_REJECTED = 1000  # per poll, so that thousands of odd files delay no scan and no sign of life
+MAX_LOGGED = 10  # of them, one line each
 WAITING_FOR_LOG = "its inclination log"
 _RECHECK_S = 5.0  # of a file that another process has open: its closing raises no event
 _FILE_TYPES = {
@@ -114,6 +116,7 @@ class Inbox:
         stable: list[ScanFile] = []
         to_precheck: ScanFile | None = None
         waiting: list[tuple[str, int, int, str]] = []
+        rejected: list[tuple[str, int, int, str]] = []
         next_s = math.inf
         for name, status in scans.items():
             if _is_done(summaries.get(safe_name(name)), status):
@@ -122,7 +125,7 @@ class Inbox:
                 self._file_states.setdefault(name, _FileState(identity, -math.inf))
                 continue
             if reason := _rejection_reason(name, status):
-                self._reject(name, status, reason)
+                rejected.append((safe_name(name), status.st_size, status.st_mtime_ns, reason))
                 continue
             scan, waiting_reason, wait_s = self._assess(name, status, files, summaries.get(name))
             waiting.append((name, status.st_size, status.st_mtime_ns, waiting_reason))
@@ -132,8 +135,11 @@ class Inbox:
             elif waiting_reason.startswith(WAITING_FOR_LOG) and _identity(status) not in self._prechecked:
                 to_precheck = to_precheck or scan
         self._journal.record_seen(waiting)
+        self._reject(rejected[:MAX_REJECTED])
+        if len(rejected) > MAX_REJECTED:
+            next_s = 0.0
         self._drop_removed(summaries, scans)
-        stable.sort(key=lambda scan: (_start_from_name(scan.name, self._pattern), scan.name))
+        stable.sort(key=lambda scan: (start_from_name(scan.name, self._pattern), scan.name))
         first = next((scan for scan in stable if not _is_open_for_writing(scan)), None)
         if stable and first is None:
             next_s = min(next_s, _RECHECK_S)
@@ -184,13 +190,17 @@ class Inbox:
         if summary is None or summary.next_try_utc_s is None or not _is_unchanged(summary, status):
             return 0.0
         remaining_s = summary.next_try_utc_s - self._now_s()
-        return remaining_s if 0 < remaining_s <= MAX_RETRY_S else 0.0  # longer: the clock was set back
+        return remaining_s if 0 < remaining_s <= LONGEST_RETRY_S else 0.0  # longer: the clock was set back
 
-    def _reject(self, name: str, status: os.stat_result, reason: str) -> None:
-        safe = safe_name(name)
-        self._journal.record_seen([(safe, status.st_size, status.st_mtime_ns, "")])
-        self._journal.set_aside(safe, reason)
-        log.warning(logfmt(scan=safe, verdict="set_aside", reason=reason))
+    def _reject(self, files: list[tuple[str, int, int, str]]) -> None:
+        """Set files aside whatever they contain: (name, size, mtime_ns, reason)."""
+        if not files:
+            return
+        self._journal.reject(files)
+        for name, _, _, reason in files[:MAX_LOGGED]:
+            log.warning(logfmt(scan=name, verdict="set_aside", reason=reason))
+        if len(files) > MAX_LOGGED:
+            log.warning(logfmt(scans=len(files) - MAX_LOGGED, verdict="set_aside", reason="see set_aside/"))
 
     def _drop_removed(self, summaries: Mapping[str, EntrySummary], scans: Iterable[str]) -> None:
         """Drop scans that were removed from the inbox before they were processed."""
@@ -262,7 +272,7 @@ def _identity(status: os.stat_result) -> tuple[int, ...]:
     return status.st_ino, status.st_size, status.st_mtime_ns
 
 
-def _start_from_name(name: str, pattern: str) -> datetime:
+def start_from_name(name: str, pattern: str) -> datetime:
     """Return the start of a scan according to its name; datetime.max (sorted last) if the name has none."""
     try:
         return datetime.strptime(Path(name).stem, pattern).replace(tzinfo=UTC)

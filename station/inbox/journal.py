@@ -24,6 +24,10 @@ if TYPE_CHECKING:
 
 FIRST_RETRY_S = 30.0  # until a deferred scan is tried again; doubled after each attempt
 MAX_RETRY_S = 3600.0
+MAX_FAILURES = 12  # inconclusive attempts until a scan is set aside for now: 17 h, the last pause 8.5 h
+LONGEST_RETRY_S = FIRST_RETRY_S * 2.0 ** (MAX_FAILURES - 2)
+SETTLING_ATTEMPTS = 6  # a scan that failed as often, after a quarter of an hour, no longer delays others
+SETTLING_S = 6 * 3600.0  # nor does one that has waited unchanged for so long, as one that stays open
 
 _EPOCH_COLUMNS = (
     "sha256",
@@ -53,7 +57,8 @@ class Entry:
     `waiting_reason` is the reason why the scan is not processed yet. `sha256`, `log_sha256`, `outcome` and
     `reason` describe the content last assessed. `epoch` (relative to the data folder), `start_utc_s`,
     `revision`, `reference` and `metrics` describe the content last stored: they are kept if an unusable file
-    arrives under the same name.
+    arrives under the same name. `judged_under` are the conditions (`Site.judging_conditions`) under which it
+    was set aside or failed: '' if they do not matter, None if an older version did not record them.
     """
 
     name: str
@@ -75,6 +80,7 @@ class Entry:
     next_try_utc_s: float | None
     first_seen_utc_s: float
     changed_utc_s: float
+    judged_under: str | None = None
 
 
 class EntrySummary(NamedTuple):
@@ -93,7 +99,8 @@ class Journal:
     """The rows of the journal and the changes the service makes to them.
 
     Every method is one transaction and raises StoreError if the file cannot be read or written. One thread of
-    one process writes (`lock.exclusive_lock`); any other process opens it with `read_only=True` at any time.
+    one process writes (`lock.exclusive_lock`), and `station retry`, which only queues scans. Any other
+    process opens it with `read_only=True` at any time.
     """
 
     def __init__(
@@ -137,6 +144,25 @@ class Journal:
                        attempts = 0, next_try_utc_s = NULL
                    WHERE size != excluded.size OR mtime_ns != excluded.mtime_ns
                        OR (state = 'waiting' AND waiting_reason != excluded.waiting_reason)""",
+                [(*file, now_s, now_s) for file in files],
+            )
+
+    def reject(self, files: Iterable[tuple[str, int, int, str]]) -> None:
+        """Set files aside that cannot be scans, (name, size, mtime_ns, reason), in one transaction."""
+        files = list(files)
+        for name, _, _, reason in files:
+            self._write_reason(name, reason)
+        now_s = self._now_s()
+        with self._transaction():
+            self._connection.executemany(
+                """INSERT INTO scan (name, size, mtime_ns, reason, state, outcome, first_seen_utc_s,
+                       changed_utc_s)
+                   VALUES (?, ?, ?, ?, 'set_aside', 'set_aside', ?, ?)
+                   ON CONFLICT (name) DO UPDATE SET
+                       size = excluded.size, mtime_ns = excluded.mtime_ns, reason = excluded.reason,
+                       state = 'set_aside', outcome = 'set_aside', sha256 = NULL, log_sha256 = '',
+                       waiting_reason = '', attempts = 0, next_try_utc_s = NULL,
+                       changed_utc_s = excluded.changed_utc_s""",
                 [(*file, now_s, now_s) for file in files],
             )
 
@@ -198,15 +224,20 @@ class Journal:
         with suppress(OSError):  # the scan is stored even if the old note stays
             self._reason_file(name).unlink(missing_ok=True)
 
-    def set_aside(self, name: str, reason: str, *, sha256: str | None = None, log_sha256: str = "") -> None:
-        """Record that a scan cannot be used, and why; write the reason to `set_aside/<name>.txt` too."""
-        try:
-            self._reasons_folder.mkdir(exist_ok=True)
-            self._reason_file(name).write_text(f"{name}: {reason}\n", encoding="utf-8")
-        except OSError as error:
-            raise StoreError(
-                f"{self._reasons_folder}: the reason for {name} cannot be written: {error}"
-            ) from error
+    def set_aside(
+        self,
+        name: str,
+        reason: str,
+        *,
+        sha256: str | None = None,
+        log_sha256: str = "",
+        judged_under: str = "",
+    ) -> None:
+        """Record that a scan cannot be used, and why; write the reason to `set_aside/<name>.txt` too.
+
+        `judged_under` are the conditions whose change makes it worth another attempt, if any do.
+        """
+        self._write_reason(name, reason)
         with self._transaction():
             self._update(
                 name,
@@ -218,6 +249,7 @@ class Journal:
                 reason=reason,
                 attempts=0,
                 next_try_utc_s=None,
+                judged_under=judged_under,
             )
 
     def defer(self, name: str, reason: str) -> float:
@@ -225,6 +257,26 @@ class Journal:
         entry = self.entry(name)
         attempts = entry.attempts + 1 if entry else 1
         delay_s = min(FIRST_RETRY_S * 2.0 ** min(attempts - 1, 20), MAX_RETRY_S)
+        self._retry_in(delay_s, name, reason, attempts, "")
+        return delay_s
+
+    def record_failure(self, name: str, reason: str, judged_under: str) -> float | None:
+        """Defer a scan whose attempt failed for a reason that may not be its own; return the delay [s].
+
+        Return None if it was set aside for now, after MAX_FAILURES attempts under the same conditions.
+        """
+        entry = self.entry(name)
+        failures = 1 + (entry.attempts if entry and entry.judged_under == judged_under else 0)
+        if failures >= MAX_FAILURES:
+            self.set_aside(
+                name, f"rejected for now, after {failures} attempts: {reason}", judged_under=judged_under
+            )
+            return None
+        delay_s = FIRST_RETRY_S * 2.0 ** (failures - 1)
+        self._retry_in(delay_s, name, reason, failures, judged_under)
+        return delay_s
+
+    def _retry_in(self, delay_s: float, name: str, reason: str, attempts: int, judged_under: str) -> None:
         with self._transaction():
             self._update(
                 name,
@@ -232,8 +284,8 @@ class Journal:
                 waiting_reason=reason,
                 attempts=attempts,
                 next_try_utc_s=self._now_s() + delay_s,
+                judged_under=judged_under,
             )
-        return delay_s
 
     def restore_unchanged(self, name: str, sha256: str) -> bool:
         """Return True if this content was already assessed under this name; then restore its former state."""
@@ -244,14 +296,20 @@ class Journal:
             self._update(name, state=entry.outcome, waiting_reason="", attempts=0, next_try_utc_s=None)
         return True
 
-    def requeue(self, names: Iterable[str]) -> None:
-        """Queue scans for reprocessing although their content is unchanged."""
+    def requeue(
+        self, names: Iterable[str], reason: str = "reprocessing", *, keep_reference: bool = True
+    ) -> None:
+        """Queue scans for processing although their content is unchanged.
+
+        They are measured from the version of the reference used before, or else from the newest.
+        """
         now_s = self._now_s()
         with self._transaction():
             self._connection.executemany(
                 """UPDATE scan SET state = 'waiting', outcome = NULL, attempts = 0, next_try_utc_s = NULL,
-                   waiting_reason = 'reprocessing', changed_utc_s = ? WHERE name = ?""",
-                [(now_s, name) for name in names],
+                   waiting_reason = ?, changed_utc_s = ?, reference = iif(?, reference, NULL)
+                   WHERE name = ?""",
+                [(reason, now_s, keep_reference, name) for name in names],
             )
 
     def import_entries(self, entries: Iterable[Entry]) -> None:
@@ -299,7 +357,8 @@ class Journal:
 
     def others_stored(self, name: str, size: int) -> dict[str, str]:
         """Return the names of other stored scans of this size by their SHA-256."""
-        entries = self._select("WHERE size = ? AND outcome = 'stored' AND name != ?", size, name)
+        where = "WHERE size = ? AND epoch IS NOT NULL AND outcome IS NOT 'set_aside' AND name != ?"
+        entries = self._select(where, size, name)
         return {entry.sha256: entry.name for entry in entries if entry.sha256}
 
     def summaries(self) -> dict[str, EntrySummary]:
@@ -336,6 +395,33 @@ class Journal:
         query = "SELECT name FROM scan WHERE state = 'stored' AND coalesce(reference, '') = '' ORDER BY name"
         with self._store_errors():
             return [name for (name,) in self._connection.execute(query)]
+
+    def judged_otherwise(self, conditions: str) -> list[str]:
+        """Return the names of scans set aside, or failed, under other conditions than these; sorted."""
+        query = (
+            "SELECT name FROM scan WHERE state IN ('set_aside', 'later')"
+            " AND judged_under IS NOT '' AND judged_under IS NOT ? ORDER BY name"
+        )
+        with self._store_errors():
+            return [name for (name,) in self._connection.execute(query, (conditions,))]
+
+    def unsettled(self) -> dict[str, float | None]:
+        """Return the starts [s], if known, of scans that will be judged soon, for which others may wait."""
+        query = (
+            "SELECT name, start_utc_s FROM scan WHERE (state = 'waiting' AND abs(changed_utc_s - ?) < ?)"
+            " OR (state = 'later' AND attempts < ?) ORDER BY name"
+        )
+        with self._store_errors():
+            parameters = self._now_s(), SETTLING_S, SETTLING_ATTEMPTS
+            return dict(self._connection.execute(query, parameters).fetchall())
+
+    def starting_at(self, start_utc_s: float) -> list[str]:
+        """Return the names of the scans with an epoch of this start, to the second; sorted."""
+        query = (
+            "SELECT name FROM scan WHERE epoch IS NOT NULL AND CAST(start_utc_s AS INTEGER) = ? ORDER BY name"
+        )
+        with self._store_errors():
+            return [name for (name,) in self._connection.execute(query, (int(start_utc_s),))]
 
     def waiting(self) -> list[Entry]:
         """Return the rows that are neither stored nor set aside, sorted by name."""
@@ -386,6 +472,15 @@ class Journal:
         return {state.value: int(counts.get(state.value, 0)) for state in State}
 
     # ---- SQLite
+
+    def _write_reason(self, name: str, reason: str) -> None:
+        try:
+            self._reasons_folder.mkdir(exist_ok=True)
+            self._reason_file(name).write_text(f"{name}: {reason}\n", encoding="utf-8")
+        except OSError as error:
+            raise StoreError(
+                f"{self._reasons_folder}: the reason for {name} cannot be written: {error}"
+            ) from error
 
     def _reason_file(self, name: str) -> Path:
         return self._reasons_folder / f"{name}.txt"

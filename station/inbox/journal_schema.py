@@ -25,7 +25,8 @@ CREATE TABLE IF NOT EXISTS scan (
     attempts INTEGER NOT NULL DEFAULT 0,
     next_try_utc_s REAL,
     first_seen_utc_s REAL NOT NULL,
-    changed_utc_s REAL NOT NULL
+    changed_utc_s REAL NOT NULL,
+    judged_under TEXT
 ) STRICT;
 CREATE INDEX IF NOT EXISTS scan_by_size ON scan (size);
 CREATE TABLE IF NOT EXISTS file (
@@ -33,7 +34,10 @@ CREATE TABLE IF NOT EXISTS file (
     sha256 TEXT NOT NULL
 ) STRICT;
 """
-_ADDED_COLUMNS = {"log_sha256": "TEXT NOT NULL DEFAULT ''"}  # missing in older journals
+_ADDED_COLUMNS = {  # missing in older journals
+    "log_sha256": "TEXT NOT NULL DEFAULT ''",
+    "judged_under": "TEXT",
+}
 
 
 def open_to_write(path: Path) -> sqlite3.Connection:
@@ -43,10 +47,8 @@ def open_to_write(path: Path) -> sqlite3.Connection:
         connection.execute("PRAGMA journal_mode = WAL")
         connection.execute("PRAGMA synchronous = FULL")
         connection.executescript(_SCHEMA)
-        existing = {column[1] for column in connection.execute("PRAGMA table_info(scan)")}
-        for column, declaration in _ADDED_COLUMNS.items():
-            if column not in existing:
-                connection.execute(f"ALTER TABLE scan ADD COLUMN {column} {declaration}")
+        for column in _missing_columns(connection):
+            connection.execute(f"ALTER TABLE scan ADD COLUMN {column} {_ADDED_COLUMNS[column]}")
     except sqlite3.Error:
         connection.close()
         raise
@@ -63,9 +65,26 @@ def open_to_read(path: Path) -> sqlite3.Connection:
     uri = f"{path.absolute().as_uri()}?{mode}"
     connection = sqlite3.connect(uri, uri=True, isolation_level=None, timeout=20.0)
     if connection.execute("SELECT 1 FROM sqlite_master WHERE name = 'scan'").fetchone():
-        return connection
+        return _with_all_columns(connection)
     connection.close()  # the service has just started, or was killed while it created the file
     return _empty()
+
+
+def _missing_columns(connection: sqlite3.Connection) -> list[str]:
+    existing = {column[1] for column in connection.execute("PRAGMA table_info(scan)")}
+    return [column for column in _ADDED_COLUMNS if column not in existing]
+
+
+def _with_all_columns(connection: sqlite3.Connection) -> sqlite3.Connection:
+    """Return the connection; of a journal that no new service has opened yet, a completed copy in memory."""
+    if not (missing := _missing_columns(connection)):
+        return connection
+    copy = sqlite3.connect(":memory:", isolation_level=None)
+    connection.backup(copy)
+    connection.close()
+    for column in missing:
+        copy.execute(f"ALTER TABLE scan ADD COLUMN {column} {_ADDED_COLUMNS[column]}")
+    return copy
 
 
 def _empty() -> sqlite3.Connection:

@@ -1,10 +1,15 @@
-"""Exclusive lock on the data folder: only one process writes to it."""
+"""Exclusive lock on the data folder: only one process writes to it, and never to another folder in its place.
+
+A folder has a random identity, `.store_id`. The service remembers the identity in the state folder that
+systemd provides, so that it does not begin a second series in the mount point of a disk that is missing.
+"""
 
 from __future__ import annotations
 
 import fcntl
 import os
 import time
+import uuid
 from contextlib import contextmanager, suppress
 from typing import TYPE_CHECKING
 
@@ -14,18 +19,110 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
     from pathlib import Path
 
+LOCK = "service.lock"
+IDENTITY = ".store_id"
+
+
+class LockedFolder:
+    """The data folder that this process has locked."""
+
+    def __init__(self, data: Path, lock_fd: int) -> None:
+        self._data = data
+        self._lock_fd = lock_fd
+        self._folder = _file_id(data)
+        self._identity = _identify(data)
+
+    def require_same(self) -> None:
+        """Raise StoreError unless the path still leads to the folder that is locked.
+
+        A lock file that was deleted is created and locked again.
+        """
+        locked = os.fstat(self._lock_fd)
+        if _file_id(self._data / LOCK) == (locked.st_dev, locked.st_ino):
+            return
+        if _file_id(self._data) != self._folder:
+            raise StoreError(
+                f"{self._data}: another folder is in its place, or none: mount or move the right one back,"
+                " the service then resumes"
+            )
+        new_fd = _open_lock(self._data)
+        try:
+            if not _try_lock(new_fd, fcntl.LOCK_EX):
+                raise StoreError(f"{self._data}: its lock was deleted, and another process uses it now")
+            os.dup2(new_fd, self._lock_fd, inheritable=False)
+        finally:
+            os.close(new_fd)
+
+    def is_remounted(self) -> bool:
+        """Return True if the path leads to the same store through another mount than when it was locked."""
+        return _file_id(self._data) != self._folder and self._identity == read_identity(self._data) != ""
+
+
+def require_known(data: Path, state: Path) -> None:
+    """Raise StoreError if a data folder is not the store that it was before, as remembered in `state`.
+
+    The store is remembered for the next time.
+    """
+    if data == state or state in data.parents:  # they come and go together
+        return
+    path, remembered = state / "data_folder", ""
+    with suppress(OSError):
+        remembered = path.read_text(encoding="utf-8", errors="replace")
+    identity = read_identity(data)
+    if remembered.startswith(f"{data}\n") and remembered != f"{data}\n{identity}\n":
+        raise StoreError(
+            f"{data}: is not the folder of the stored series: is its disk mounted? To begin a new series in"
+            f" this folder, delete {path}"
+        )
+    with suppress(OSError):
+        path.write_text(f"{data}\n{identity or _identify(data)}\n", encoding="utf-8")
+
+
+def read_identity(data: Path) -> str:
+    """Return the identity of a data folder, '' if it has none."""
+    try:
+        return (data / IDENTITY).read_text(encoding="ascii", errors="replace").strip()
+    except OSError:
+        return ""
+
+
+def _identify(data: Path) -> str:
+    """Return the identity of a data folder, which is given one if it has none and the disk is not full."""
+    if not read_identity(data):
+        tmp_path = data / f"{IDENTITY}.{os.getpid()}"
+        with suppress(OSError):
+            tmp_path.write_text(f"{uuid.uuid4()}\n", encoding="ascii")
+            tmp_path.replace(data / IDENTITY)
+    return read_identity(data)
+
+
+def _file_id(path: Path) -> tuple[int, int]:
+    """Return device and inode of a file or folder; zeros if it does not exist."""
+    try:
+        status = path.stat()
+    except OSError:
+        return 0, 0
+    return status.st_dev, status.st_ino
+
+
+def _open_lock(data: Path) -> int:
+    try:
+        return os.open(data / LOCK, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o640)
+    except OSError as error:
+        raise StoreError(f"{data}: the data folder is not writable: {error.strerror}") from error
+
 
 @contextmanager
-def exclusive_lock(data: Path, *, timeout_s: float = 2.0) -> Iterator[None]:
+def exclusive_lock(data: Path, *, timeout_s: float = 2.0) -> Iterator[LockedFolder]:
     """Lock the data folder for this process; raise NotReadyError if another process has locked it.
 
     The time-out is needed because `station status` takes the same lock for a moment.
     """
     try:
         data.mkdir(parents=True, exist_ok=True)
-        lock_fd = os.open(data / "service.lock", os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o640)
     except OSError as error:
         raise StoreError(f"{data}: the data folder is not writable: {error.strerror}") from error
+    lock_fd = _open_lock(data)
     try:
         until_s = time.monotonic() + timeout_s
         while not _try_lock(lock_fd, fcntl.LOCK_EX):
@@ -39,7 +136,7 @@ def exclusive_lock(data: Path, *, timeout_s: float = 2.0) -> Iterator[None]:
         with suppress(OSError):  # the disk is full: the lock is valid, only the pid is missing
             os.ftruncate(lock_fd, 0)
             os.pwrite(lock_fd, b"%d\n" % os.getpid(), 0)
-        yield
+        yield LockedFolder(data, lock_fd)
     finally:
         os.close(lock_fd)
 
@@ -47,7 +144,7 @@ def exclusive_lock(data: Path, *, timeout_s: float = 2.0) -> Iterator[None]:
 def is_locked(data: Path) -> bool:
     """Return True if a process has locked the data folder."""
     try:
-        lock_fd = os.open(data / "service.lock", os.O_RDONLY | os.O_CLOEXEC)
+        lock_fd = os.open(data / LOCK, os.O_RDONLY | os.O_CLOEXEC)
     except OSError:
         return False
     try:

@@ -35,6 +35,7 @@ CALIBRATION_SCANS = 24  # newest scans that test the calibration of sigma
 MIN_CALIBRATION_SCANS = 8  # with fewer, the calibration is not tested
 MIN_ARRIVED_SCANS = 4  # scans per day; with fewer, a share is meaningless
 RESTART_ALLOWANCE_S = 600.0  # an update or a reboot may take this long
+EDITING_ALLOWANCE_S = 600.0  # and the correction of a file that was edited
 
 
 def evaluate_rules(
@@ -59,6 +60,7 @@ def evaluate_rules(
 
     evaluate_rule("the service works", lambda: _service(site, rules, since_utc_s, now_s))
     evaluate_rule("the disk has room", lambda: _disk(site, rules))
+    evaluate_rule("the input files can be used", lambda: _inputs(site))
     if rules.moved and site.adjusts:
         evaluate_rule("the scanner was moved", lambda: _scanner_moved(site))
     if rules.change:
@@ -144,6 +146,15 @@ def _disk(site: Site, rules: AlarmsSection) -> Iterator[Alarm]:
             require_disk_space(site)
         except StoreError as error:
             yield Alarm("disk", str(error))
+
+
+def _inputs(site: Site) -> Iterator[Alarm]:
+    """Yield an alarm if areas, flags, stable ground or the weather log cannot be used."""
+    from station.processing.usable_inputs import usable_site, weather_fault  # noqa: PLC0415 - a second of imports
+
+    faults = [*usable_site(site).input_faults, *filter(None, [weather_fault(site)])]
+    if faults:  # an editor may have saved half a file
+        yield Alarm("inputs", "; ".join(faults), min_duration_s=EDITING_ALLOWANCE_S)
 
 
 def _scanner_moved(site: Site) -> Iterator[Alarm]:

@@ -4,9 +4,15 @@ from __future__ import annotations
 
 import logging
 import shutil
+import socket
+import threading
 from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
-from typing import TYPE_CHECKING
+from ipaddress import ip_address
+from typing import TYPE_CHECKING, Any
+from urllib.parse import urlsplit
+from wsgiref.simple_server import WSGIRequestHandler, WSGIServer
 
 from station.config import Site
 from station.errors import ConfigError, StationError
@@ -29,6 +35,68 @@ SCAN_METRICS = {
     "roll_deg": ("station_roll_degrees", "Mean roll of the scanner in the newest scan."),
     "pitch_deg": ("station_pitch_degrees", "Mean pitch of the scanner in the newest scan."),
 }
+THREADS = 2  # that answer requests: one for Prometheus, one for a person
+MAX_CONNECTIONS = 16  # answered or waiting; further ones are closed at once
+CONNECTION_TIMEOUT_S = 3.0  # for which a client may be silent
+
+
+class _Server(WSGIServer):
+    """Web server with a limited number of threads and connections, however many clients connect."""
+
+    request_queue_size = 128
+
+    def __init__(self, address: tuple[str, int], app: Any) -> None:  # noqa: ANN401 - of prometheus_client
+        self.address_family = socket.AF_INET6 if ":" in address[0] else socket.AF_INET
+        self._threads = ThreadPoolExecutor(THREADS, "metrics")
+        self._free_connections = threading.BoundedSemaphore(MAX_CONNECTIONS)
+        super().__init__(address, _RequestHandler)
+        self.set_app(app)
+
+    def process_request(self, request: Any, client_address: Any) -> None:  # noqa: ANN401 - of the base class
+        if not self._free_connections.acquire(blocking=False):
+            self.shutdown_request(request)
+            return
+        self._threads.submit(self._answer, request, client_address)
+
+    def _answer(self, request: Any, client_address: Any) -> None:  # noqa: ANN401
+        try:
+            self.finish_request(request, client_address)
+        except OSError:  # the client has gone, or was silent for too long
+            return
+        finally:
+            self.shutdown_request(request)
+            self._free_connections.release()
+
+    def server_close(self) -> None:
+        super().server_close()
+        self._threads.shutdown(cancel_futures=True)
+
+
+def _is_loopback(host: str) -> bool:
+    try:
+        return ip_address(host).is_loopback
+    except ValueError:
+        return host == "localhost"
+
+
+def _only_for_loopback(app: Any) -> Any:  # noqa: ANN401 - WSGI
+    """Return a WSGI app that refuses requests to other host names: a web page may point one at loopback."""
+
+    def answer(environ: dict[str, Any], start_response: Any) -> Any:  # noqa: ANN401
+        host = urlsplit(f"//{environ.get('HTTP_HOST', '')}").hostname or ""
+        if _is_loopback(host):
+            return app(environ, start_response)
+        start_response("403 Forbidden", [("Content-Type", "text/plain")])
+        return [b"only for this machine\n"]
+
+    return answer
+
+
+class _RequestHandler(WSGIRequestHandler):
+    timeout = CONNECTION_TIMEOUT_S
+
+    def log_message(self, *_: object) -> None:
+        """Log no requests."""
 
 
 class Metrics:
@@ -46,13 +114,15 @@ class Metrics:
             yield
             return
         registry = self._registry()
-        from prometheus_client import start_http_server  # noqa: PLC0415 - an extra
+        from prometheus_client import make_wsgi_app  # noqa: PLC0415 - an extra
 
         host, _, port = address.rpartition(":")
         try:
-            server, thread = start_http_server(int(port), host.strip("[]"), registry)
+            server = _Server((host.strip("[]"), int(port)), _only_for_loopback(make_wsgi_app(registry)))
         except OSError as error:
             raise ConfigError(f"service.metrics = {address!r}: cannot listen: {error.strerror}") from error
+        thread = threading.Thread(target=server.serve_forever, daemon=True)
+        thread.start()
         try:
             yield
         finally:

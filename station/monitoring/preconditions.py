@@ -20,7 +20,7 @@ _EPOCH_BYTES_PER_CELL = 40  # uncompressed, with all error terms; `station check
 
 
 def require_disk_space(site: Site) -> None:
-    """Raise StoreError if the disk has too little space for another epoch, or no free inodes."""
+    """Raise StoreError if the disk is read-only, has too little space for another epoch, or no inodes."""
     folder = site.station.data
     cells = site.grid.shape[0] * site.grid.shape[1]
     required = _RESERVE_BYTES + _EPOCH_BYTES_PER_CELL * cells
@@ -28,6 +28,10 @@ def require_disk_space(site: Site) -> None:
         disk = os.statvfs(folder)
     except OSError as error:
         raise StoreError(f"{folder}: the data folder cannot be reached: {error.strerror}") from error
+    if disk.f_flag & os.ST_RDONLY:
+        raise StoreError(
+            f"{folder}: its disk has gone read-only: check it and mount it again, the service then resumes"
+        )
     free = disk.f_bavail * disk.f_frsize
     if free < required:
         raise StoreError(

@@ -18,6 +18,7 @@ from station.readers.scan import suffixes
 if TYPE_CHECKING:
     from station.config import Site
 
+MAX_LISTED = 50  # scans of a kind, in the text
 Status = dict[str, Any]  # printed by `station status --json`
 
 
@@ -26,11 +27,14 @@ def status(site: Site) -> Status:
 
     Works with or without a running service. Raises StoreError if the journal cannot be read.
     """
-    data = site.station.data
+    from station.processing.usable_inputs import usable_site  # noqa: PLC0415 - a second of imports
+
+    site, data = usable_site(site), site.station.data
     with Journal(data / "journal.sqlite", read_only=True) as journal:
         queue = _queue_status(site, journal)
         counts = journal.counts()
         last = journal.last_stored()
+        queued = [entry.epoch for entry in journal.waiting() if entry.epoch]
     return {
         "station": site.station.id,
         "name": site.station.name,
@@ -41,7 +45,7 @@ def status(site: Site) -> Status:
         "last": _last_scan(last) if last else None,
         "moved": _last_pose_step(site),
         "alarms": active(data),
-        "stale": _count_outdated(site),
+        "stale": _count_outdated(site, queued),
         "series": str(data / "series.nc") if (data / "series.nc").exists() else None,
         "disk_free_gb": round(shutil.disk_usage(data).free / 1e9, 2) if data.is_dir() else None,
         "faults": [*queue["faults"], *filter(None, [_log_clock_problem(site)])],
@@ -49,7 +53,10 @@ def status(site: Site) -> Status:
 
 
 def queue_status(site: Site) -> Status:
-    """Return the part of `status` that needs no series: waiting scans, scans set aside, faults."""
+    """Return the part of `status` that needs no series: waiting scans, scans set aside, faults.
+
+    `input_faults` of the site are among the faults.
+    """
     with Journal(site.station.data / "journal.sqlite", read_only=True) as journal:
         return _queue_status(site, journal)
 
@@ -71,7 +78,15 @@ def _queue_status(site: Site, journal: Journal) -> Status:
         {"scan": name, "state": "new", "for": new_scans_wait_for, "next_try": None}
         for name in journal.unrecorded(names)
     ]
-    faults = (inbox_problem, _disk_space_problem(site), clock_problem(site.station.data, time.time()))
+    from station.processing.usable_inputs import weather_fault  # noqa: PLC0415 - as in `status`
+
+    faults = (
+        inbox_problem,
+        _disk_space_problem(site),
+        clock_problem(site.station.data, time.time()),
+        *site.input_faults,
+        weather_fault(site),
+    )
     return {"waiting": waiting, "set_aside": set_aside, "faults": [fault for fault in faults if fault]}
 
 
@@ -97,10 +112,14 @@ def format_status(report: Status) -> str:
     lines += [f"moved    {report['moved']}"] if report["moved"] else []
     lines += [f"alarm    {text}" for text in report["alarms"].values()]
     lines += [f"fault    {fault}" for fault in report["faults"]]
-    for scan in report["waiting"]:
+    for scan in report["waiting"][:MAX_LISTED]:
         next_try = f", next try {scan['next_try']}" if scan["next_try"] else ""
         lines.append(f"waits    {scan['scan']}: {scan['for'] or 'its turn'}{next_try}")
-    lines += [f"aside    {scan['scan']}: {scan['reason']}" for scan in report["set_aside"]]
+    if (left_out := waiting - MAX_LISTED) > 0:
+        lines.append(f"waits    and {left_out} more: station status --json")
+    lines += [f"aside    {scan['scan']}: {scan['reason']}" for scan in report["set_aside"][-MAX_LISTED:]]
+    if (left_out := len(report["set_aside"]) - MAX_LISTED) > 0:
+        lines.append(f"aside    and {left_out} more: station status --json")
     return "\n".join(lines)
 
 
@@ -136,7 +155,7 @@ def _last_pose_step(site: Site) -> str:
 
     try:
         return latest_step(site) if (site.station.data / "series.nc").is_file() else ""
-    except StoreError as error:
+    except (StoreError, ValueError) as error:
         return str(error)
 
 
@@ -145,19 +164,19 @@ def _log_clock_problem(site: Site) -> str:
 
     try:
         return log_clock_offset(site) if site.adjusts and (site.station.data / "series.nc").is_file() else ""
-    except StoreError as error:
+    except (StoreError, ValueError) as error:  # of a text, if series.nc is damaged
         return str(error)
 
 
-def _count_outdated(site: Site) -> int | None:
+def _count_outdated(site: Site, queued: list[str]) -> int | None:
     """Return the number of epochs whose settings are outdated; None if it cannot be determined now."""
     if not (site.station.data / "series.nc").is_file():
         return 0
     from station.processing.staleness import count_outdated  # noqa: PLC0415 - a second of imports
 
     try:
-        return count_outdated(site)
-    except StationError:
+        return count_outdated(site, queued)
+    except (StationError, ValueError):
         return None
 
 

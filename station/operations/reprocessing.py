@@ -19,6 +19,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from station.archive.reference_files import valid_versions
+from station.archive.tilt_offsets import read_tilt_offset
 from station.config import Site
 from station.errors import NotReadyError, ScanError
 from station.inbox.inbox import ScanFile
@@ -35,7 +36,7 @@ from station.processing.reference_tasks import (
     scans_for_version,
     update_reference_version,
 )
-from station.processing.scan_inputs import load_scan_inputs, read_tilt_offset, sop_identity
+from station.processing.scan_inputs import load_scan_inputs, sop_identity
 from station.processing.scan_tasks import Progress as Tick
 from station.processing.scan_tasks import (
     Rejected,
@@ -46,6 +47,7 @@ from station.processing.scan_tasks import (
     series_for,
 )
 from station.processing.staleness import Plan, Task, plan_reprocessing, usable_scans
+from station.processing.usable_inputs import usable_site
 from station.readers.scan import utc_interval
 from station.readers.sop import valid_sop
 from station.service.worker import Worker, record_result
@@ -63,7 +65,9 @@ def reprocess(
     The status is 3 if a scan is missing or was set aside, 75 if interrupted; finished epochs are kept. Raises
     NotReadyError if the service is running, or if the reference has to be rebuilt and its scans are missing.
     """
-    data = site.station.data
+    site, data = usable_site(site, save=not dry_run), site.station.data
+    for fault in site.input_faults:
+        report(f"fault: {fault}")
     if dry_run:
         with Journal(data / "journal.sqlite", read_only=True) as journal:
             return Reprocessing(site, journal, report, threading.Event()).dry_run(_seconds(span))
@@ -240,7 +244,11 @@ class Reprocessing:
         if isinstance(result, Rejected):
             self._report(f"  {task.name}: set aside: {result.reason}")
             self._journal.set_aside(
-                task.name, result.reason, sha256=result.sha256 or None, log_sha256=result.log_sha256
+                task.name,
+                result.reason,
+                sha256=result.sha256 or None,
+                log_sha256=result.log_sha256,
+                judged_under=self._site.judging_conditions,
             )
             return 1
         record_result(self._journal, task.name, result)

@@ -6,7 +6,7 @@ import math
 import os
 import shutil
 import time
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 from station.config import Site, read_site
@@ -15,9 +15,18 @@ from station.inbox.journal import Journal
 from station.inbox.lock import is_locked
 from station.inbox.scan_files import scan_file
 from station.monitoring.preconditions import EARLIEST_S
+from station.operations.site_plausibility import (
+    LevelAndMessage,
+    alarm_findings,
+    overlap_findings,
+    position_findings,
+    rights_findings,
+    setting_findings,
+    weather_time_findings,
+)
 from station.processing import isolation
 from station.processing.integrity import check_store
-from station.processing.scan_inputs import pressure_fault, scanner_height_m, scanner_to_map
+from station.processing.scan_inputs import map_position, pressure_fault, scanner_height_m, scanner_to_map
 from station.processing.scan_tasks import dry_run, load_areas, polygon_cells, series_for
 from station.readers.flags import read_flags
 from station.readers.scan import suffixes
@@ -33,9 +42,11 @@ def site_findings(site_path: Path) -> list[Finding]:
     site = read_site(site_path)
     return [
         _finding("ok", "config", f"{site_path}: {site.station.name or site.station.id}"),
+        *_named("settings", setting_findings(site)),
         *_sop_poses(site),
         *_polygons(site),
         *_folders(site),
+        *_named("rights", rights_findings(site, _files_read(site))),
         *_flags(site),
         *_clock(),
         *_weather(site),
@@ -64,6 +75,29 @@ def _check_store_isolated(site: Site) -> list[tuple[str, str, str]]:
     )
 
 
+def _named(what: str, findings: Iterable[LevelAndMessage]) -> Iterator[Finding]:
+    for level, message in findings:
+        yield _finding(level, what, message)
+
+
+def _files_read(site: Site) -> list[Path]:
+    """Return the files that the service reads, as far as they exist."""
+    files = [site.path, *(sop.file for sop in site.sop), *_scans(site)[-1:]]
+    files += [section.file for section in (site.weather, site.areas, site.flags) if section]
+    files += [
+        path
+        for path in (site.map.pop, site.adjustment.stable, site.reference.scans)
+        if isinstance(path, Path)
+    ]
+    if site.inclination:
+        files += [
+            log
+            for scan in _scans(site)[-1:]
+            if (log := scan.with_name(scan.stem + site.inclination.suffix)).exists()
+        ]
+    return files
+
+
 def _finding(level: str, what: str, message: str) -> Finding:
     return {"level": level, "what": what, "message": message}
 
@@ -88,6 +122,7 @@ def _sop_poses(site: Site) -> Iterator[Finding]:
             f"{sop.file.name} from {sop.from_:%Y-%m-%d}: scanner at"
             f" {east_m:.2f} {north_m:.2f} {height_m:.2f}, tilt {tilt_deg:.2f}°",
         )
+        yield from _named("sop", position_findings(site, sop.file.name, frame.position_m, map_position(site)))
         distance_m = math.hypot(
             max(grid.west_m - east_m, 0.0, east_m - grid.west_m - grid.nx * grid.cell_m),
             max(north_m - grid.north_m, 0.0, grid.north_m - grid.ny * grid.cell_m - north_m),
@@ -101,7 +136,8 @@ def _sop_poses(site: Site) -> Iterator[Finding]:
 def _polygons(site: Site) -> Iterator[Finding]:
     """Yield the number of cells in each named polygon."""
     try:
-        areas = {f"area {name}": cells for name, cells in load_areas(site).items()}
+        named = load_areas(site)
+        areas = {f"area {name}": cells for name, cells in named.items()}
         if isinstance(site.adjustment.stable, Path) and site.adjustment.method == "joint":
             areas["stable ground"] = polygon_cells(site.adjustment.stable, site)
     except StationError as error:
@@ -110,12 +146,15 @@ def _polygons(site: Site) -> Iterator[Finding]:
     for name, cells in areas.items():
         message = f"{name}: {int(cells.sum()):,} cells of the grid"
         yield _finding("ok" if cells.any() else "fault", "polygons", message)
+    if (stable := areas.get("stable ground")) is not None:
+        yield from _named("polygons", overlap_findings(named, stable))
+    yield from _named("alarms", alarm_findings(site, set(named)))
 
 
 def _folders(site: Site) -> Iterator[Finding]:
     inbox, data = site.scans.inbox, site.station.data
-    if not inbox.is_dir():
-        yield _finding("fault", "inbox", f"{inbox}: no such folder")
+    if not os.path.isdir(inbox):  # noqa: PTH112 - Path raises an error if a parent cannot be read
+        yield _finding("fault", "inbox", f"{inbox}: no such folder, or no permission to see it")
     elif not os.access(inbox, os.R_OK | os.X_OK):
         yield _finding("fault", "inbox", f"{inbox}: no permission to read")
     else:
@@ -167,6 +206,7 @@ def _weather(site: Site) -> Iterator[Finding]:
         yield _finding("warning", "weather", f"{settings.file}: no rows yet")
         return
     last_s = float(log.time_utc_s[-1])
+    yield from _named("weather", weather_time_findings(last_s))
     air = interpolate_air(log, last_s, settings.max_age_s)
     message = f"{len(log.time_utc_s)} rows up to {time.strftime('%Y-%m-%d %H:%M UTC', time.gmtime(last_s))}"
     if air is None:
@@ -186,12 +226,16 @@ def _newest_height_m(site: Site) -> float | None:
 
 
 def _scans(site: Site) -> list[Path]:
-    return sorted(path for path in site.scans.inbox.iterdir() if path.suffix.lower() in suffixes())
+    """Return the scans in the inbox, by name; none if it cannot be read."""
+    try:
+        return sorted(path for path in site.scans.inbox.iterdir() if path.suffix.lower() in suffixes())
+    except OSError:  # a finding of its own
+        return []
 
 
 def _newest_scan(site: Site) -> Iterator[Finding]:
     """Measure the newest scan without storing it."""
-    scans = _scans(site) if site.scans.inbox.is_dir() else []
+    scans = _scans(site)
     if not scans:
         yield _finding("warning", "scan", "no scan in the inbox to measure")
         return

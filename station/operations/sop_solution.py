@@ -10,7 +10,6 @@ from pathlib import Path
 
 import numpy as np
 from pyproj import CRS, Transformer
-from pyproj.exceptions import CRSError
 from scipy.spatial.transform import Rotation
 
 from station.errors import ConfigError, StoreError
@@ -21,7 +20,7 @@ from station.scanners import SCANNERS
 from station.science.geometry import pose
 from station.science.geometry.registration import POSE, Features, Registration, solve
 from station.science.uncertainty.point_covariance import shot_covariance
-from station.sections import ScannerSection
+from station.sections import ScannerSection, require_projected
 
 MAX_STANDARDISED = 3.3  # sigmas: exceeded by chance by one residual in a thousand
 
@@ -159,14 +158,11 @@ class _LevelFrame:
 
 
 def _projected_crs(crs: str) -> CRS:
-    """Return the horizontal part of a CRS; raise ConfigError if it is unknown or not projected."""
+    """Return the horizontal part of a CRS; raise ConfigError unless it is projected and in metres."""
     try:
-        projected = pose.horizontal_crs(crs)
-    except CRSError as error:
-        raise ConfigError(f"--crs {crs}: unknown to PROJ") from error
-    if not projected.is_projected:
-        raise ConfigError(f"--crs {crs}: in degrees: name a projected CRS, such as EPSG:32632")
-    return projected
+        return pose.horizontal_crs(require_projected(crs))
+    except ValueError as error:
+        raise ConfigError(f"--crs {crs}: {error}") from error
 
 
 def _write_new(path: Path, text: str) -> None:

@@ -5,7 +5,6 @@ Functions with a `progress` argument read many files and run in a worker process
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from datetime import datetime
@@ -14,6 +13,9 @@ from pathlib import Path
 import h5py
 import numpy as np
 
+from station.archive.areas import FILE_NAME as AREAS
+from station.archive.areas import is_intact as areas_intact
+from station.archive.atomic_files import DAMAGED
 from station.archive.epochs import (
     EpochRef,
     compacted_files,
@@ -25,19 +27,21 @@ from station.archive.netcdf_layout import Series, decode_text
 from station.archive.reference_files import version_path
 from station.archive.schema import VERDICTS
 from station.archive.series.index import list_epochs, source_files
-from station.archive.series.manifest import index_if_current
+from station.archive.series.manifest import index_if_current, is_intact
+from station.archive.tilt_offsets import (
+    damaged_tilt_offsets,
+    read_tilt_offset,
+    stored_tilt_offsets,
+    write_tilt_offset,
+)
 from station.config import Site
 from station.errors import StoreError
 from station.inbox.file_hash import sha256_file
 from station.inbox.journal import Entry, State
 from station.inbox.scan_files import find_scan
 from station.processing.provenance import StoredEpoch, stored_epochs
-from station.processing.scan_inputs import read_tilt_offset, write_tilt_offset
 from station.processing.scan_tasks import Progress, series_for
 from station.readers.scan import suffixes
-from station.science.geometry.inclination import CyclicError
-
-DAMAGED = ".damaged"  # appended to the file name; such a file is never read and never deleted
 
 
 @dataclass(frozen=True)
@@ -208,6 +212,7 @@ def check_store(
     ]
     findings += _check_references(series)
     findings += _check_series(series, refs, is_complete=not verification.damaged)
+    findings += _check_derived(series)
     file_count = len(checksums) + len(verification.new_checksums)
     return [("ok", "store", f"{file_count} files, {len({ref.start for ref in refs})} epochs"), *findings]
 
@@ -251,19 +256,30 @@ def _check_references(series: Series) -> list[tuple[str, str, str]]:
     return [("fault", "reference", f"reference_{version}.nc {message}") for version in missing]
 
 
+def _check_derived(series: Series) -> list[tuple[str, str, str]]:
+    """Return findings on `areas.nc` and the tilt offsets, which the service restores while it runs."""
+    paths = damaged_tilt_offsets(series.folder)
+    if (series.folder / AREAS).exists() and not areas_intact(series):
+        paths.append(series.folder / AREAS)
+    message = "damaged: the service restores it with the next scan"
+    return [("fault", "file", f"{path.relative_to(series.folder)}: {message}") for path in paths]
+
+
 def _check_series(series: Series, refs: list[EpochRef], *, is_complete: bool) -> list[tuple[str, str, str]]:
     """Return findings if `series.nc` does not contain the stored epochs in order of time."""
     if not refs:
         return []
     if not series.path.is_file():
         return [("fault", "series", "series.nc is missing: the service rebuilds it when it starts")]
+    if not is_intact(series):
+        return [("fault", "series", "series.nc is damaged: the service rebuilds it with the next scan")]
     try:
         missing = [path for path in source_files(series.path) if not path.is_file()]
         with h5py.File(series.path, "r") as file:
             times = np.asarray(file["time"][:])
             names = decode_text(file["epoch_file"][:])
     except (StoreError, OSError, RuntimeError, KeyError) as error:
-        return [("fault", "series", f"series.nc is damaged: the service rebuilds it when it starts: {error}")]
+        return [("fault", "series", f"series.nc cannot be read: {error}")]
     remedy = "start the service or run station reprocess to rebuild it"
     findings = [
         ("fault", "series", f"series.nc refers to {path}, which is missing: {remedy}") for path in missing
@@ -276,25 +292,11 @@ def _check_series(series: Series, refs: list[EpochRef], *, is_complete: bool) ->
 
 
 def restore_tilt_offsets(site: Site, progress: Progress) -> None:
-    """Restore missing tilt offsets of SOPs from the stored epochs."""
-    if site.inclination is None or site.inclination.mode == "absolute":
-        return
-    for sop_id, tilt_offset in _tilt_offsets(series_for(site)).items():
+    """Restore lost and damaged tilt offsets of SOPs from the stored epochs."""
+    for sop_id, tilt_offset in stored_tilt_offsets(site).items():
         progress()
-        if tilt_offset and read_tilt_offset(site, sop_id) is None:
-            write_tilt_offset(site, sop_id, CyclicError(**json.loads(tilt_offset)))
-
-
-def _tilt_offsets(series: Series) -> dict[str, str]:
-    """Return the tilt offset stored in the first epoch of each SOP, from the series or else the epochs."""
-    try:
-        with h5py.File(series.path, "r") as file:
-            columns = [decode_text(file[name][:]) for name in ("sop_id", "sop_tilt_offset")]
-    except (OSError, RuntimeError, KeyError):
-        provenances = [item.provenance for item in stored_epochs(series)]
-        columns = [[item.sop_id for item in provenances], [item.sop_tilt_offset for item in provenances]]
-    pairs = [(sop_id, tilt_offset) for sop_id, tilt_offset in zip(*columns, strict=True) if tilt_offset]
-    return dict(reversed(pairs))
+        if read_tilt_offset(site, sop_id) is None:
+            write_tilt_offset(site, sop_id, tilt_offset)
 
 
 def _journal_entry(site: Site, stored: StoredEpoch) -> Entry:

@@ -1,9 +1,8 @@
 """Isolation of tasks in worker processes with limited memory and time.
 
 A corrupt scan can hang the decoder, abort the process, allocate 15 GB, or panic past `except Exception`.
-Workers are forked from a server process without threads that has preloaded the large modules, so that they
-start within milliseconds. A task is a function that a fresh interpreter can import; its last argument is
-`progress()`. Source: service.md, 2.
+A task is a function that a fresh interpreter can import; its last argument is `progress()`.
+Source: service.md, 2.
 """
 
 from __future__ import annotations
@@ -20,46 +19,24 @@ import signal
 import threading
 import time
 import traceback
-from multiprocessing import forkserver
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar
 
-from station.errors import NotReadyError, ScanError, StationError
+from station.errors import InconclusiveError, NotReadyError, StationError
+from station.processing import fork_server
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
+    from collections.abc import Callable, Iterator
     from multiprocessing.connection import Connection
     from multiprocessing.context import ForkServerProcess
 
 T = TypeVar("T")
 
-# Modules that cannot be imported are skipped; the first one imports nearly all of the others.
-PRELOAD = (
-    "station.processing.scan_tasks",
-    "station.service.publishing",
-    "station.processing.isolation",
-    "typer",  # imported by the main module of the command, which a worker loads too
-    "PIL.WebPImagePlugin",  # without it, each worker imports the plugins of all image formats to write one
-    "station.readers.las",
-    "netCDF4",
-    "scipy.signal",  # for the spectrum of an inclination log; its import takes longer than the spectrum
-)
-# Decoding uses two cores, everything else one: each further BLAS thread reserves address space that counts
-# against RLIMIT_AS. Freed memory is kept for the next array, because clearing fresh pages is slow; between
-# steps with arrays of different sizes a task may call `trim_heap`. Arrays use small pages: a virtual machine
-# returns free huge pages to its host, and requesting them again would take 0.5 s per scan. Cell look-ups in
-# small pages are not measurably slower.
-WORKER_ENV = {
-    "OPENBLAS_NUM_THREADS": "1",
-    "OMP_NUM_THREADS": "1",
-    "RAYON_NUM_THREADS": "2",
-    "MALLOC_TRIM_THRESHOLD_": str(2**28),
-    "MALLOC_MMAP_THRESHOLD_": str(2**25),
-    "NUMPY_MADVISE_HUGEPAGE": "0",
-}
 _POLL_S = 0.2
 _FORKSERVER_LOST = 255  # exit status that multiprocessing reports if the fork server died
 _NOT_STARTED = ("not started", None)
+STALL_S = 120.0  # without progress, after which a worker is ended; shorter than the watchdog of the service
 _ORPHANED = 1  # exit status of a worker whose parent died; nobody reads it
 # A scan that needs too much memory hits RLIMIT_AS; the kernel kills if the machine or the unit has less.
 _EXTERNAL_SIGNALS = {signal.SIGKILL, signal.SIGTERM, signal.SIGINT, signal.SIGHUP}
@@ -67,27 +44,37 @@ _EXTERNAL_SIGNALS = {signal.SIGKILL, signal.SIGTERM, signal.SIGINT, signal.SIGHU
 # Delays before a killed worker is restarted: a single kill must not change the order of the scans.
 RETRY_DELAYS_S = (1.0, 5.0, 30.0)
 
-_start_lock = threading.Lock()  # several threads may run workers
-_context = multiprocessing.get_context("forkserver")
-
 
 class _WorkerLostError(NotReadyError):
     """The worker process was killed from outside or could not be started."""
 
 
-def start_forkserver(preload: Sequence[str] = PRELOAD) -> None:
-    """Start the server from which workers are forked; only the first call can choose what it preloads."""
-    with _start_lock:
-        saved = {name: os.environ.get(name) for name in WORKER_ENV}
-        os.environ.update(WORKER_ENV)
-        try:
-            _context.set_forkserver_preload(list(preload))
-            forkserver.ensure_running()
-        finally:
-            for name, value in saved.items():
-                os.environ.pop(name)
-                if value is not None:
-                    os.environ[name] = value
+class _StartFailures:
+    """Since when no worker process could be started; several threads may run workers."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._since_s: float | None = None
+
+    def record(self, *, has_started: bool) -> None:
+        """Record an attempt to start a worker."""
+        with self._lock:
+            if has_started:
+                self._since_s = None
+            elif self._since_s is None:
+                self._since_s = time.monotonic()
+
+    def duration_s(self) -> float:
+        with self._lock:
+            return 0.0 if self._since_s is None else time.monotonic() - self._since_s
+
+
+_start_failures = _StartFailures()
+
+
+def seconds_without_worker() -> float:
+    """Return for how long every attempt to start a worker process has failed [s], 0 if the last succeeded."""
+    return _start_failures.duration_s()
 
 
 def run_isolated(
@@ -100,19 +87,21 @@ def run_isolated(
 ) -> T:
     """Return the result of `task(*args, progress)`, computed in a worker process limited to `memory_gb`.
 
-    `on_progress` is called in this process while it waits, up to `timeout_s`.
+    `on_progress` is called in this process when the worker reports progress or has used CPU time, so never
+    while it is blocked, for instance by a network folder that hangs.
 
-    Raises the StationError that the task raised. Raises ScanError if the worker ran out of memory or time,
-    panicked, or died by a signal that it caused. Raises NotReadyError if `should_stop()` returned true, or if
-    the worker repeatedly could not be started or was killed from outside. Raises RuntimeError with the
-    traceback of the worker for a bug.
+    Raises the StationError that the task raised. Raises InconclusiveError if the worker ran out of memory or
+    time, panicked, or died by a signal that it caused: a corrupt scan does that, and so do a machine without
+    memory and a disk that hangs. Raises NotReadyError if `should_stop()` returned true, or if the worker was
+    blocked for STALL_S, repeatedly could not be started or was killed from outside. Raises RuntimeError with
+    the traceback of the worker for a bug.
     """
     hooks = on_progress, should_stop
     for delay_s in RETRY_DELAYS_S:
         try:
             return _run_once(task, args, memory_gb, timeout_s, *hooks)
         except _WorkerLostError:
-            _pause(delay_s, *hooks)
+            _pause(delay_s, should_stop)
     return _run_once(task, args, memory_gb, timeout_s, *hooks)
 
 
@@ -124,28 +113,29 @@ def _run_once(
     on_progress: Callable[[], None],
     should_stop: Callable[[], bool],
 ) -> T:
-    start_forkserver()
-    parent_conn, child_conn = _context.Pipe()
+    parent_conn, child_conn = fork_server.context.Pipe()
     with parent_conn:
-        process = _context.Process(
+        process = fork_server.context.Process(
             target=_child_main,
             args=(child_conn, task, args, int(memory_gb * 2**30)),
             name=task.__name__,
             daemon=True,
         )
         with child_conn:
+            _start(process)
+        with _killed_at_end(process.pid):
             try:
-                process.start()
-            except OSError as error:  # also from flushing stderr first: its disk may be full
-                raise _WorkerLostError(f"the worker process could not be started: {error}") from error
-        try:
-            report = _await_report(parent_conn, time.monotonic() + timeout_s, on_progress, should_stop)
-            if report is None:
-                raise ScanError(
-                    f"took longer than {timeout_s:g} s: the file is corrupt, or timeout_s is too short"
+                report = _await_report(
+                    parent_conn, process.pid, time.monotonic() + timeout_s, on_progress, should_stop
                 )
-        finally:
-            exit_status = _terminate(process)
+                if report is None:
+                    raise InconclusiveError(
+                        f"took longer than {timeout_s:g} s: the file is corrupt, a disk or mount hangs, or"
+                        " scans.timeout_s is too short"
+                    )
+            finally:
+                exit_status = _terminate(process)
+    _start_failures.record(has_started=report != _NOT_STARTED)
     kind, value = report
     if kind == "returned":
         return value  # type: ignore[return-value] # the task returned it
@@ -156,47 +146,95 @@ def _run_once(
     if kind == "died":
         raise _exit_error(exit_status)
     if kind == "memory":
-        raise ScanError(
-            f"needs more than {memory_gb:g} GB: the file is corrupt, or service.memory_gb is too small"
+        raise InconclusiveError(
+            f"needs more than {memory_gb:g} GB: the file is corrupt, service.memory_gb is too small, or the"
+            " machine has no memory to spare"
         )
     if kind == "error":
         assert isinstance(value, StationError)  # noqa: S101 - sent by _child_main
         raise value
     if kind == "panicked":
-        raise ScanError(f"the decoder panicked: {value}")
+        raise InconclusiveError(f"the decoder panicked: {value}")
     raise RuntimeError(f"a bug in {task.__name__}, in the worker process:\n{value}")
 
 
-def _pause(delay_s: float, on_progress: Callable[[], None], should_stop: Callable[[], bool]) -> None:
+def _start(process: ForkServerProcess) -> None:
+    """Start a worker; raise _WorkerLostError if that fails. A fork server that is the cause is stopped."""
+    try:
+        fork_server.ensure_running()
+        process.start()
+    except (OSError, EOFError) as error:  # also from flushing stderr first: its disk may be full
+        _start_failures.record(has_started=False)
+        if isinstance(error, FileNotFoundError | ConnectionError | EOFError):
+            fork_server.stop()
+        raise _WorkerLostError(f"the worker process could not be started: {error}") from error
+
+
+def _pause(delay_s: float, should_stop: Callable[[], bool]) -> None:
     until_s = time.monotonic() + delay_s
     while (remaining_s := until_s - time.monotonic()) > 0:
         if should_stop():
             raise NotReadyError("stopped before it was done")
-        on_progress()
         time.sleep(min(remaining_s, _POLL_S))
 
 
 def _await_report(
     parent_conn: Connection,
+    pid: int | None,
     deadline_s: float,
     on_progress: Callable[[], None],
     should_stop: Callable[[], bool],
 ) -> tuple[str, object] | None:
-    """Return (kind, value) of the final report of the worker; None if it did not arrive in time."""
-    has_started = False
+    """Return (kind, value) of the final report of the worker; None if it did not arrive in time.
+
+    Raises NotReadyError if the worker was blocked for STALL_S or `should_stop()` returned true.
+    """
+    has_started, cpu_ticks, progress_s = False, 0, time.monotonic()
     while time.monotonic() < deadline_s:
         if should_stop():
             raise NotReadyError("stopped before it was done")
-        on_progress()
         try:
             if parent_conn.poll(_POLL_S):
+                on_progress()
+                progress_s = time.monotonic()
                 kind, value = parent_conn.recv()
                 has_started = True
                 if kind != "progress":
                     return kind, value
         except (EOFError, OSError):  # before or during a message
             return ("died", None) if has_started else _NOT_STARTED
+        if (used_ticks := _cpu_ticks(pid)) != cpu_ticks:
+            on_progress()
+            cpu_ticks, progress_s = used_ticks, time.monotonic()
+        elif time.monotonic() > progress_s + STALL_S:
+            raise NotReadyError(f"blocked for {STALL_S:g} s: does a disk or network folder not respond?")
     return None
+
+
+def _cpu_ticks(pid: int | None) -> int:
+    """Return the CPU time that a process has used, in clock ticks; 0 if it has ended. Source: proc(5)."""
+    try:
+        fields = Path(f"/proc/{pid}/stat").read_text(encoding="utf-8").rpartition(")")[2].split()
+    except OSError:
+        return 0
+    return int(fields[11]) + int(fields[12])
+
+
+@contextmanager
+def _killed_at_end(pid: int | None) -> Iterator[None]:
+    """Kill a worker at the end of the block even if the fork server, its parent process, has died."""
+    try:
+        descriptor = os.pidfd_open(pid or 0)
+    except OSError:  # it has ended
+        yield
+        return
+    try:
+        yield
+    finally:
+        with suppress(OSError):
+            signal.pidfd_send_signal(descriptor, signal.SIGKILL)
+        multiprocessing.connection.wait([descriptor], _POLL_S)
+        os.close(descriptor)
 
 
 def _terminate(process: ForkServerProcess) -> int | None:
@@ -211,17 +249,15 @@ def _terminate(process: ForkServerProcess) -> int | None:
     return exit_status
 
 
-def _exit_error(exit_status: int | None) -> ScanError | NotReadyError:
-    """Return the error for a dead worker.
-
-    A crash of the decoder is a ScanError; a kill from outside is not the fault of the scan.
-    """
+def _exit_error(exit_status: int | None) -> NotReadyError:
+    """Return the error for a dead worker; a kill from outside is not the fault of the scan."""
     if exit_status is None or exit_status >= 0:
-        return ScanError(f"the decoder ended the process without a message (exit status {exit_status})")
+        message = f"the decoder ended the process without a message (exit status {exit_status})"
+        return InconclusiveError(message)
     name = signal.Signals(-exit_status).name
     if -exit_status in _EXTERNAL_SIGNALS:
         return _WorkerLostError(f"the process was killed ({name}): is the machine out of memory?")
-    return ScanError(f"the decoder died by {name}")
+    return InconclusiveError(f"the decoder died by {name}")
 
 
 def _child_main(

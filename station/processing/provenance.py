@@ -19,6 +19,7 @@ from station.archive.netcdf_layout import Series, decode_text, roundtrip_text
 from station.archive.schema import FILL
 from station.archive.series.epoch_reader import contiguous_runs, read_source
 from station.archive.series.index import list_epochs
+from station.archive.tilt_offsets import read_tilt_offset
 from station.config import Site
 from station.errors import ConfigError, NotReadyError, ScanError
 from station.inbox.file_hash import sha256_file
@@ -26,7 +27,6 @@ from station.inbox.inbox import ScanFile
 from station.inbox.journal import Entry
 from station.processing.scan_inputs import (
     air_from_log,
-    read_tilt_offset,
     scanner_height_m,
     sop_identity,
 )

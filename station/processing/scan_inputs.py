@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 from pyproj import CRS, Transformer
 
-from station.archive.atomic_files import atomic_write
+from station.archive.tilt_offsets import read_tilt_offset, stored_tilt_offsets, write_tilt_offset
 from station.config import Site
 from station.errors import ConfigError, NotReadyError, ScanError
 from station.processing.pipeline import AdjustmentInputs, Pose
@@ -76,11 +76,13 @@ def load_scan_inputs(
     *,
     save_tilt_offset: bool = True,
     wait_for_weather: bool = False,
+    waiting_before: str = "",
 ) -> ScanInputs:
     """Return the inputs of a scan; raise ScanError or ConfigError if it cannot be georeferenced.
 
-    With `save_tilt_offset`, a tilt offset estimated here is saved for later scans. With `wait_for_weather`,
-    NotReadyError is raised if there is no weather yet.
+    With `save_tilt_offset`, a tilt offset estimated here is saved for later scans. NotReadyError is raised if
+    that offset is to be of an earlier scan, the one in `waiting_before`; and, with `wait_for_weather`, if
+    there is no weather yet.
     """
     if site.scans.frame == "map":
         return _inputs_in_map_frame(site, start.timestamp())
@@ -95,7 +97,9 @@ def load_scan_inputs(
     faults = _static_tilt_faults(site, log)
     tilt_offset = read_tilt_offset(site, sop_id)
     if tilt_offset is None:
-        tilt_offset = _find_tilt_offset(site, sop, reader, log, track, warnings)
+        tilt_offset = stored_tilt_offsets(site).get(sop_id)
+        if tilt_offset is None:
+            tilt_offset = _find_tilt_offset(site, sop, reader, log, track, warnings, waiting_before)
         # That of an absolute sensor is zero and need not be saved.
         if save_tilt_offset and tilt_offset is not None and tilt_offset != NO_CYCLIC_ERROR:
             write_tilt_offset(site, sop_id, tilt_offset)
@@ -147,7 +151,7 @@ def load_scan_inputs(
 
 def _inputs_in_map_frame(site: Site, start_s: float) -> ScanInputs:
     """Return the inputs of a scan that is already on the map."""
-    position_m = _map_position(site)
+    position_m = map_position(site)
     geometry, log_only_covariance, adjustment_inputs = scan_geometry(site, position_m), None, None
     if position_m is not None:  # registered elsewhere, with unknown accuracy
         params = parameters.parameter_layout(geometry.grid, position_m)
@@ -225,7 +229,8 @@ def _require_on_map(crs: str, position_m: list[float], file: Path) -> None:
         )
 
 
-def _map_position(site: Site) -> tuple[float, float, float] | None:
+def map_position(site: Site) -> tuple[float, float, float] | None:
+    """Return easting, northing and height of `map.origin` [m]; None without it."""
     if site.map.origin is None or site.map.crs is None:
         return None
     to_map = Transformer.from_crs(pose.GEOGRAPHIC, pose.horizontal_crs(site.map.crs), always_xy=True)
@@ -344,28 +349,6 @@ def _tilt_record(
     return tilt_record
 
 
-def _tilt_offset_file(site: Site, sop_id: str) -> Path:
-    return site.station.data / "sop_tilt_offset" / f"{sop_id}.json"
-
-
-def read_tilt_offset(site: Site, sop_id: str) -> CyclicError | None:
-    """Return the saved tilt offset of an SOP, None if there is none yet."""
-    if site.inclination is None or site.inclination.mode == "absolute":
-        return None
-    path = _tilt_offset_file(site, sop_id)
-    if not path.is_file():
-        return None
-    content = json.loads(path.read_text())
-    return CyclicError(tuple(content["roll_rad"]), tuple(content["pitch_rad"]))
-
-
-def write_tilt_offset(site: Site, sop_id: str, tilt_offset: CyclicError) -> None:
-    """Save the tilt offset of an SOP."""
-    path = _tilt_offset_file(site, sop_id)
-    with atomic_write(path) as tmp_path:
-        tmp_path.write_text(json.dumps(asdict(tilt_offset)))
-
-
 def _find_tilt_offset(
     site: Site,
     sop: SopSection,
@@ -373,15 +356,21 @@ def _find_tilt_offset(
     log: InclinationLog | None,
     track: AzimuthTrack | None,
     warnings: list[str],
+    waiting_before: str,
 ) -> CyclicError | None:
     """Return the tilt offset contained in an SOP: the tilt of the scan from which the SOP was determined.
 
-    Without `sop.scan`, that is the scan at hand, the first one processed under the SOP.
+    Without `sop.scan`, that is the scan at hand, the first one under the SOP. Raises NotReadyError if an
+    earlier one, `waiting_before`, is still to be processed.
     """
     if site.inclination is None:
         return None
     if site.inclination.mode == "absolute":
         return NO_CYCLIC_ERROR
+    if sop.scan is None and waiting_before:
+        raise NotReadyError(
+            f"waits for {waiting_before}: the first scan under an SOP defines its tilt offset"
+        )
     if sop.scan is not None and sop.scan != reader.path.stem:
         log, track = _load_earlier_log(site, sop.scan)
         if log is None:

@@ -24,6 +24,7 @@ from station.config import Site
 from station.errors import ScanError
 from station.inbox.file_hash import hash_if_unchanged, sha256_file
 from station.inbox.inbox import ScanFile
+from station.inbox.journal import Journal
 from station.processing.isolation import trim_heap
 from station.processing.pipeline import (
     AdjustmentInputs,
@@ -40,6 +41,7 @@ from station.processing.pipeline import (
 )
 from station.processing.previews import PreviewRecorder
 from station.processing.scan_inputs import ScanInputs, load_scan_inputs
+from station.processing.usable_inputs import usable_site
 from station.products.overview import Overview
 from station.quantities import Bools, Measurement, Quality, Reference, ScanGeometry, VarianceComponents
 from station.queries.aggregates import LEVERAGE_VARIABLES
@@ -50,6 +52,7 @@ from station.readers.scan import ScanReader, open_scan, reject_future, utc_inter
 from station.science.adjustment import ground_classes
 from station.science.adjustment.joint import Adjustment
 from station.science.analysis import inclination_check, verdict
+from station.science.geometry.pose import horizontal_crs, is_same_map
 from station.science.geometry.terrain import nodes_from_means
 from station.science.gridding.gridder import Gridder
 from station.science.gridding.viewing_geometry import ViewingGeometry
@@ -86,6 +89,7 @@ class ScanHistory:
     last_content: tuple[str, str] | None = None  # SHA-256 of scan and log last assessed under its name
     stored_scans: Mapping[str, str] = field(default_factory=dict)  # names of other stored scans by SHA-256
     wait_for_weather: bool = False  # if the weather log is not up to date yet
+    waiting_before: str = ""  # name of an earlier scan that will be processed soon
 
 
 @dataclass(frozen=True)
@@ -173,8 +177,17 @@ def process(
         is_recent = time.time() - scan.mtime_ns * 1e-9 < wait_s
         reference = load_reference(site, history.reference)
         epoch = _compute_epoch(
-            site, scan, scan_sha256, reference, progress, is_dry_run=False, wait_for_weather=is_recent
+            site,
+            scan,
+            scan_sha256,
+            reference,
+            progress,
+            is_dry_run=False,
+            wait_for_weather=is_recent,
+            waiting_before=history.waiting_before,
         )
+    if not history.revision:
+        _require_new_start(site, epoch.start_s)
     version, epoch_file = epoch.provenance["reference_version"], _identical_epoch(series, epoch)
     preview = PreviewRecorder(site, series, version if with_preview and epoch_file is None else "")
     epoch_file = epoch_file or epochs.write_epoch(series, epoch, history.revision, preview.add)
@@ -193,6 +206,18 @@ def process(
     )
 
 
+def _require_new_start(site: Site, start_utc_s: float) -> None:
+    """Raise ScanError if a scan of another name with the same start is stored: it would be replaced."""
+    with Journal(site.station.data / "journal.sqlite", read_only=True) as journal:
+        stored = journal.starting_at(start_utc_s)
+    if stored:
+        start = datetime.fromtimestamp(start_utc_s, UTC)
+        raise ScanError(
+            f"begins at {start:%Y-%m-%d %H:%M:%S} UTC, as {stored[0]} does, which is stored: a series has one"
+            f" scan per start; to replace that one, copy this file over it"
+        )
+
+
 def check_header(site: Site, scan: ScanFile, progress: Progress) -> None:
     """Raise ScanError if the headers of a scan show that it cannot be used."""
     progress()
@@ -202,7 +227,7 @@ def check_header(site: Site, scan: ScanFile, progress: Progress) -> None:
 
 def dry_run(site: Site, scan: ScanFile, progress: Progress) -> tuple[str, str, dict[str, float | str]]:
     """Return verdict, reason and metrics of a scan; nothing is stored."""
-    began_s = time.monotonic()
+    began_s, site = time.monotonic(), usable_site(site)
     reference = None if isinstance(site.reference.scans, Path) else load_reference(site)
     epoch = _compute_epoch(site, scan, "", reference, progress, is_dry_run=True, wait_for_weather=False)
     return epoch.verdict, epoch.verdict_reason, _log_metrics(epoch, time.monotonic() - began_s)
@@ -217,6 +242,7 @@ def _compute_epoch(
     *,
     is_dry_run: bool,
     wait_for_weather: bool,
+    waiting_before: str = "",
 ) -> epochs.Epoch:
     with open_scan_for(site, scan.path) as reader:
         start, end, _ = utc_interval(reader, site.scans.name)
@@ -229,6 +255,7 @@ def _compute_epoch(
             end,
             save_tilt_offset=not is_dry_run,
             wait_for_weather=wait_for_weather,
+            waiting_before=waiting_before,
         )
         viewing = load_viewing_geometry(site, inputs.geometry, reference) if reference else None
         progress()
@@ -431,7 +458,16 @@ def open_scan_for(site: Site, path: Path) -> Iterator[ScanReader]:
     """Yield a reader of a scan with the settings of the site; raises ScanError or NotReadyError."""
     range_max_m = site.scanner.range_max_m if site.scans.frame == "scanner" else None
     with open_scan(path, range_max_m=range_max_m) as reader:
+        if site.scans.frame == "map" and site.map.crs and reader.header.crs_wkt:
+            _require_same_map(reader.header.crs_wkt, site.map.crs)
         yield reader
+
+
+def _require_same_map(declared_wkt: str, crs: str) -> None:
+    """Raise ScanError if a scan declares another projected or geographic CRS than the site."""
+    declared, expected = horizontal_crs(declared_wkt), horizontal_crs(crs)
+    if (declared.is_projected or declared.is_geographic) and not is_same_map(declared, expected):
+        raise ScanError(f"the file is in {declared.name}, map.crs is {expected.name}: export it to that map")
 
 
 def sha256_log(scan: ScanFile) -> str:

@@ -6,7 +6,7 @@ An epoch is outdated if its settings, its inputs or its reference differ from th
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -129,12 +129,16 @@ def late_inputs(site: Site, entries: list[Entry], progress: Progress) -> list[st
     return names
 
 
-def count_outdated(site: Site) -> int:
-    """Return the number of epochs with another SOP, setting, flag or reference; opens no input file."""
+def count_outdated(site: Site, queued: Collection[str] = ()) -> int:
+    """Return the number of epochs with another SOP, setting, flag or reference; opens no input file.
+
+    `queued` are the epoch files, relative to the data folder, of scans that will be processed again anyway.
+    """
     series, config = series_for(site), CurrentConfig(site)
     if not series.path.is_file():
         return 0
-    stored = stored_epochs(series)
+    names = {Path(file).name for file in queued}
+    stored = [epoch for epoch in stored_epochs(series) if epoch.ref.epoch_file not in names]
     valid = _valid_versions(site, series, stored)
     return sum(
         epoch.science_hash != site.science_hash

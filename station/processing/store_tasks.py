@@ -11,7 +11,7 @@ from pathlib import Path
 from station.archive import compaction, epochs
 from station.archive.areas import update_areas
 from station.archive.reference_files import repair_reference_link
-from station.archive.series import index
+from station.archive.series.manifest import source_count
 from station.archive.series.virtual import build_series
 from station.config import Site
 from station.errors import StoreError
@@ -23,6 +23,7 @@ Checksums = dict[str, str]  # SHA-256 by file, relative to the data folder
 
 # Source files of the series: beyond the limit of open files some readers return wrong data.
 MAX_SOURCES = 250
+MAX_STORE_TASK_S = 12 * 3600.0  # verifying terabytes takes hours; a task beyond this is in an endless loop
 LOWEST_PRIORITY = 19  # nice value
 MAX_UNCOMPACTED = 48  # of closed days, before they are compacted during a backlog
 
@@ -34,7 +35,7 @@ def update_series(site: Site, progress: Progress) -> int:
     """
     series = series_for(site)
     repair_reference_link(series)
-    if len(index.source_files(series.path)) > MAX_SOURCES:
+    if source_count(series) > MAX_SOURCES:
         compaction.compact(series, compaction.latest_start(series), progress)
     build_series(series)
     progress()

@@ -15,7 +15,7 @@ from station.archive.areas import area_statistics, matches
 from station.archive.epochs import EpochRef
 from station.archive.netcdf_layout import Series
 from station.archive.schema import VERDICTS
-from station.archive.series.index import list_epochs, series_in
+from station.archive.series.index import list_epochs, nearest_epoch, series_in
 from station.config import Site
 from station.errors import ConfigError, StationError
 from station.products.epoch_table import AreaSeries, EpochTable, read_area_series, read_epoch_table
@@ -71,7 +71,7 @@ def parse_time(text: str, *, end_of_day: bool = False) -> datetime:
 
 
 def find_epoch(series: Series, text: str) -> EpochRef:
-    """Return the epoch of a scan name, or the one nearest to a time (UTC).
+    """Return the epoch of a scan name, or the nearest one within 12 h of a time (UTC).
 
     Raises StationError if there is none.
     """
@@ -90,7 +90,14 @@ def find_epoch(series: Series, text: str) -> EpochRef:
     except StationError as error:
         newest = table.texts["scan_id"][-1]
         raise StationError(f"{text}: neither a stored scan (the newest is {newest}) nor a time") from error
-    return min(epochs, key=lambda epoch: abs(epoch.start.timestamp() - time_s))
+    return nearest_epoch(epochs, time_s)
+
+
+def describe_epoch(site: Site, text: str) -> str:
+    """Return which epoch a scan name or time stands for, '' for the reference and the previous epoch."""
+    if text in {REFERENCE, PREVIOUS}:
+        return ""
+    return f"{text}: epoch of {find_epoch(series_in(site.station.data), text).start:%Y-%m-%d %H:%M:%S} UTC"
 
 
 def area_records(
@@ -201,7 +208,7 @@ def as_text(records: Iterable[AreaRecord]) -> str:
     body = [
         (
             f"{record.start:%Y-%m-%d %H:%M}",
-            record.area,
+            "".join(character if character.isprintable() else "�" for character in record.area),
             f"{statistics['mean_change']:+.4f}",
             f"±{statistics['mean_change_high'] - statistics['mean_change']:.4f}",
             f"{statistics['median_change']:+.4f}",

@@ -6,6 +6,7 @@ import hashlib
 import json
 import time
 import zipfile
+import zlib
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -20,6 +21,7 @@ from station._version import __version__
 from station.archive.atomic_files import atomic_write
 from station.archive.epochs import EpochRef
 from station.archive.netcdf_layout import Series
+from station.errors import StoreError
 from station.products.colours import round_up
 from station.products.maps import Caption, change_map, encode_webp, points_map, sigma_map
 from station.products.overview import BaseMap, Overview, base_map, read_overview
@@ -119,8 +121,17 @@ def update_gallery(
     images.reverse()
     _, sigma, points = _file_names(Path(images[-1].file).name, is_last=True)
     _delete_old(maps_folder, {Path(item.file).name for item in images} | {sigma, points})
-    with Image.open(folder / images[-1].file) as picture:
-        return Gallery(images, f"maps/{sigma}", f"maps/{points}", limit_m, picture.size)
+    return Gallery(images, f"maps/{sigma}", f"maps/{points}", limit_m, _size(folder / images[-1].file))
+
+
+def _size(path: Path) -> tuple[int, int]:
+    """Return width and height of a map [pixels]; a damaged file is deleted, so that it is drawn again."""
+    try:
+        with Image.open(path) as picture:
+            return picture.size
+    except OSError as error:
+        path.unlink(missing_ok=True)
+        raise StoreError(f"{path}: damaged, drawn again with the next scan: {error}") from error
 
 
 def _file_names(name: str, *, is_last: bool) -> tuple[str, ...]:
@@ -196,7 +207,7 @@ def cached_base_map(series: Series, folder: Path, version: str, pixels: int) -> 
                 part = Grid(west_m, north_m, cell_m, nx, ny)
                 rows, columns = slice(row_start, row_stop), slice(column_start, column_stop)
                 return BaseMap(version, factor, rows, columns, shade.astype(np.float32), part)
-    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile):
+    except (OSError, ValueError, KeyError, EOFError, RuntimeError, zipfile.BadZipFile, zlib.error):
         pass  # missing or damaged: computed again
     base = base_map(series, version, pixels)
     shade = (

@@ -13,7 +13,7 @@ from station.archive.epochs import EpochRef
 from station.archive.netcdf_layout import Series, decode_text
 from station.archive.raster_io import bounding_slices
 from station.archive.reference_files import open_reference
-from station.archive.series.index import list_epochs
+from station.archive.series.index import list_epochs, nearest_epoch
 from station.errors import StoreError
 from station.quantities import Bools, ChangeErrors, Floats, Grid, Quality, Reals, Reference, SharedParameters
 from station.science.adjustment import ground_classes
@@ -65,14 +65,17 @@ class Aggregates:
         return self._references[version]
 
     def find_epoch(self, epoch: int | str | np.datetime64) -> EpochRef:
-        """Return the epoch at an index in the series, or the one with mid-time nearest to a time (UTC)."""
+        """Return the epoch at an index in the series, or the nearest one within 12 h of a time (UTC).
+
+        Raises StationError if there is none.
+        """
         epochs = list_epochs(self._series)
         if not epochs:
             raise StoreError(f"{self._series.folder}: nothing is stored yet")
         if isinstance(epoch, (int, np.integer)):
             return epochs[epoch]
         requested_s = float((np.datetime64(str(epoch)) - np.datetime64(0, "s")) / np.timedelta64(1, "s"))
-        return min(epochs, key=lambda candidate: abs(candidate.time_s - requested_s))
+        return nearest_epoch(epochs, requested_s)
 
     def variance(self, weights: Floats, epoch: EpochRef, other: EpochRef | None = None) -> float:
         """Return the variance of the weighted sum of change [m² times squared weights].
@@ -80,6 +83,8 @@ class Aggregates:
         The sum is over one epoch, or over its difference to another epoch. `weights` (ny, nx) are zero
         outside the area. Cells without a change do not contribute. Source: equations.md, 6.2.
         """
+        if other == epoch:
+            return 0.0
         cells = weights != 0
         epochs = self._read_epochs(cells, epoch, other)
         common_cells = observed_in_all(epochs, cells)

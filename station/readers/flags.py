@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from station.errors import ConfigError
+from station.readers.regular_file import read_text
 from station.readers.scan import decoder_errors
 
 COLUMNS = ["from", "to", "reason"]
@@ -28,7 +29,7 @@ def read_flags(path: Path) -> list[Flag]:
     written; NotReadyError if the disk fails or access is denied.
     """
     with decoder_errors(f"{path.name} cannot be read"):
-        text = path.read_text(encoding="utf-8-sig")
+        text = read_text(path)
     lines = text.splitlines()
     if lines and [name.strip() for name in lines[0].split(",")] != COLUMNS:
         raise ConfigError(f"{path}: must begin with the line {','.join(COLUMNS)}")

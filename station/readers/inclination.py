@@ -9,6 +9,7 @@ import numpy as np
 
 from station.errors import ScanError
 from station.quantities import Floats, InclinationLog
+from station.readers.regular_file import open_regular
 from station.readers.scan import WEEK_S, decoder_errors
 
 COLUMNS = ("time", "roll", "pitch")
@@ -24,7 +25,7 @@ def read_inclination(path: Path) -> InclinationLog:
     the week continue past the end of the week, as those of the scan do.
     Raises ScanError if no row can be read, NotReadyError if the disk fails or access is denied.
     """
-    with decoder_errors(f"{path.name} cannot be read"), path.open("rb") as file:
+    with decoder_errors(f"{path.name} cannot be read"), open_regular(path) as file:
         raw = file.read(MAX_BYTES + 1)
     if len(raw) > MAX_BYTES:
         raise ScanError(f"{path.name}: too large for an inclination log")

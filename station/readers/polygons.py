@@ -12,6 +12,7 @@ from pyproj.exceptions import CRSError
 
 from station.errors import ConfigError
 from station.quantities import Bools, Grid
+from station.readers.regular_file import read_text
 from station.science.geometry.pose import horizontal_crs, is_same_map
 
 TILE_CELLS = 64  # rows and columns of cells that are tested together
@@ -86,7 +87,7 @@ def cells_inside(geometry: shapely.Geometry, grid: Grid) -> Bools:
 
 def _read_json(path: Path) -> dict[str, Any]:
     try:
-        document = json.loads(path.read_text(encoding="utf-8-sig"))
+        document = json.loads(read_text(path))
     except OSError as error:
         raise ConfigError(f"{path}: cannot be read: {error.strerror}") from error
     except (ValueError, RecursionError) as error:  # also for a wrong encoding or too deep nesting

@@ -18,7 +18,7 @@ from typing import NoReturn
 import numpy as np
 from numpy.typing import NDArray
 
-from station.errors import ScanError
+from station.errors import InconclusiveError
 
 N_BUFFERS = 2  # one is filled while the other is read
 
@@ -77,7 +77,7 @@ def _from_child(
     if connection_lost:
         if os.WIFSIGNALED(status):
             os.kill(os.getpid(), os.WTERMSIG(status))
-        raise ScanError(f"the decoder process ended without a message (wait status {status})")
+        raise InconclusiveError(f"the decoder process ended without a message (wait status {status})")
 
 
 def _child_main(

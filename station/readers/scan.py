@@ -8,6 +8,7 @@ from __future__ import annotations
 import errno
 import functools
 import logging
+import re
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -17,7 +18,7 @@ from importlib.metadata import entry_points
 from pathlib import Path
 from typing import ClassVar, Protocol, Self
 
-from station.errors import NotReadyError, ScanError, StationError
+from station.errors import InconclusiveError, NotReadyError, ScanError, StationError
 from station.quantities import AzimuthTrack, IntensityScale, Shots
 
 log = logging.getLogger(__name__)
@@ -34,16 +35,14 @@ LEAP_SECONDS = (
     (datetime(2006, 1, 1, tzinfo=UTC), 14),
     (datetime(1999, 1, 1, tzinfo=UTC), 13),
 )
-# Disk and permission errors are transient; an invalid seek (EINVAL) is the file's own fault.
+# Errors of disk, network, permissions, memory and tasks are transient; an invalid seek (EINVAL) is the file's
+# own fault.
 TRANSIENT_ERRNOS = {
-    errno.EACCES,
-    errno.EPERM,
-    errno.ENOENT,
-    errno.EIO,
-    errno.ESTALE,
-    errno.ETIMEDOUT,
-    errno.EMFILE,
-}
+    errno.EACCES, errno.EPERM, errno.ENOENT, errno.EIO, errno.ESTALE, errno.ETIMEDOUT, errno.EMFILE,
+    errno.ENFILE, errno.EAGAIN, errno.ENOMEM, errno.ENODEV, errno.ENXIO, errno.ENOTCONN, errno.EHOSTDOWN,
+    errno.EHOSTUNREACH,
+}  # fmt: skip
+_RUST_OS_ERROR = re.compile(r"Os \{ code: (\d+)")  # how a panic prints the system's error that caused it
 MAX_CLOCK_DIFFERENCE_S = 900.0  # between name and GPS times of a scan; names are up to minutes early
 
 
@@ -106,7 +105,8 @@ class ScanReader(Protocol):
 def decoder_errors(action: str) -> Iterator[None]:
     """Turn whatever a decoder or plug-in raises into ScanError, or into NotReadyError if it is transient.
 
-    Decoders written in Rust panic past `except Exception`, hence BaseException.
+    Without memory or threads it becomes InconclusiveError: a corrupt file asks for too much, a good one finds
+    a busy machine. Decoders written in Rust panic past `except Exception`, hence BaseException.
     """
     try:
         yield
@@ -115,7 +115,16 @@ def decoder_errors(action: str) -> Iterator[None]:
     except BaseException as error:
         if isinstance(error, OSError) and error.errno in TRANSIENT_ERRNOS:
             raise NotReadyError(f"{action}: {error.strerror}") from error
-        raise ScanError(f"{action}: {type(error).__name__}: {error}") from error
+        kind = InconclusiveError if _lacks_resources(error) else ScanError
+        raise kind(f"{action}: {type(error).__name__}: {error}") from error
+
+
+def _lacks_resources(error: BaseException) -> bool:
+    """Return True if a decoder failed for want of memory, tasks or another resource of the machine."""
+    if isinstance(error, MemoryError) or "can't start new thread" in str(error):
+        return True
+    match = _RUST_OS_ERROR.search(str(error))
+    return match is not None and int(match[1]) in TRANSIENT_ERRNOS
 
 
 @functools.cache

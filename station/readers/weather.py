@@ -14,6 +14,7 @@ import numpy as np
 
 from station.errors import ScanError
 from station.quantities import Air, Floats, WeatherLog
+from station.readers.regular_file import open_regular
 from station.readers.scan import decoder_errors
 from station.sections import WeatherColumns
 
@@ -56,7 +57,7 @@ def read_weather(
     Raises ScanError if a column is missing, no row is complete, no time can be read, the newest rows come
     first or humidity is a fraction; NotReadyError if the disk fails or access is denied.
     """
-    with decoder_errors(f"{path.name} cannot be read"), path.open("rb") as file:
+    with decoder_errors(f"{path.name} cannot be read"), open_regular(path) as file:
         names, units = _header(file, format, path.name)
         parse = _parser(names, units, columns, utc_offset_h, path.name)
         first_row = file.tell()

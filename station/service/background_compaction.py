@@ -5,7 +5,6 @@ A month takes minutes.
 
 from __future__ import annotations
 
-import math
 import threading
 from collections.abc import Callable, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -13,7 +12,7 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from station.config import Site
 from station.errors import NotReadyError
 from station.processing import isolation
-from station.processing.store_tasks import Checksums, compact_low_priority
+from station.processing.store_tasks import MAX_STORE_TASK_S, Checksums, compact_low_priority
 
 
 class BackgroundCompaction:
@@ -58,6 +57,6 @@ class BackgroundCompaction:
             checksums,
             in_backlog,
             memory_gb=self._site.service.memory_gb,
-            timeout_s=math.inf,
+            timeout_s=MAX_STORE_TASK_S,
             should_stop=self._stop.is_set,
         )

@@ -9,22 +9,24 @@ from __future__ import annotations
 import faulthandler
 import logging
 import math
+import os
 import signal
 import time
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from dataclasses import dataclass
+from pathlib import Path
 from queue import Empty, SimpleQueue
 from typing import TYPE_CHECKING, Protocol
 
 from station.config import Site, read_site
-from station.errors import ConfigError, StationError
+from station.errors import ConfigError, NotReadyError, StationError
 from station.inbox.inbox import Inbox, ScanFile
 from station.inbox.journal import Journal, State
-from station.inbox.lock import exclusive_lock
+from station.inbox.lock import LockedFolder, exclusive_lock, require_known
 from station.logs import log_to_stderr, logfmt
 from station.monitoring.metrics import Metrics
 from station.monitoring.preconditions import EARLIEST_S, clock_problem, require_disk_space
-from station.processing import isolation
+from station.processing import fork_server, isolation
 from station.readers.scan import suffixes
 from station.service.inbox_watcher import InboxWatcher
 from station.service.scheduler import JobScheduler, LoopEvent
@@ -32,7 +34,6 @@ from station.service.systemd import SystemdNotifier
 
 if TYPE_CHECKING:
     from collections.abc import Callable
-    from pathlib import Path
 
 log = logging.getLogger("station")
 
@@ -57,6 +58,7 @@ class LoopTiming:
     debounce_s: float = 1.0  # minimum between two polls, however many events arrive
     grace_s: float = 60.0  # for the running scan when the service is to stop
     first_pause_s: float = 5.0  # after a store error; doubled up to period_s
+    give_up_s: float = 300.0  # without any worker process, after which systemd is to restart the service
     clock_wait_s: float = 3600.0  # for a doubtful clock; an impossible one is waited for without limit
 
 
@@ -73,7 +75,8 @@ def run(
     """
     log_to_stderr()
     if make_worker is None:
-        isolation.start_forkserver()  # the fork server imports modules while this process does
+        with suppress(OSError):  # the first scan tries again
+            fork_server.ensure_running()  # it imports modules while this process does
         from station.service.worker import Worker  # noqa: PLC0415 - a second of imports that tests avoid
 
         make_worker = Worker
@@ -108,6 +111,7 @@ class Daemon:
         self._is_overdue = False
         self._site_file_fault = ""  # why the last reload was rejected
         self._exit_stack = ExitStack()
+        self._folder: LockedFolder
         self._journal: Journal | None = None
         self._open_components: tuple[ScanProcessor, Inbox, InboxWatcher, JobScheduler] | None = None
         self._is_reconciled = False
@@ -125,9 +129,12 @@ class Daemon:
         self._events.put(LoopEvent.STOP)
 
     def serve(self) -> None:
-        """Run the loop until `stop` is called."""
+        """Run the loop until `stop` is called; raise NotReadyError if only a restart helps."""
         self._wait_for_clock()
-        with exclusive_lock(self._site.station.data), self._metrics.serving(), self._exit_stack:
+        data = self._site.station.data
+        if state_folder := os.environ.get("STATE_DIRECTORY", "").partition(":")[0]:
+            require_known(data, Path(state_folder))
+        with exclusive_lock(data) as self._folder, self._metrics.serving(), self._exit_stack:
             self._exit_stack.callback(self._close_components)
             while not self._is_stopping():
                 try:
@@ -136,6 +143,7 @@ class Daemon:
                 except StationError as error:
                     wait_s = self._pause(error)
                     self._systemd.ready()  # up although paused: a restart would gain nothing
+                self._require_no_restart()
                 self._wait(wait_s)
             log.info(logfmt(service="stopped"))
 
@@ -147,6 +155,7 @@ class Daemon:
         if LoopEvent.RELOAD in self._due:
             self._due.discard(LoopEvent.RELOAD)
             self._reload()
+        self._folder.require_same()
         require_disk_space(self._site)
         worker, inbox, watcher, scheduler = self._components()
         watcher.ensure_watching()
@@ -181,7 +190,9 @@ class Daemon:
             raise
         except Exception as bug:  # a bug triggered by one scan must not block the others
             log.exception(logfmt(scan=scan.name, verdict="later", reason="a bug: please report it"))
-            self._open_journal().defer(scan.name, f"a bug: {type(bug).__name__}: {bug}"[:500])
+            cause = f"{type(bug).__name__}: {bug}".strip().splitlines()[-1]  # of a traceback the last line
+            reason = f"a bug: {cause}"[:500]
+            self._open_journal().record_failure(scan.name, reason, self._site.judging_conditions)
 
     def _housekeeping(self, worker: ScanProcessor) -> None:
         """Run scheduled tasks while no scan is waiting; a failed task runs again at its next time."""
@@ -223,6 +234,7 @@ class Daemon:
             site,
             journal,
             on_progress=self._systemd.watchdog,
+            before_task=self._folder.require_same,
             should_stop=lambda: time.monotonic() > self._stop_deadline_s,
             on_compacted=lambda: self.post(LoopEvent.COMPACTED),
             in_service=True,
@@ -268,6 +280,16 @@ class Daemon:
             self._open_components = None
 
     # ---- faults, waiting, stopping
+
+    def _require_no_restart(self) -> None:
+        """Raise NotReadyError if only a restart by systemd helps."""
+        if self._is_stopping():
+            return
+        lost_s = isolation.seconds_without_worker()
+        if lost_s > self._timing.give_up_s:
+            raise NotReadyError(f"no worker process could be started for {lost_s:.0f} s: restart the service")
+        if self._folder.is_remounted():
+            raise NotReadyError(f"{self._site.station.data} was mounted again: restart the service")
 
     def _pause(self, error: StationError) -> float:
         """Log the first of consecutive faults; return the pause before the next attempt [s]."""

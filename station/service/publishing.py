@@ -24,6 +24,7 @@ class PublishResult:
 
     warning: str  # the movement of the scanner, if this scan revealed it
     fault: str  # why the page or a file could not be written
+    input_faults: tuple[str, ...] = ()  # why optional files cannot be used
 
 
 def publish(site: Site, result: StoredResult | None, progress: Progress) -> PublishResult:
@@ -43,8 +44,8 @@ def publish(site: Site, result: StoredResult | None, progress: Progress) -> Publ
             progress()
         _write_products(site, result, faults, progress)
     except StationError as error:
-        return PublishResult(warning, str(error))
-    return PublishResult(warning, "")
+        return PublishResult(warning, str(error), site.input_faults)
+    return PublishResult(warning, "", site.input_faults)
 
 
 def _write_products(site: Site, result: StoredResult | None, faults: list[str], progress: Progress) -> None:

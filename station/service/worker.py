@@ -10,11 +10,18 @@ from pathlib import Path
 from typing import TypeVar
 
 from station.archive.reference_files import valid_versions
-from station.archive.series.index import series_in
+from station.archive.series.index import stored_series
 from station.config import Site
-from station.errors import ConfigError, NotReadyError, ScanError, StationError, StoreError
-from station.inbox.inbox import ScanFile
-from station.inbox.journal import Entry, Journal, State
+from station.errors import (
+    ConfigError,
+    InconclusiveError,
+    NotReadyError,
+    ScanError,
+    StationError,
+    StoreError,
+)
+from station.inbox.inbox import ScanFile, start_from_name
+from station.inbox.journal import SETTLING_S, Entry, Journal, State
 from station.inbox.scan_files import find_scan
 from station.logs import logfmt
 from station.monitoring.daily_digest import write_digest, yesterday
@@ -49,12 +56,15 @@ from station.processing.scan_tasks import (
 )
 from station.processing.staleness import count_outdated, late_inputs
 from station.processing.store_tasks import (
+    MAX_STORE_TASK_S,
     MAX_UNCOMPACTED,
     Checksums,
     compact_epochs,
     delete_expired,
     update_series,
 )
+from station.processing.usable_inputs import with_usable_inputs
+from station.science.geometry.pose import horizontal_crs, is_same_map
 from station.service.background_compaction import BackgroundCompaction
 from station.service.publishing import publish
 from station.service.retention import apply_retention, expired_scans
@@ -75,25 +85,30 @@ class Worker:
         on_progress: Progress = lambda: None,
         should_stop: Callable[[], bool] = lambda: False,
         on_compacted: Callable[[], None] = lambda: None,
+        before_task: Callable[[], None] = lambda: None,
         in_service: bool = False,
     ) -> None:
         """`on_compacted` is called, in another thread, when `publish_compacted` has something to do.
 
+        `before_task` raises StoreError if the data folder cannot be used now.
+
         `in_service`: scans may wait for weather, and one with a new mtime but the same bytes is not processed
         again.
 
-        Raises ConfigError if the stored series has another grid.
+        Raises ConfigError if the stored series has another map or grid.
         """
-        _require_same_grid(site)
+        _require_same_map(site)
         self._site = site
         self._series = series_for(site)
         self._journal = journal
         self._on_progress = on_progress
         self._should_stop = should_stop
+        self._before_task = before_task
         self._in_service = in_service
         self._processed: dict[str, ScanFile] = {}
         self._last_verified_s = -math.inf
         self._reported_outdated = 0
+        self._reported_faults: tuple[str, ...] = ()
         self._compaction = BackgroundCompaction(site, on_compacted)
 
     def process(self, scan: ScanFile) -> bool:
@@ -101,6 +116,11 @@ class Worker:
 
         Raises StoreError if the store cannot be written; the scan is then still waiting.
         """
+        is_stored = self._process(scan)
+        self._build_reference_if_due()  # also if the scan is not stored: the reference may have waited for it
+        return is_stored
+
+    def _process(self, scan: ScanFile) -> bool:
         self._processed[scan.name] = scan
         entry = self._journal.entry(scan.name)
         history = ScanHistory(
@@ -109,11 +129,14 @@ class Worker:
             last_content=_assessed_content(entry) if self._in_service else None,
             stored_scans=self._journal.others_stored(scan.name, scan.size),
             wait_for_weather=self._in_service,
+            waiting_before=self._unsettled_before(self._start_s(scan.name)) if self._in_service else "",
         )
         try:
             result = self._with_repair(process_new, scan, history)
         except ScanError as error:
             return self._set_aside(scan, str(error))
+        except InconclusiveError as error:
+            return record_failure(self._journal, self._site, scan.name, str(error))
         except NotReadyError as error:
             pause_s = self._journal.defer(scan.name, str(error))
             log.info("%s", logfmt(scan=scan.name, verdict="later", reason=error, retry_s=round(pause_s)))
@@ -126,7 +149,6 @@ class Worker:
         record_result(self._journal, scan.name, result)
         _log_result(scan.name, result)
         self.publish(scan.name, result)
-        self._build_reference_if_due()
         if self._in_service and uncompacted > MAX_UNCOMPACTED:
             self.start_compaction(in_backlog=True)
         return True
@@ -213,13 +235,19 @@ class Worker:
             log.warning("%s", logfmt(digest="failed", reason=error))
 
     def run_maintenance(self) -> None:
-        """Delete expired files, requeue scans with late inputs, report outdated epochs, apply retention."""
+        """Rebuild damaged files, delete expired ones, requeue scans with late inputs, report outdated epochs.
+
+        Then apply retention.
+        """
+        if holds_epochs(self._series):
+            self._with_repair(update_series)
         self._journal.drop_checksums(self._with_repair(delete_expired))
         affected = self._with_repair(late_inputs, self._journal.rows(State.STORED))
         names = [name for name in affected if (self._site.scans.inbox / name).is_file()]
         for name in names:
             log.info("%s", logfmt(scan=name, reason="its log or weather arrived late: reprocessing"))
         self._journal.requeue(names)
+        self._judge_again()
         self._report_outdated()
         self._apply_retention()
 
@@ -275,7 +303,10 @@ class Worker:
     def _set_aside(
         self, scan: ScanFile, reason: str, sha256: str | None = None, log_sha256: str = ""
     ) -> bool:
-        self._journal.set_aside(scan.name, reason, sha256=sha256, log_sha256=log_sha256)
+        conditions = self._site.judging_conditions
+        self._journal.set_aside(
+            scan.name, reason, sha256=sha256, log_sha256=log_sha256, judged_under=conditions
+        )
         log.warning("%s", logfmt(scan=scan.name, verdict="set_aside", reason=reason))
         self.publish()
         return False
@@ -290,6 +321,10 @@ class Worker:
         except (StationError, RuntimeError) as error:
             log.warning("%s", logfmt(page="failed", reason=error))
             return
+        if published.input_faults != self._reported_faults:
+            for fault in published.input_faults:
+                log.warning("%s", logfmt(input="broken", reason=fault))
+            self._reported_faults = published.input_faults
         if published.warning:
             log.warning("%s", logfmt(scan=name, moved=published.warning))
         if published.fault:
@@ -306,9 +341,19 @@ class Worker:
         entry = self._journal.entry(scan.name)
         return entry is not None and entry.state is State.STORED
 
+    def _judge_again(self) -> None:
+        """Queue scans that were set aside or failed under other settings, limits or another version."""
+        names = self._journal.judged_otherwise(self._site.judging_conditions)
+        names = [name for name in names if (self._site.scans.inbox / name).is_file()]
+        reason = "settings, limits or version have changed since it was set aside or failed"
+        for name in names:
+            log.info("%s", logfmt(scan=name, verdict="waiting", reason=reason))
+        self._journal.requeue(names, reason)
+
     def _report_outdated(self) -> None:
         """Log the number of epochs with outdated settings, whenever it changes."""
-        count = self.run(_count_outdated)
+        queued = [entry.epoch for entry in self._journal.waiting() if entry.epoch]
+        count = self.run(_count_outdated, queued)
         if count and count != self._reported_outdated:
             reason = "outdated SOP, setting, flag or reference: run station reprocess"
             log.warning("%s", logfmt(epochs=count, reason=reason))
@@ -347,7 +392,11 @@ class Worker:
         if versions and not isinstance(setting, Path):
             self._requeue_without_reference()
         chosen = scans_for_version(self._site, usable, len(versions))
-        if isinstance(setting, Path) or not chosen or len(usable) < scans_needed(self._site, len(versions)):
+        needed = scans_needed(self._site, len(versions))
+        if isinstance(setting, Path) or not chosen or len(usable) < needed:
+            return
+        last_s = self._start_s(usable[needed - 1])
+        if self._unsettled_before(last_s):  # it may belong to the reference
             return
         scans = [self._find_scan(name) for name in chosen]
         available = [scan for scan in scans if scan is not None]
@@ -367,9 +416,36 @@ class Worker:
             return
         self.add_checksums()
         log.info("%s", logfmt(reference=version, scans=len(available)))
-        if not versions:
-            others = (row.name for row in self._journal.rows(State.STORED) if row.reference != version)
-            self._journal.requeue(others)
+        self._requeue_for_version(version, last_s if versions else None)
+
+    def _requeue_for_version(self, version: str, update_s: float | None) -> None:
+        """Requeue epochs that were not measured from a version of the reference, but should have been.
+
+        These are all epochs of a first version; of an update, to the scans before `update_s`, those of later
+        scans that were processed while the update waited for an earlier one.
+        """
+        outdated = (
+            row.name
+            for row in self._journal.rows()
+            if row.epoch and row.outcome is not State.SET_ASIDE and row.reference != version
+            if update_s is None
+            or ((row.start_utc_s or 0.0) > update_s and row.changed_utc_s > time.time() - SETTLING_S)
+        )
+        self._journal.requeue(outdated, keep_reference=False)
+
+    def _unsettled_before(self, start_utc_s: float) -> str:
+        """Return the name of an earlier scan that will be judged soon, '' if there is none."""
+        for name, known_s in self._journal.unsettled().items():
+            if (known_s or start_from_name(name, self._site.scans.name).timestamp()) < start_utc_s:
+                return name
+        return ""
+
+    def _start_s(self, name: str) -> float:
+        """Return the start of a scan, from its epoch or else its name; the year 9999 if neither tells it."""
+        entry = self._journal.entry(name)
+        if entry is not None and entry.start_utc_s is not None:
+            return entry.start_utc_s
+        return start_from_name(name, self._site.scans.name).timestamp()
 
     def _requeue_without_reference(self) -> None:
         """Requeue epochs without change: power failed between building the reference and its first use."""
@@ -390,18 +466,21 @@ class Worker:
         return find_scan(self._site, name, entry.start_utc_s if entry else None)
 
     def run(self, task: Callable[..., T], *args: object) -> T:
-        """Run a task in a worker process, limited to `timeout_s` per scan; without scans, unlimited."""
+        """Run a task in a worker process, limited to `timeout_s` per scan; without scans, to hours."""
         items = [item for arg in args for item in (arg if isinstance(arg, list) else [arg])]
+        self._before_task()
         scan_count = sum(isinstance(item, ScanFile) for item in items)
-        return isolation.run_isolated(
+        result: T = isolation.run_isolated(
+            with_usable_inputs,
             task,
             self._site,
             *args,
             memory_gb=self._site.service.memory_gb,
-            timeout_s=self._site.scans.timeout_s * scan_count if scan_count else math.inf,
+            timeout_s=self._site.scans.timeout_s * scan_count or MAX_STORE_TASK_S,
             on_progress=self._on_progress,
             should_stop=self._should_stop,
         )
+        return result
 
 
 def _assessed_content(entry: Entry | None) -> tuple[str, str] | None:
@@ -409,6 +488,14 @@ def _assessed_content(entry: Entry | None) -> tuple[str, str] | None:
     if entry is None or entry.outcome is None or not entry.sha256:
         return None
     return entry.sha256, entry.log_sha256
+
+
+def record_failure(journal: Journal, site: Site, name: str, reason: str) -> bool:
+    """Record and log an attempt that failed although the scan may be good; return False: it is not stored."""
+    pause_s = journal.record_failure(name, reason, site.judging_conditions)
+    verdict, extra = ("set_aside", {}) if pause_s is None else ("later", {"retry_s": round(pause_s)})
+    log.warning("%s", logfmt(scan=name, verdict=verdict, reason=reason, **extra))
+    return False
 
 
 def record_result(journal: Journal, name: str, result: StoredResult) -> None:
@@ -428,12 +515,21 @@ def record_result(journal: Journal, name: str, result: StoredResult) -> None:
     )
 
 
-def _require_same_grid(site: Site) -> None:
-    """Raise ConfigError if the stored series has another grid: a series has only one."""
-    try:
-        stored = series_in(site.station.data).grid
-    except StoreError:  # nothing stored yet, or to be rebuilt
+def _require_same_map(site: Site) -> None:
+    """Raise ConfigError if the stored series has another map or grid: a series has only one."""
+    series = stored_series(series_for(site))
+    if series is None:
         return
+    crs = site.map.crs
+    if (crs is None) != (series.crs is None) or (
+        crs and series.crs and not is_same_map(horizontal_crs(series.crs), horizontal_crs(crs))
+    ):
+        stored_name = horizontal_crs(series.crs).name if series.crs else "a local frame, without map.crs"
+        raise ConfigError(
+            f"map.crs = {crs!r} differs from that of {site.station.data}, {stored_name}: restore it, or give"
+            " station.data a new folder"
+        )
+    stored = series.grid
     configured = site.grid_cells
     deviation_m = max(
         abs(stored_m - configured_m)
@@ -451,9 +547,9 @@ def _require_same_grid(site: Site) -> None:
         )
 
 
-def _count_outdated(site: Site, progress: Progress) -> int:
+def _count_outdated(site: Site, queued: list[str], progress: Progress) -> int:
     progress()
-    return count_outdated(site)
+    return count_outdated(site, queued)
 
 
 def _log_result(name: str, result: StoredResult) -> None:

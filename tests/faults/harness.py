@@ -12,48 +12,21 @@ import subprocess
 import sys
 import time
 from contextlib import suppress
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import netCDF4
 import numpy as np
 import pytest
+from support.tiny_station import PENDING, SCANS, assert_same_values, build, scan_name  # noqa: F401 - for tests
 
 from benchmarks.process_cost import family
 from station.inbox.journal import Journal, State
-from station.simulation.scenario import small
-from station.simulation.station import simulate
 
 FOLDER = Path(__file__).parent
 HOOKS = FOLDER / "hooks"
 RECORD = 96  # bytes per boundary, see hooks/boundaries.py
 TIMEOUT_S = 120.0  # a worker process that keeps dying is restarted after 1, 5 and 30 s
-SCANS = 6
-PENDING = "pending"  # folder of the scans that have not arrived yet
-NOT_COMPARED = {"epoch_file"}  # the revision may differ
-
-
-def build(folder, *, method="none", hours=SCANS):
-    """Simulate a station whose scans take a fifth of a second to process; its inbox is empty."""
-    scenario = replace(
-        small(hours=hours),
-        lines=30,
-        shots_per_line=60,
-        cell_m=25.0,
-        azimuth_deg=(150.0, 165.0),
-        terrain_step_m=10.0,
-        scan_s=60.0,
-        reference_scans=2,
-    )
-    simulate(folder, scenario)
-    text = (folder / "site.toml").read_text()
-    for old, new in (('method = "joint" ', f'method = "{method}" '), ("settle_s = 2 ", "settle_s = 0.05 ")):
-        assert old in text
-        text = text.replace(old, new)
-    (folder / "site.toml").write_text(text)
-    (folder / "inbox").rename(folder / PENDING)
-    (folder / "inbox").mkdir()
-    return folder
 
 
 class Warm:
@@ -273,32 +246,7 @@ def pause(seconds=0.05):
     time.sleep(seconds)
 
 
-def scan_name(hour):
-    """Return the name of a scan without its suffix."""
-    return f"250715_{hour:02d}0000"
-
-
 # ---- invariants
-
-
-def values(path):
-    """Return the dimensions and the stored values of every variable of a file."""
-    with netCDF4.Dataset(path) as file:
-        file.set_auto_mask(False)
-        return {
-            name: (variable.dimensions, np.asarray(variable[...]))
-            for name, variable in file.variables.items()
-            if name not in NOT_COMPARED
-        }
-
-
-def assert_same_values(path, expected_path):
-    """Assert that every variable is bit-identical to that of an undisturbed run."""
-    actual, expected = values(path), values(expected_path)
-    assert actual.keys() == expected.keys()
-    for name, (dims, value) in expected.items():
-        assert actual[name][0] == dims, name
-        assert actual[name][1].tobytes() == value.tobytes(), f"{path.name}: {name} differs"
 
 
 def assert_store_intact(station, hours, undisturbed=None):

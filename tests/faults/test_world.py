@@ -167,6 +167,18 @@ def test_arrivals_out_of_order_and_repeated(make_station, undisturbed, rng):
     finish(station, undisturbed())
 
 
+def test_touched_scans_change_no_value_although_the_reference_falls_due(make_station, undisturbed, rng):
+    """Scans that others overtake while they settle belong to the first reference all the same."""
+    station = make_station()
+    station.start()
+    for hour in ALL:
+        station.drop(hour)
+        for touched in rng.choices(range(hour + 1), k=3):
+            os.utime(station.inbox / f"{harness.scan_name(touched)}.laz")
+            harness.pause(rng.uniform(0.0, 0.2))
+    finish(station, undisturbed())
+
+
 @pytest.mark.slow
 def test_scan_replaced_while_it_is_read(make_station, undisturbed, rng):
     """Finally the last version of the file is stored, once."""

@@ -42,13 +42,13 @@ def run_service(order):
 
 
 def start_fork_server():
-    """Start the fork server of `station.processing.isolation`, itself by a fork."""
-    from station.processing import isolation
+    """Start the fork server of `station.processing.fork_server`, itself by a fork."""
+    from station.processing.fork_server import ensure_running
 
     spawn = multiprocessing.util.spawnv_passfds
     multiprocessing.util.spawnv_passfds = fork_server
     try:
-        isolation.start_forkserver()
+        ensure_running()
     finally:
         multiprocessing.util.spawnv_passfds = spawn
 

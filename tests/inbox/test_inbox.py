@@ -12,6 +12,7 @@ import socket
 import pytest
 
 from station.errors import NotReadyError
+from station.inbox import inbox as inbox_module
 from station.inbox.inbox import Inbox, safe_name
 from station.inbox.journal import Journal, State
 
@@ -73,6 +74,22 @@ def drop(tmp_path):
 
 def store(journal, name):
     journal.record_stored(name, sha256="0", verdict="good", epoch="e", start_utc_s=0.0, revision=1)
+
+
+def test_thousands_of_odd_names_delay_no_scan(make_site, monkeypatch, caplog):
+    monkeypatch.setattr(inbox_module, "MAX_REJECTED", 20)
+    site = make_site(settle_s=0.0)
+    for number in range(50):
+        (site.scans.inbox / f"odd name {number}.laz").touch()
+    (site.scans.inbox / "261121_010000.laz").write_text("scan")
+    with Journal(site.station.data / "journal.sqlite") as journal:
+        inbox = Inbox(site, journal, (".laz",))
+        states = [inbox.poll() for _ in range(3)]
+        assert [state.first.name for state in states] == ["261121_010000.laz"] * 3
+        assert [state.next_s for state in states] == [0.0, 0.0, math.inf]
+        assert journal.counts()[State.SET_ASIDE] == 50
+    assert len(caplog.records) == 10 + 1 + 10 + 1 + 10  # of each poll ten, and how many more
+    assert len(list((site.station.data / "set_aside").iterdir())) == 50
 
 
 def test_scan_is_ready_when_unchanged_for_settle_s(make_inbox, drop, clock, journal):

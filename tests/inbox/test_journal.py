@@ -9,6 +9,7 @@ import sqlite3
 import subprocess
 import sys
 import time
+from contextlib import closing
 from dataclasses import replace
 
 import pytest
@@ -109,6 +110,61 @@ def test_retry_delay_doubles_up_to_an_hour_and_restarts_when_the_file_changes(jo
     assert journal.entry(NAME).next_try_utc_s == 4600.0
     journal.record_seen([(NAME, 11, 20, "")])
     assert (journal.entry(NAME).attempts, journal.entry(NAME).next_try_utc_s) == (0, None)
+
+
+def test_failures_count_only_under_the_same_conditions(journal):
+    for _ in range(20):
+        journal.defer(NAME, "permission denied")
+    delays_s = [journal.record_failure(NAME, "killed", "0.1 a") for _ in range(3)]
+    assert delays_s == [30, 60, 120]
+    assert journal.judged_otherwise("0.1 a") == []
+    assert journal.judged_otherwise("0.2 a") == [NAME]
+    assert journal.record_failure(NAME, "killed", "0.2 a") == 30
+    assert [journal.record_failure(NAME, "killed", "0.2 a") for _ in range(11)][-2:] == [30 * 2**10, None]
+    assert journal.entry(NAME).state is State.SET_ASIDE
+
+
+def test_scans_set_aside_whatever_the_settings_are_not_judged_again(journal):
+    journal.set_aside("copy.laz", "the same bytes as a.laz, which is stored")
+    journal.set_aside("short.laz", "cut off", judged_under="0.1 a")
+    assert journal.judged_otherwise("0.2 a") == ["short.laz"]
+
+
+def test_settled_scans_delay_no_other(tmp_path):
+    now_s = [1000.0]
+    with Journal(tmp_path / "journal.sqlite", now_s=lambda: now_s[0]) as journal:
+        journal.record_seen([(name, 10, 20, "") for name in ("open.laz", "stored.laz", "later.laz")])
+        store(journal, "stored.laz")
+        journal.defer("later.laz", "permission denied")
+        assert journal.unsettled() == {"later.laz": None, "open.laz": None}
+        for _ in range(5):
+            journal.defer("later.laz", "permission denied")
+        assert list(journal.unsettled()) == ["open.laz"]
+        now_s[0] += 7 * 3600
+        assert journal.unsettled() == {}
+        journal.record_seen([("stored.laz", 10, 21, "")])
+        assert journal.unsettled() == {"stored.laz": 5.0}
+
+
+def test_copy_is_recognised_while_its_original_waits(journal):
+    journal.record_seen([(NAME, 10, 20, "")])
+    store(journal)
+    journal.requeue([NAME])
+    assert journal.others_stored("copy.laz", 10) == {"aa": NAME}
+    assert journal.starting_at(5.9) == [NAME]
+
+
+def test_older_journal_is_read_and_completed(tmp_path):
+    path = tmp_path / "journal.sqlite"
+    with Journal(path) as journal:
+        store(journal)
+        journal.set_aside("short.laz", "cut off", judged_under="0.1 a")
+    with closing(sqlite3.connect(path)) as connection:
+        connection.execute("ALTER TABLE scan DROP COLUMN judged_under")
+    with Journal(path, read_only=True) as journal:
+        assert [row.name for row in journal.rows()] == [NAME, "short.laz"]
+    with Journal(path) as journal:
+        assert journal.judged_otherwise("0.2 a") == ["short.laz"]
 
 
 def test_requeued_scan_is_not_restored_by_its_content(journal):

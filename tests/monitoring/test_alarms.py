@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import subprocess
 import sys
 import time
@@ -201,7 +202,7 @@ def test_disk_space_alarm_and_unreadable_disk(station_at, monkeypatch):
 
     monkeypatch.setattr(alarm_rules.shutil, "disk_usage", lambda _: SimpleNamespace(free=3e9))
     assert active(0) == {}
-    full = SimpleNamespace(f_bavail=10**6, f_frsize=4096, f_files=1000, f_favail=3)
+    full = SimpleNamespace(f_bavail=10**6, f_frsize=4096, f_files=1000, f_favail=3, f_flag=0)
     monkeypatch.setattr("station.monitoring.preconditions.os.statvfs", lambda _: full)
     assert "no inodes left" in active(0)["disk"]
 
@@ -295,6 +296,14 @@ def test_secrets_are_not_printed(make_site, credentials, capfd):
     assert "geheim" not in "".join(capfd.readouterr())
 
 
+@pytest.mark.parametrize("url", ["mailto//user:geheim@example.org", "geheim", "slack://geheim%2Fx/a"])
+def test_secrets_in_a_misspelt_url_are_not_printed(make_site, credentials, capfd, caplog, url):
+    site = make_site(more='[alarms]\ntargets = ["hook"]\n')
+    credentials(hook=url)
+    assert alarms.test(site, print) == 1
+    assert "geheim" not in "".join([*capfd.readouterr(), caplog.text])
+
+
 @pytest.mark.parametrize(
     ("more", "message"),
     [
@@ -329,7 +338,8 @@ def test_digest_is_sent_once(make_site, credentials, webhook):
 
 def test_change_is_assessed_once_per_epoch_and_always_at_the_newest(make_site, tmp_path, write_series):
     """A step at hour 20; all scans until hour 40 are processed between two evaluations."""
-    (tmp_path / "areas.geojson").write_text("{}")
+    triangle = {"type": "Polygon", "coordinates": [[[0, 0], [500, 0], [0, 500], [0, 0]]]}
+    (tmp_path / "areas.geojson").write_text(json.dumps(triangle))
     rules = f'[areas]\nfile = "areas.geojson"\n[alarms]\n{NO_RULES}[alarms.change]\nareas = ["tongue"]\n'
     site = make_site(more=rules)
     hours = np.arange(40)

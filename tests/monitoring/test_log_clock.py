@@ -70,7 +70,8 @@ def test_series_without_the_variables_reports_nothing(problem_of):
 def test_status_lists_the_offset_among_the_faults(problem_of, tmp_path, monkeypatch):
     """The station has a journal, like a running one."""
     monkeypatch.setattr("station.monitoring.pose_stability.latest_step", lambda _: "")
-    monkeypatch.setattr("station.processing.staleness.count_outdated", lambda _: 0)
+    monkeypatch.setattr("station.processing.staleness.count_outdated", lambda *_: 0)
+    monkeypatch.setattr("station.processing.usable_inputs.usable_site", lambda site: site)
     problem_of(*draw(1, 6.0))
     with Journal(tmp_path / "journal.sqlite"):
         pass
@@ -79,6 +80,8 @@ def test_status_lists_the_offset_among_the_faults(problem_of, tmp_path, monkeypa
         scans=SimpleNamespace(inbox=tmp_path, expected_every_s=3600.0),
         grid=SimpleNamespace(shape=(2, 3)),
         adjusts=True,
+        weather=None,
+        input_faults=(),
     )
     assert any("clock of the logger" in fault for fault in status.status(site)["faults"])
     site.adjusts = False

@@ -7,8 +7,11 @@ import shutil
 import socket
 import subprocess
 import sys
+import threading
 import time
+import urllib.error
 import urllib.request
+from contextlib import ExitStack, suppress
 from pathlib import Path
 
 import pytest
@@ -18,7 +21,7 @@ from station.config import read_site
 from station.errors import ConfigError
 from station.inbox.journal import Journal
 from station.monitoring.alarm_state import FILE_NAME, Alarm, AlarmState, due_messages, save
-from station.monitoring.metrics import Metrics
+from station.monitoring.metrics import THREADS, Metrics, _RequestHandler
 
 
 @pytest.fixture
@@ -104,6 +107,29 @@ def test_occupied_port_and_missing_folder_are_reported(station, port, make_site,
     metrics.write()
     metrics.write()
     assert len([record for record in caplog.records if "metrics_file" in record.message]) == 1
+
+
+@pytest.mark.parametrize("host", ["evil.example", "127.0.0.1.evil.example", ""])
+def test_requests_to_other_hosts_are_refused(station, port, host):
+    request = urllib.request.Request(f"http://127.0.0.1:{port}/metrics", headers={"Host": host})
+    with Metrics(lambda: station).serving(), pytest.raises(urllib.error.HTTPError, match="403"):
+        urllib.request.urlopen(request)  # noqa: S310 - an address of this test
+
+
+def test_idle_connections_take_neither_threads_nor_the_service(station, port, monkeypatch):
+    monkeypatch.setattr(_RequestHandler, "timeout", 0.1)
+    before = threading.active_count()
+    with Metrics(lambda: station).serving(), ExitStack() as idle:
+        for _ in range(100):
+            idle.enter_context(socket.create_connection(("127.0.0.1", port)))
+        assert threading.active_count() <= before + 1 + THREADS
+        until_s = time.monotonic() + 20
+        while time.monotonic() < until_s:  # the idle connections are closed meanwhile
+            with suppress(OSError), urllib.request.urlopen(f"http://127.0.0.1:{port}/metrics") as answer:
+                assert figures(answer.read().decode())["station_scans", "stored"] == 3
+                return
+            time.sleep(0.1)
+        pytest.fail("no answer")
 
 
 @pytest.mark.parametrize("address", ["0.0.0.0:9750", "192.0.2.1:9750", ":9750", "127.0.0.1", "127.0.0.1:0"])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import time
 
 import pytest
@@ -14,7 +15,7 @@ from station.monitoring.preconditions import clock_problem, require_disk_space
 class FileSystem:
     """A result of os.statvfs."""
 
-    f_frsize, f_bavail, f_files, f_favail = 4096, 10_000_000, 1000, 1000
+    f_frsize, f_bavail, f_files, f_favail, f_flag = 4096, 10_000_000, 1000, 1000, 0
 
     def __init__(self, **changes):
         self.__dict__.update(changes)
@@ -22,7 +23,11 @@ class FileSystem:
 
 @pytest.mark.parametrize(
     ("changes", "message"),
-    [({"f_bavail": 1000}, "4 MB free, 16 MB needed"), ({"f_favail": 3}, "inodes")],
+    [
+        ({"f_bavail": 1000}, "4 MB free, 16 MB needed"),
+        ({"f_favail": 3}, "inodes"),
+        ({"f_flag": os.ST_RDONLY}, "read-only"),
+    ],
 )
 def test_lack_of_space_or_inodes_is_an_error(make_site, monkeypatch, changes, message):
     site = make_site()

@@ -1,6 +1,7 @@
 """`station reprocess`: a change affects exactly its epochs, and every other value stays bit-identical."""
 
 import contextlib
+import json
 import os
 import shutil
 import signal
@@ -10,6 +11,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import xarray as xr
 
 import station
 from station.archive.reference_files import read_reference_provenance
@@ -18,6 +20,7 @@ from station.errors import ConfigError, NotReadyError
 from station.inbox.journal import Journal, State
 from station.inbox.lock import exclusive_lock
 from station.inbox.scan_files import scan_file
+from station.monitoring.status import status as station_status
 from station.operations import reprocessing
 from station.operations.batch import process_scans
 from station.operations.reprocessing import Reprocessing, reprocess
@@ -199,6 +202,32 @@ def test_service_drops_a_damaged_epoch_and_reprocesses_its_scan(folder):
 
 
 @integration
+def test_service_restores_damaged_derived_files(folder):
+    """A reference needs no second scan: nothing of what is damaged here is a source."""
+    site, data = edited_site(folder), folder / "data"
+    with Journal(data / "journal.sqlite") as journal:
+        Worker(site, journal, in_service=True).recover()  # the store is a copy
+    original = {name: xr.open_dataset(data / name).load() for name in ("series.nc", "areas.nc")}
+    (tilt_offset,) = (data / "sop_tilt_offset").iterdir()
+    text = tilt_offset.read_text()
+    derived = [data / "series.nc", data / "areas.nc", tilt_offset]
+    for content in (b"", b"garbage"):
+        for path in derived:
+            path.write_bytes(content)
+        assert len(faults(folder)) == 3
+        assert station_status(site)["counts"][State.STORED] == len(SCANS)
+        with Journal(data / "journal.sqlite") as journal:
+            worker = Worker(site, journal, in_service=True)
+            worker.run_maintenance()
+            assert process_scans(site, [site.scans.inbox / f"{LAST}.laz"], lambda _: None) == 0
+        assert faults(folder) == []
+        for name, expected in original.items():
+            with xr.open_dataset(data / name) as actual:
+                assert actual.load().identical(expected)
+        assert tilt_offset.read_text() == text
+
+
+@integration
 def test_flag_makes_its_epoch_unusable_until_it_is_removed(folder):
     original = read_series(folder)
     flags = folder / "flags.csv"
@@ -275,7 +304,8 @@ def test_tilt_offset_of_an_sop_is_that_of_its_first_scan_in_any_order(folder, mo
     assert (status, "2 × other SOP" in messages) == (0, True)
     (actual,) = (folder / "data" / "sop_tilt_offset").glob("sop_2-*.json")
     assert (actual.name, actual.read_text()) == (expected.name, expected.read_text())
-    assert read_series(folder).sop_tilt_offset.values[3:].tolist() == [expected.read_text()] * 2
+    stored = [json.loads(text) for text in read_series(folder).sop_tilt_offset.values[3:].tolist()]
+    assert stored == [json.loads(expected.read_text())["content"]] * 2
 
 
 @pytest.mark.slow
@@ -373,6 +403,15 @@ def test_late_log_and_weather_requeue_their_scan(processed, tmp_path):
 
 
 @integration
+def test_epoch_that_waits_to_be_processed_again_is_not_outdated(folder):
+    site = edited_site(folder, ("min_points = 1", "min_points = 2"))
+    with Journal(site.station.data / "journal.sqlite") as journal:
+        assert station_status(site)["stale"] == 5
+        journal.requeue([f"{LAST}.laz"])
+        assert station_status(site)["stale"] == 4
+
+
+@integration
 def test_touched_scan_is_not_reprocessed_and_a_copy_is_set_aside(folder):
     site = edited_site(folder)
     files = sorted((folder / "data" / "epochs").rglob("*"))
@@ -425,6 +464,15 @@ def test_lost_journal_is_rebuilt_from_the_epochs(folder):
         assert len(journal.rows()) == len(SCANS)
     assert sorted((folder / "data" / "epochs").rglob("*.nc")) == files
     assert run(site)[1] == "0 epochs to reprocess"
+
+
+@integration
+@pytest.mark.parametrize("crs", ["EPSG:25832", "EPSG:32633"])
+def test_store_of_another_map_is_rejected(folder, crs):
+    """ETRS89 differs from WGS84 by less than a metre, but other pairs do not."""
+    site = edited_site(folder, ('crs = "EPSG:32632"', f'crs = "{crs}"'))
+    with pytest.raises(ConfigError, match=r"map\.crs = .* differs from that of .* zone 32N: restore it"):
+        run(site)
 
 
 @integration

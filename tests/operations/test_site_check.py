@@ -1,7 +1,9 @@
 """`station check`: findings on polygons, flags and folders of a site."""
 
 import json
+import os
 import shutil
+import time
 from dataclasses import replace
 
 import laspy
@@ -9,6 +11,7 @@ import pytest
 
 from station.config import read_site
 from station.operations import site_check
+from station.operations import site_plausibility as plausibility
 from station.sections import FlagsSection, RetentionSection
 from station.simulation.station import simulate, small
 
@@ -53,6 +56,98 @@ def test_unreadable_polygon_file_is_a_fault(folder):
     (finding,) = site_check._polygons(read_site(folder / "site.toml"))
     assert finding["level"] == "fault"
     assert "areas.geojson" in finding["message"]
+
+
+def warnings(findings):
+    return [message for level, message in findings if level != "ok"]
+
+
+def edited(folder, *changes, more=""):
+    path = folder / "site.toml"
+    text = path.read_text()
+    for old, new in changes:
+        assert old in text
+        text = text.replace(old, new)
+    path.write_text(text + more)
+    return read_site(path)
+
+
+def test_alarms_of_unknown_areas_and_without_their_library_are_faults(folder, monkeypatch):
+    site = edited(folder, more='\n[alarms]\ntargets = ["mail"]\n[alarms.change]\nareas = ["tongue"]\n')
+    monkeypatch.setattr(plausibility.importlib.util, "find_spec", lambda _: None)
+    unknown, missing = warnings(plausibility.alarm_findings(site, {"glacier"}))
+    assert unknown == "alarms.change.areas: no area 'tongue'; there are glacier"
+    assert "tls-station[alarms]" in missing
+
+
+def test_areas_on_stable_ground_are_told(folder):
+    shutil.copy(folder / "areas.geojson", folder / "stable.geojson")
+    messages = [finding["message"] for finding in site_check._polygons(read_site(folder / "site.toml"))]
+    assert "100% of the area glacier is declared stable: its change is adjusted away" in messages
+
+
+def test_sop_in_millimetres_is_told(folder):
+    site = read_site(folder / "site.toml")
+    origin_m = site_check.map_position(site)
+    far_off_m = (origin_m[0] + 1700, origin_m[1], origin_m[2] + 2000)
+    assert (
+        "is its translation in metres?"
+        in warnings(plausibility.position_findings(site, "sop.dat", far_off_m, origin_m))[0]
+    )
+    assert not warnings(plausibility.position_findings(site, "sop.dat", origin_m, origin_m))
+
+
+@pytest.mark.parametrize(
+    ("map_section", "scanner", "message"),
+    [
+        ({"vertical_datum": "EGM2008"}, {}, "write its name in EPSG, 'EGM2008 geoid'"),
+        ({"vertical_datum": "Zugspitze 1900"}, {}, "no datum of EPSG"),
+        ({"vertical_datum": "EGM2008 geoid"}, {}, None),
+        ({}, {"beam_divergence_mrad": 0.00012}, "scanner.beam_divergence_mrad = 0.00012, but a riegl"),
+    ],
+)
+def test_unusual_settings_are_told(folder, map_section, scanner, message):
+    site = read_site(folder / "site.toml")
+    site = site.model_copy(
+        update={
+            "map": site.map.model_copy(update={"vertical_datum": "", **map_section}),
+            "scanner": site.scanner.model_copy(update=scanner),
+        }
+    )
+    found = warnings(plausibility.setting_findings(site))
+    assert [message in text for text in found] == ([True] if message else [])
+
+
+def test_weather_log_of_another_time_zone_is_told():
+    (message,) = warnings(plausibility.weather_time_findings(time.time() + 7200))
+    assert "2.0 h in the future" in message
+    assert not warnings(plausibility.weather_time_findings(time.time() - 60))
+
+
+@pytest.mark.skipif(os.geteuid() != 0, reason="tells root what another user may not do")
+def test_rights_of_the_user_of_the_service_are_told_to_root(folder):
+    site = read_site(folder / "site.toml")
+    (folder / "sop.dat").chmod(0o600)
+    messages = warnings(plausibility.rights_findings(site, [folder / "sop.dat"], "nobody"))
+    assert f"{folder / 'sop.dat'}: the user nobody may not read it" in messages
+    assert any("may not write there" in message for message in messages)
+    assert os.geteuid() == 0
+    (message,) = warnings(plausibility.rights_findings(site, [], "nosuchuser"))
+    assert "run as root" in message
+
+
+def test_unreadable_inbox_is_a_fault(folder, monkeypatch):
+    site = read_site(folder / "site.toml")
+    monkeypatch.setattr(site_check.os, "access", lambda path, _: path != site.scans.inbox)
+    monkeypatch.setattr(type(site.scans.inbox), "iterdir", raise_permission_error)
+    assert site_check._scans(site) == []
+    assert [finding["what"] for finding in site_check._folders(site) if finding["level"] == "fault"] == [
+        "inbox"
+    ]
+
+
+def raise_permission_error(_):
+    raise PermissionError(13, "Permission denied")
 
 
 def test_flags_are_counted_and_an_invalid_row_is_a_fault(folder, tmp_path):

@@ -89,6 +89,25 @@ def hang_ignoring_signals(note, _progress):
         time.sleep(0.05)
 
 
+def read_pipe(pipe, note, _progress):
+    Path(note).write_text(str(os.getpid()), encoding="ascii")
+    return Path(pipe).read_bytes()
+
+
+def work_silently(seconds, _progress):
+    until_s, steps = time.monotonic() + seconds, 0
+    while time.monotonic() < until_s:
+        steps += 1
+    return steps
+
+
+def note_pid_and_spin(note, progress):
+    with Path(note).open("a", encoding="ascii") as file:
+        file.write(f"{os.getpid()}\n")
+    while True:
+        progress()
+
+
 def panic(_progress):
     raise Panic("called `Option::unwrap()` on a `None` value")
 

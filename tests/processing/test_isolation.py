@@ -2,18 +2,22 @@
 
 from __future__ import annotations
 
+import math
 import os
+import shutil
 import signal
 import subprocess
 import sys
+import tempfile
 import time
 from contextlib import suppress
+from multiprocessing import forkserver, util
 from pathlib import Path
 
 import pytest
 
-from station.errors import NotReadyError, ScanError, StoreError
-from station.processing import isolation
+from station.errors import InconclusiveError, NotReadyError, ScanError, StationError, StoreError
+from station.processing import fork_server, isolation
 
 HERE = Path(__file__).parent
 
@@ -24,7 +28,7 @@ def tasks(monkeypatch):
     import isolated_tasks
 
     # pytest, because a worker imports the main module, which is that of pytest in a test run
-    isolation.start_forkserver(("station.processing.isolation", "numpy", "pytest"))
+    fork_server.ensure_running(("station.processing.isolation", "numpy", "pytest"))
     return isolated_tasks
 
 
@@ -72,23 +76,23 @@ def test_full_disk_of_stderr_raises_not_ready(tasks, monkeypatch):
 
 
 @pytest.mark.parametrize("task", ["allocate", "allocate_in_numpy"])
-def test_memory_limit_raises_scan_error(tasks, task):
-    with pytest.raises(ScanError, match="needs more than 1 GB"):
+def test_memory_limit_raises_inconclusive_error(tasks, task):
+    with pytest.raises(InconclusiveError, match="needs more than 1 GB"):
         run(getattr(tasks, task), 10)
 
 
 @pytest.mark.integration
 def test_memory_of_preloaded_modules_does_not_count(tasks):
     assert run(tasks.allocate, 0.9, memory_gb=1.0) > 9e8
-    with pytest.raises(ScanError, match="needs more"):
+    with pytest.raises(InconclusiveError, match="needs more"):
         run(tasks.allocate, 1.1, memory_gb=1.0)
 
 
 @pytest.mark.parametrize(
     ("number", "error"),
     [
-        (signal.SIGABRT, ScanError),
-        (signal.SIGSEGV, ScanError),
+        (signal.SIGABRT, InconclusiveError),
+        (signal.SIGSEGV, InconclusiveError),
         (signal.SIGKILL, NotReadyError),  # not sent by a decoder: the machine is out of memory
         (signal.SIGTERM, NotReadyError),
     ],
@@ -128,30 +132,104 @@ def test_stop_ends_the_delay_before_a_restart(tasks, tmp_path, monkeypatch):
 @pytest.mark.parametrize(
     ("task", "message"), [("abort", "SIGABRT"), ("segfault", "SIGSEGV"), ("vanish", "without a message")]
 )
-def test_native_crash_raises_scan_error(tasks, task, message):
-    with pytest.raises(ScanError, match=message):
+def test_native_crash_raises_inconclusive_error(tasks, task, message):
+    with pytest.raises(InconclusiveError, match=message):
         run(getattr(tasks, task))
 
 
 @pytest.mark.parametrize("task", ["panic", "exit_task"])
-def test_base_exceptions_of_a_task_raise_scan_error(tasks, task):
-    with pytest.raises(ScanError, match=r"panicked: (Panic: called|SystemExit)"):
+def test_base_exceptions_of_a_task_raise_inconclusive_error(tasks, task):
+    with pytest.raises(InconclusiveError, match=r"panicked: (Panic: called|SystemExit)"):
         run(getattr(tasks, task))
 
 
 def test_hanging_worker_is_killed_at_its_timeout(tasks, tmp_path):
-    reports = []
     start_s = time.monotonic()
-    with pytest.raises(ScanError, match="longer than 1 s"):
+    with pytest.raises(InconclusiveError, match="longer than 1 s"):
+        run(tasks.hang_ignoring_signals, str(tmp_path / "pid"), timeout_s=1.0)
+    assert time.monotonic() - start_s < 3.0
+    assert not is_alive(int((tmp_path / "pid").read_text()))
+
+
+def test_blocked_worker_reports_no_progress_and_is_killed(tasks, tmp_path, monkeypatch):
+    """A pipe without a writer stands for a network folder that hangs; then nothing may feed the watchdog."""
+    monkeypatch.setattr(isolation, "STALL_S", 0.8)
+    os.mkfifo(tmp_path / "weather.dat")
+    reports = []
+    with pytest.raises(NotReadyError, match=r"blocked for 0.8 s"):
         run(
-            tasks.hang_ignoring_signals,
+            tasks.read_pipe,
+            str(tmp_path / "weather.dat"),
             str(tmp_path / "pid"),
-            timeout_s=1.0,
+            timeout_s=math.inf,
             on_progress=lambda: reports.append(1),
         )
-    assert time.monotonic() - start_s < 3.0
-    assert len(reports) >= 3
+    assert len(reports) <= 3  # it started
     assert not is_alive(int((tmp_path / "pid").read_text()))
+
+
+def test_silent_work_counts_as_progress(tasks, monkeypatch):
+    monkeypatch.setattr(isolation, "STALL_S", 0.5)
+    reports = []
+    assert run(tasks.work_silently, 1.2, on_progress=lambda: reports.append(1)) > 0
+    assert len(reports) >= 3
+
+
+def test_fork_server_is_restarted_when_its_socket_was_deleted(tasks):
+    """Programs that clean /tmp delete it after some days."""
+    assert run(tasks.add, 2, 3) == 5
+    shutil.rmtree(util.get_temp_dir())
+    assert run(tasks.add, 2, 3) == 5
+    assert isolation.seconds_without_worker() == 0.0
+
+
+@pytest.mark.integration
+@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGSTOP])
+def test_worker_outlives_its_fork_server_but_not_its_timeout(tasks, tmp_path, number):
+    note = tmp_path / "pids"
+
+    def end_server():
+        if note.exists() and note.read_text() and server_pid() is not None:
+            os.kill(server_pid(), number)
+            fork_server.stop()
+
+    with pytest.raises(StationError, match="longer than"):
+        run(tasks.note_pid_and_spin, str(note), timeout_s=1.5, on_progress=end_server)
+    (pid,) = note.read_text().split()
+    assert not is_alive(int(pid))
+    assert run(tasks.add, 2, 3) == 5
+
+
+def test_seconds_without_worker_count_failed_starts(tasks, monkeypatch):
+    def fail(*_):
+        raise BlockingIOError("no more tasks")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(fork_server, "ensure_running", fail)
+        with pytest.raises(NotReadyError, match="could not be started: no more tasks"):
+            run(tasks.add, 2, 3)
+    assert isolation.seconds_without_worker() > 0.0
+    assert run(tasks.add, 2, 3) == 5
+    assert isolation.seconds_without_worker() == 0.0
+
+
+SOCKET_FOLDER = """
+from multiprocessing import util
+from station.processing import fork_server
+if __name__ == "__main__":
+    fork_server.ensure_running(())
+    print(util.get_temp_dir())
+    fork_server.stop()
+"""
+
+
+def test_socket_is_in_the_runtime_folder_of_the_service(tmp_path):
+    script = tmp_path / "service.py"
+    script.write_text(SOCKET_FOLDER)
+    with tempfile.TemporaryDirectory() as runtime:  # the path of a socket has at most 107 characters
+        environment = os.environ | {"RUNTIME_DIRECTORY": runtime}
+        printed = subprocess.check_output([sys.executable, script], env=environment, text=True)
+    assert str(Path(printed.strip()).parent) == runtime
 
 
 def test_stop_ends_the_worker_with_not_ready(tasks):
@@ -180,9 +258,9 @@ SERVICE = """
 import sys
 sys.path.insert(0, sys.argv[1])
 import isolated_tasks
-from station.processing import isolation
+from station.processing import fork_server, isolation
 if __name__ == "__main__":
-    isolation.start_forkserver(("station.processing.isolation",))
+    fork_server.ensure_running(("station.processing.isolation",))
     isolation.run_isolated(isolated_tasks.hang_ignoring_signals, sys.argv[2], memory_gb=1, timeout_s=60)
 """
 
@@ -221,6 +299,10 @@ def test_orphaned_worker_exits_without_a_traceback(step):
         check=False,
     )
     assert (process.returncode, process.stdout, process.stderr) == (1, "", "")
+
+
+def server_pid():
+    return forkserver._forkserver._forkserver_pid
 
 
 def is_alive(pid):

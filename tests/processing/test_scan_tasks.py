@@ -3,13 +3,16 @@
 import os
 import re
 import shutil
+from contextlib import nullcontext
 from dataclasses import replace
 
 import laspy
 import netCDF4
 import numpy as np
 import pytest
+from pyproj import CRS
 
+from station.archive import tilt_offsets
 from station.config import read_site
 from station.errors import ConfigError, NotReadyError, ScanError
 from station.inbox.scan_files import scan_file
@@ -65,6 +68,38 @@ def log_file(folder, scan=1):
 def test_complete_inputs_give_verdict_good(folder):
     result, _ = process(folder)
     assert (result.verdict, result.reason) == ("good", "")
+
+
+@pytest.mark.parametrize(
+    "content",
+    ["one digit", *(pytest.param(text, marks=pytest.mark.integration) for text in ("", "[]", None))],
+)
+def test_damaged_tilt_offset_is_restored_from_the_epochs(folder, content):
+    process(folder, scan=0)
+    (path,) = (folder / "data" / "sop_tilt_offset").glob("*.json")
+    intact = path.read_text()
+    path.unlink()
+    if content is not None:
+        path.write_text(content if content != "one digit" else intact.replace("0.000", "0.001", 1))
+        assert path.read_text() != intact
+        assert tilt_offsets.damaged_tilt_offsets(folder / "data") == [path]
+    site = edited_site(folder)
+    scan = scan_file(site, max(site.scans.inbox.glob("*.laz")))
+    with scan_tasks.open_scan_for(site, scan.path) as reader:
+        start, end, _ = utc_interval(reader, site.scans.name)
+        load_scan_inputs(site, reader, scan.log, start, end)
+    assert path.read_text() == intact
+    assert tilt_offsets.damaged_tilt_offsets(folder / "data") == []
+
+
+@pytest.mark.parametrize(
+    ("declared", "is_same"),
+    [("EPSG:32632", True), ("EPSG:32632+5773", True), ("EPSG:32633", False), ("EPSG:4326", False)],
+)
+def test_map_that_a_scan_declares_must_be_that_of_the_site(declared, is_same):
+    wkt = CRS.from_user_input(declared).to_wkt()
+    with nullcontext() if is_same else pytest.raises(ScanError, match=r"map\.crs is WGS 84 / UTM zone 32N"):
+        scan_tasks._require_same_map(wkt, "EPSG:32632")
 
 
 def test_line_times_match_the_shots(folder):

@@ -3,13 +3,22 @@
 import csv
 import io
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 import station
 from station.errors import ConfigError, StationError
-from station.products.area_tables import Span, area_records, as_csv, as_text, find_epoch, parse_time
+from station.products.area_tables import (
+    Span,
+    area_records,
+    as_csv,
+    as_text,
+    describe_epoch,
+    find_epoch,
+    parse_time,
+)
 
 ALL = Span.parse(None, None)
 
@@ -87,6 +96,8 @@ def test_csv_of_areas(site, small):
         assert float(row["mean_change_low95_m"]) == pytest.approx(mean - 1.96 * sigma, rel=1e-4)
         assert float(row["volume_change_m3"]) == pytest.approx(mean * float(row["area_size_m2"]), rel=1e-4)
     assert "rises" in as_text(area_records(site, None, ALL, "reference"))
+    record = next(iter(area_records(site, None, ALL, "reference")))
+    assert "\x1b" not in as_text([replace(record, area="\x1b[2Jtongue")])
     assert as_text([]) == "no epoch with a change in this span"
 
 
@@ -96,6 +107,10 @@ def test_epochs_are_found_by_scan_or_time(site, series, small):
     assert find_epoch(series, "2025-11-21T01:20").start.hour == 1
     assert find_epoch(series, "2025-11-21T02:20+01:00").start.hour == 1
     assert find_epoch(series, "last").start.hour == 5
+    assert describe_epoch(site, "2025-11-21T01:20").endswith("epoch of 2025-11-21 01:00:00 UTC")
+    assert describe_epoch(site, "reference") == describe_epoch(site, "previous") == ""
+    with pytest.raises(StationError, match="no epoch within 12 h of 2024-01-01"):
+        find_epoch(series, "2024-01-01")
     with pytest.raises(StationError, match="neither a stored scan"):
         find_epoch(series, "yesterday")
     with pytest.raises(StationError, match="is not a time"):

@@ -15,7 +15,7 @@ from station.archive.compaction import compact
 from station.archive.netcdf_layout import Series
 from station.archive.reference_files import write_reference
 from station.archive.series.virtual import build_series
-from station.errors import StoreError
+from station.errors import StationError, StoreError
 from station.quantities import (
     ChangeErrors,
     Grid,
@@ -481,13 +481,16 @@ def test_epochs_are_found_by_index_and_by_the_nearest_time(stored):
         ("2025-11-21T01:07:30", 0),
         ("2025-11-21T02:20", 1),
         (np.datetime64("2025-11-21T05:00:00.000"), 2),
-        ("1999-01-01", 0),
-        ("2050-01-01", 3),
+        ("2025-11-21", 0),
     ):
         assert queries.find_epoch(requested) == queries.find_epoch(index)
+    for far_off in ("1999-01-01", "2050-01-01"):
+        with pytest.raises(StationError, match=rf"within 12 h of {far_off} .* nearest is that of 2025"):
+            queries.find_epoch(far_off)
     weights = np.ones(GRID.shape)
     by_time = station.variance(stored.folder, weights, "2025-11-21T03:00")
     assert by_time == station.variance(stored.folder, weights, JOINT)
+    assert station.variance(stored.folder, weights, JOINT, JOINT) == 0.0
     with pytest.raises(IndexError):
         queries.find_epoch(4)
 

@@ -11,7 +11,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from station.errors import NotReadyError, ScanError
+from station.errors import InconclusiveError, NotReadyError, ScanError
 from station.readers import las
 from station.readers.las import LasScan
 
@@ -231,10 +231,19 @@ class PanicException(BaseException):
     ("error", "expected"),
     [
         (PanicException("index out of bounds"), ScanError),
-        (MemoryError(), ScanError),
+        (
+            PanicException(
+                'ThreadPoolBuildError { kind: IOError(Os { code: 11, kind: WouldBlock, message: "" }) }'
+            ),
+            InconclusiveError,
+        ),
+        (PanicException("called `Result::unwrap()`: Os { code: 22, kind: InvalidInput }"), ScanError),
+        (RuntimeError("can't start new thread"), InconclusiveError),
+        (MemoryError(), InconclusiveError),
         (ValueError("not implemented"), ScanError),
         (OSError(22, "Invalid argument"), ScanError),
         (OSError(5, "Input/output error"), NotReadyError),
+        (OSError(11, "Resource temporarily unavailable"), NotReadyError),
         (KeyboardInterrupt(), KeyboardInterrupt),
     ],
 )

@@ -9,7 +9,7 @@ import textwrap
 import numpy as np
 import pytest
 
-from station.processing.isolation import WORKER_ENV
+from station.processing.fork_server import WORKER_ENV
 from station.readers.las import LasScan
 
 # In a process of its own: only a process without other threads forks.
@@ -124,7 +124,7 @@ def test_silent_exit_of_the_child_is_reported():
             os._exit(3)
         list(prefetch(open_decoder, [10] * 8))
         """
-    assert b"ScanError: the decoder process ended without a message" in run(script).stderr
+    assert b"InconclusiveError: the decoder process ended without a message" in run(script).stderr
 
 
 @pytest.mark.integration

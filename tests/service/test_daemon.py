@@ -15,14 +15,24 @@ from contextlib import suppress
 from pathlib import Path
 
 import pytest
+from support.fake_service import FakeWorker
 
-from station.errors import ConfigError
+from station.errors import ConfigError, NotReadyError
 from station.inbox.journal import Journal, State
+from station.inbox.lock import is_locked
 from station.monitoring.status import status
 from station.service import daemon
 
 FAKE = Path(__file__).parents[1] / "support" / "fake_service.py"
 FIRST, SECOND, THIRD = "261121_010000.laz", "261121_020000.laz", "261121_030000.laz"
+
+
+def test_service_without_worker_processes_ends_for_systemd(write_site, monkeypatch):
+    """A restart gives it a new fork server and a new place in its control group."""
+    monkeypatch.setattr(daemon.isolation, "seconds_without_worker", lambda: 301.0)
+    service = daemon.Daemon(write_site(), FakeWorker, daemon.LoopTiming())
+    with pytest.raises(NotReadyError, match="no worker process could be started for 301 s"):
+        service.serve()
 
 
 class Service:
@@ -157,6 +167,33 @@ def test_inbox_may_be_removed_and_recreated(write_site, start):
     assert service.process.poll() is None
 
 
+def test_service_pauses_while_another_folder_is_in_place_of_its_data(write_site, start):
+    """As after `umount -l`: the mount point, an empty folder, comes to light."""
+    path = write_site(settle_s=0.0)
+    service = start(path, period_s=0.1)
+    drop(path, FIRST)
+    wait_for(lambda: "STATUS=1 stored, 0 waiting, 0 set aside" in service.notifications())
+    data = path.parent / "data"
+    data.rename(path.parent / "elsewhere")
+    data.mkdir()
+    drop(path, SECOND)
+    wait_for(lambda: "another folder is in its place" in service.log())
+    time.sleep(0.3)
+    assert list(data.iterdir()) == []
+    data.rmdir()
+    (path.parent / "elsewhere").rename(data)
+    wait_for(lambda: stored(path) == [FIRST, SECOND])
+    wait_for(lambda: "service=resumed" in service.log())
+
+
+def test_deleted_lock_is_taken_again(write_site, start):
+    path = write_site(settle_s=0.0)
+    start(path, period_s=0.1)
+    lock = path.parent / "data" / "service.lock"
+    lock.unlink()
+    wait_for(lambda: lock.exists() and is_locked(lock.parent))
+
+
 @pytest.mark.integration
 def test_bad_scans_and_bugs_do_not_stop_the_service(write_site, start):
     path = write_site(settle_s=0.0)
@@ -179,6 +216,19 @@ def test_bad_scans_and_bugs_do_not_stop_the_service(write_site, start):
     assert report["waiting"][0]["for"] == "a bug: ZeroDivisionError: division by zero"
     assert report["last"]["figures"] == {"points": 4}
     assert "ZeroDivisionError" in service.log()
+
+
+@pytest.mark.integration
+def test_retry_beside_the_running_service(write_site, start):
+    path = write_site(settle_s=0.0)
+    drop(path, "261120_bad.laz")
+    start(path, period_s=0.2)
+    wait_for(lambda: "process 261120_bad.laz" in calls(path))
+    result = subprocess.run(
+        [sys.executable, "-m", "station", "retry", str(path)], capture_output=True, text=True, check=True
+    )
+    assert result.stdout == "261120_bad.laz: queued\n1 scans, tried again within a minute\n"
+    wait_for(lambda: calls(path).count("process 261120_bad.laz") == 2)
 
 
 @pytest.mark.integration

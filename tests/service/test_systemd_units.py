@@ -9,6 +9,7 @@ import subprocess
 import pytest
 
 from station.monitoring.notifiers import SEND_TIMEOUT_S
+from station.processing.isolation import STALL_S
 from station.service.daemon import LoopTiming
 
 UNIT = "systemd/station@.service"
@@ -51,6 +52,7 @@ def test_timeouts_match_those_of_the_service(service_unit):
     )
     assert float(keys["TimeoutStopSec"]) > LoopTiming().grace_s + 20
     assert float(keys["WatchdogSec"]) / 3 >= LoopTiming().period_s
+    assert float(keys["WatchdogSec"]) > STALL_S + 30  # the service ends a blocked worker before
     assert keys["RestartPreventExitStatus"] == "78"
     assert keys["Type"] == "notify"
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from bisect import bisect_right
 from collections.abc import Sequence
-from datetime import datetime
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import overload
 
@@ -21,12 +21,16 @@ from station.archive.epochs import (
     compacted_revision,
     epoch_files,
     epochs_in_file,
+    list_files,
     parse_epoch_filename,
 )
 from station.archive.netcdf_layout import Series
 from station.archive.schema import TEXT_LENGTH
-from station.errors import StoreError
+from station.errors import StationError, StoreError
 from station.quantities import Grid
+
+NEAREST_TOLERANCE_S = 12 * 3600.0  # so that a date finds the first or last epoch of its day
+MAX_TRIED = 5  # files of the store, if the newest are damaged
 
 
 def list_epochs(series: Series) -> list[EpochRef]:
@@ -51,6 +55,28 @@ def list_epochs(series: Series) -> list[EpochRef]:
     return _drop_simultaneous(
         sorted((epoch for _, epoch in best.values()), key=lambda epoch: (epoch.time_s, epoch.start))
     )
+
+
+def nearest_epoch(epochs: Sequence[EpochRef], time_s: float) -> EpochRef:
+    """Return the epoch whose start or middle is nearest to a time [s since 1970].
+
+    Raises StationError, with the nearest time, if there is none within NEAREST_TOLERANCE_S.
+    """
+
+    def distance_s(epoch: EpochRef) -> float:
+        return min(abs(epoch.start.timestamp() - time_s), abs(epoch.time_s - time_s))
+
+    nearest = min(epochs, key=distance_s)
+    if distance_s(nearest) > NEAREST_TOLERANCE_S:
+        raise StationError(
+            f"no epoch within {NEAREST_TOLERANCE_S / 3600:g} h of {_format_utc(time_s)}:"
+            f" the nearest is that of {_format_utc(nearest.start.timestamp())}"
+        )
+    return nearest
+
+
+def _format_utc(time_s: float) -> str:
+    return f"{datetime.fromtimestamp(time_s, UTC):%Y-%m-%d %H:%M} UTC"
 
 
 def _drop_simultaneous(refs: list[EpochRef]) -> list[EpochRef]:
@@ -146,7 +172,28 @@ def series_in(site_or_folder: str | Path) -> Series:
     """Return the store of a site file or data folder; raise StoreError if there is no series yet."""
     folder = data_folder(site_or_folder)
     try:
-        with netCDF4.Dataset(folder / "series.nc") as file:
+        return _read_header(folder, folder / "series.nc")
+    except StoreError as error:
+        raise StoreError(f"{folder}: holds no readable series (see station status): {error}") from error
+
+
+def stored_series(series: Series) -> Series | None:
+    """Return the station, grid and map of the stored epochs; None if nothing readable is stored.
+
+    They are read from the newest files of epochs, because a derived file may be damaged.
+    """
+    for name in sorted(list_files(series), key=lambda name: Path(name).name, reverse=True)[:MAX_TRIED]:
+        try:
+            return _read_header(series.folder, series.folder / name)
+        except StoreError:
+            continue
+    return None
+
+
+def _read_header(folder: Path, path: Path) -> Series:
+    """Return the store in a folder as one of its files describes it; raise StoreError if that is damaged."""
+    try:
+        with netCDF4.Dataset(path) as file:
             x_m, y_m = (np.asarray(file[axis][:], dtype=np.float64) for axis in "xy")
             x_bounds, y_bounds = (file[f"{axis}_bnds"][0] for axis in "xy")
             west_m, north_m = float(x_bounds.min()), float(y_bounds.max())
@@ -154,4 +201,4 @@ def series_in(site_or_folder: str | Path) -> Series:
             crs = str(file["crs"].crs_wkt) if "crs" in file.variables else None
             return Series(folder, str(file.station_id), grid, crs)
     except (OSError, RuntimeError, KeyError, IndexError, AttributeError) as error:
-        raise StoreError(f"{folder}: holds no readable series (see station status): {error}") from error
+        raise StoreError(f"{path}: cannot be read: {error}") from error

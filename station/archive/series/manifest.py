@@ -6,18 +6,24 @@ Only a cache: if it is missing or does not match the files, the series is rebuil
 from __future__ import annotations
 
 import hashlib
-import json
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from station._version import __version__
+from station.archive.atomic_files import move_folder_away
+from station.archive.checksums import (
+    fingerprint,
+    matches_fingerprint,
+    read_checked_json,
+    to_checked_json,
+)
 from station.archive.epochs import list_files, parse_epoch_filename
 from station.archive.netcdf_layout import Series
 from station.archive.schema import VARIABLES
 from station.archive.series.epoch_reader import EpochSource, Parameters, read_source
-from station.archive.series.index import SeriesIndex
+from station.archive.series.index import SeriesIndex, list_epochs
 
 MANIFEST = ".series.json"
 
@@ -42,7 +48,7 @@ def write_manifest(series: Series, manifest: SeriesManifest) -> None:
     path = series.folder / MANIFEST
     content = {
         "header_hash": _header_hash(series),
-        "series": _file_stamp(series.path),
+        "series": fingerprint(series.path),
         "files": sorted(list_files(series)),
         "parameters": manifest.parameters,
         "last_s": manifest.last_s,
@@ -60,7 +66,8 @@ def write_manifest(series: Series, manifest: SeriesManifest) -> None:
     }
     tmp_path = path.with_name(f"{MANIFEST}.part")
     with suppress(OSError):
-        tmp_path.write_text(json.dumps(content), encoding="utf-8")
+        tmp_path.write_text(to_checked_json(content), encoding="utf-8")
+        move_folder_away(path)
         tmp_path.replace(path)
 
 
@@ -101,19 +108,37 @@ def index_if_current(series: Series) -> SeriesIndex | None:
     )
 
 
+def is_intact(series: Series) -> bool:
+    """Return True if `series.nc` is as it was written."""
+    return listed_sources(series) is not None
+
+
+def listed_sources(series: Series) -> set[Path] | None:
+    """Return the files that `series.nc` refers to, without opening it; None if it is damaged."""
+    content = read_checked_json(series.folder / MANIFEST)
+    if content is None or not matches_fingerprint(series.path, content["series"]):
+        return None
+    return {series.folder / entry["name"] for entry in content["sources"]}
+
+
+def source_count(series: Series) -> int:
+    """Return the number of files that `series.nc` refers to, or will refer to when it is built again."""
+    content = _read_manifest(series)
+    return len({ref.path for ref in list_epochs(series)}) if content is None else len(content["sources"])
+
+
 def _read_manifest(series: Series) -> dict[str, Any] | None:
-    """Return the manifest if it describes this `series.nc` and its files are unchanged; else None."""
+    """Return the manifest if `series.nc` is intact and its sources are unchanged; else None."""
+    content: dict[str, Any] | None = read_checked_json(series.folder / MANIFEST)
+    if content is None or content["header_hash"] != _header_hash(series):
+        return None
     try:
-        content: dict[str, Any] = json.loads((series.folder / MANIFEST).read_text(encoding="utf-8"))
-        is_current = content["header_hash"] == _header_hash(series) and content["series"] == _file_stamp(
-            series.path
-        )
-        is_current = is_current and all(
+        is_current = all(
             _file_stamp(series.folder / entry["name"]) == entry["stamp"] for entry in content["sources"]
         )
-    except (OSError, ValueError, KeyError, TypeError):
+    except OSError:
         return None
-    return content if is_current else None
+    return content if is_current and matches_fingerprint(series.path, content["series"]) else None
 
 
 def _source_from_manifest(series: Series, entry: dict[str, Any], parameters: Parameters) -> EpochSource:

@@ -14,6 +14,7 @@ import netCDF4
 import numpy as np
 
 from station.archive.atomic_files import atomic_write
+from station.archive.epochs import list_files
 from station.archive.netcdf_layout import TIMES_PER_CHUNK, Series, attributes, create_file, create_variable
 from station.archive.schema import FILL, Variable
 from station.archive.series.epoch_reader import (
@@ -25,8 +26,8 @@ from station.archive.series.epoch_reader import (
     copy_unchanged,
     read_source,
 )
-from station.archive.series.index import list_epochs, source_files
-from station.archive.series.manifest import SeriesManifest, pending_epochs, write_manifest
+from station.archive.series.index import list_epochs
+from station.archive.series.manifest import SeriesManifest, listed_sources, pending_epochs, write_manifest
 from station.errors import StoreError
 
 LIBVER_VIRTUAL = ("v110", "v110")  # HDF5 version bounds; with newer ones only xarray can read the file
@@ -36,7 +37,8 @@ def build_series(series: Series) -> Path:
     """Bring `series.nc` up to date with the files of the store, by atomic replacement, and return its path.
 
     If only later epochs were added, the other epochs are copied from the old `series.nc` and no other file is
-    opened. Raises StoreError if a file is damaged, nothing is stored yet, or the file cannot be written.
+    opened. A damaged `series.nc` is never opened: it is built again from the epochs. Raises StoreError if an
+    epoch is damaged, nothing is stored yet, or the file cannot be written.
     """
     pending = pending_epochs(series)
     if pending is None:
@@ -72,7 +74,7 @@ def _rebuild(series: Series) -> Path:
             write_scalars(file, series, _title(series), epoch_sources, parameters)
         with h5py.File(tmp_path, "r+", libver=LIBVER_VIRTUAL) as file:
             _link_rasters(file, series, epoch_sources, parameters)
-        _touch(source_files(series.path) - {source.path for source in epoch_sources})
+        _touch_replaced(series, {source.path for source in epoch_sources})
     newest_start_s = max(epoch.start for epoch in epochs).timestamp()
     write_manifest(series, SeriesManifest(epoch_sources, parameters, epochs[-1].time_s, newest_start_s))
     return series.path
@@ -82,9 +84,12 @@ def _title(series: Series) -> str:
     return f"Elevation change at {series.name or series.station_id}"
 
 
-def _touch(paths: set[Path]) -> None:
-    """Restart the grace period of files that the series no longer refers to."""
-    for path in paths:
+def _touch_replaced(series: Series, used: set[Path]) -> None:
+    """Restart the grace period of files that the series no longer refers to, or may have referred to."""
+    earlier = listed_sources(series)
+    if earlier is None:
+        earlier = {series.folder / name for name in list_files(series)}
+    for path in earlier - used:
         if path.is_file():
             os.utime(path)
 

@@ -34,6 +34,11 @@ def short_chunks(monkeypatch):
 
 
 @pytest.fixture
+def rng():
+    return np.random.default_rng(24)
+
+
+@pytest.fixture
 def growing(series):
     """A store on a small grid, and a function that updates series.nc and areas.nc."""
     small = dataclasses.replace(series, grid=SMALL_GRID)
@@ -115,6 +120,77 @@ def test_appending_equals_rebuilding(growing, epoch):
         assert contents(series) == appended, hour
     assert list(SeriesIndex(series)) == list_epochs(series)
     assert len(SeriesIndex(series)) == 16
+
+
+def flip_bits(path, generator, count=1):
+    content = bytearray(path.read_bytes())
+    for position in generator.integers(0, len(content), count):
+        content[position] ^= 1 << int(generator.integers(0, 8))
+    path.write_bytes(content)
+
+
+def overwrite(path, content):
+    path.write_bytes(content)
+
+
+def replace_by_folder(path):
+    path.unlink()
+    path.mkdir()
+
+
+DAMAGES = {
+    "empty": lambda path, _: overwrite(path, b""),
+    "halved": lambda path, _: overwrite(path, path.read_bytes()[: path.stat().st_size // 2]),
+    "garbage": lambda path, _: overwrite(path, b"\x93garbage" * 1000),
+    "one bit": flip_bits,
+    "many bits": lambda path, generator: flip_bits(path, generator, 100),
+    "lost": lambda path, _: path.unlink(),
+    "a folder": lambda path, _: replace_by_folder(path),
+}
+
+
+@pytest.mark.parametrize("kind", ["empty", "one bit", "a folder"])
+def test_damaged_derived_files_are_rebuilt(growing, epoch, rng, kind):
+    series, update = growing
+    epochs.write_epoch(series, epoch(1, grid=SMALL_GRID))
+    update()
+    expected = contents(series)
+    for name in ("series.nc", "areas.nc"):
+        DAMAGES[kind](series.folder / name, rng)
+    update()
+    assert contents(series) == expected
+
+
+@pytest.mark.integration
+@pytest.mark.parametrize("name", ["series.nc", "areas.nc", manifest.MANIFEST, ".areas.json"])
+def test_damaged_derived_files_are_rebuilt_with_the_next_epoch(growing, epoch, rng, name):
+    series, update = growing
+    for hour in range(5):
+        epochs.write_epoch(series, epoch(hour, grid=SMALL_GRID))
+    update()
+    for hour, damage in enumerate(DAMAGES.values(), start=5):
+        damage(series.folder / name, rng)
+        epochs.write_epoch(series, epoch(hour, grid=SMALL_GRID))
+        update()
+        actual = contents(series)
+        rebuild(series, update)
+        assert actual == contents(series)
+        assert manifest.is_intact(series)
+        assert areas.is_intact(series)
+
+
+def test_any_flipped_bit_is_noticed(growing, epoch, rng):
+    series, update = growing
+    epochs.write_epoch(series, epoch(1, grid=SMALL_GRID))
+    update()
+    intact = {name: (series.folder / name).read_bytes() for name in ("series.nc", "areas.nc")}
+    for _ in range(100):
+        for name, content in intact.items():
+            flip_bits(series.folder / name, rng)
+            assert not (manifest.is_intact(series) and areas.is_intact(series)), name
+            (series.folder / name).write_bytes(content)
+    assert manifest.is_intact(series)
+    assert areas.is_intact(series)
 
 
 @pytest.mark.integration

@@ -79,7 +79,7 @@ def shorten_delays(period_s=5.0):
 
     journal.FIRST_RETRY_S = journal.MAX_RETRY_S = 0.1
     isolation.RETRY_DELAYS_S = (0.01,) * 100
-    daemon.LoopTiming.__init__.__defaults__ = (period_s, 0.02, 5.0, 0.05, 3600.0)
+    daemon.LoopTiming.__init__.__defaults__ = (period_s, 0.02, 5.0, 0.05, 300.0, 3600.0)
 
 
 def _watched(name, call):
