@@ -155,13 +155,13 @@ class Journal:
         now_s = self._now_s()
         with self._transaction():
             self._connection.executemany(
-                """INSERT INTO scan (name, size, mtime_ns, reason, state, outcome, first_seen_utc_s,
-                       changed_utc_s)
-                   VALUES (?, ?, ?, ?, 'set_aside', 'set_aside', ?, ?)
+                """INSERT INTO scan (name, size, mtime_ns, reason, state, outcome, judged_under,
+                       first_seen_utc_s, changed_utc_s)
+                   VALUES (?, ?, ?, ?, 'set_aside', 'set_aside', '', ?, ?)
                    ON CONFLICT (name) DO UPDATE SET
                        size = excluded.size, mtime_ns = excluded.mtime_ns, reason = excluded.reason,
                        state = 'set_aside', outcome = 'set_aside', sha256 = NULL, log_sha256 = '',
-                       waiting_reason = '', attempts = 0, next_try_utc_s = NULL,
+                       waiting_reason = '', attempts = 0, next_try_utc_s = NULL, judged_under = '',
                        changed_utc_s = excluded.changed_utc_s""",
                 [(*file, now_s, now_s) for file in files],
             )

@@ -127,6 +127,7 @@ def test_failures_count_only_under_the_same_conditions(journal):
 def test_scans_set_aside_whatever_the_settings_are_not_judged_again(journal):
     journal.set_aside("copy.laz", "the same bytes as a.laz, which is stored")
     journal.set_aside("short.laz", "cut off", judged_under="0.1 a")
+    journal.reject([("notes.laz", 10, 1, "not a name of a scan")])
     assert journal.judged_otherwise("0.2 a") == ["short.laz"]
 
 
