@@ -22,7 +22,7 @@ from station.quantities import (
     TiltSeries,
     VarianceComponents,
 )
-from station.science.adjustment import ground_classes, prior
+from station.science.adjustment import ground_classes, prior, variance_components
 from station.science.adjustment.ground_classes import SnowTest
 from station.science.adjustment.joint import Adjustment, adjust_scan, tilt_effect
 from station.science.adjustment.normal_equations import LineInclination
@@ -160,14 +160,14 @@ def adjust_to_reference(
         return adjust_scan(patches, inputs.assumed_rad, state_prior.relative_to(reference_state), log)
 
     adjustment = adjusted(components)
-    widened = prior.as_wide_as(components, adjustment.estimate)
+    widened = variance_components.as_wide_as(components, adjustment.estimate)
     return adjustment if widened == components else adjusted(widened)
 
 
 def usual_motion(reference: Reference, time_s: float) -> VarianceComponents:
     """Return the variance components of a scan at a time [s since 1970] relative to a reference."""
     elapsed_s = abs(time_s - reference.time_s)
-    return prior.after(reference.components, elapsed_s if np.isfinite(elapsed_s) else 0.0)
+    return variance_components.after(reference.components, elapsed_s if np.isfinite(elapsed_s) else 0.0)
 
 
 def snow_test(gridder: Gridder, scan_geometry: ScanGeometry, viewing: ViewingGeometry) -> SnowTest:

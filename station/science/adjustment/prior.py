@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -33,9 +33,7 @@ CYCLIC_CHANGE_RAD = math.radians(0.002)
 CYCLIC_CHANGE_SHARE = 0.2  # of its amplitude, between scans: equations.md, 2.7
 MAX_CYCLIC_ERROR_RAD = math.radians(0.05)  # a larger wave is the mount's tilt, which does not change
 TILT_DRIFT_S = 300.0
-MOUNT_CREEP_RAD, MOUNT_CREEP_M = math.radians(0.005), 0.001  # in a day, growing with the root of time
 TILT_JITTER_S = 3.0
-UNUSUAL_SIGMAS = 3.0  # of the usual motion
 PRIOR_INCREMENTS = 4  # of the drift in a scan's log: as many as a log of ten minutes shows
 CYCLIC_ERROR_RMS_RAD = math.radians(0.04) / math.sqrt(2)  # 0.03° to 0.05° of any phase: equations.md, 2.7
 SENSOR_BIAS_RAD = math.radians(0.0015)
@@ -52,33 +50,6 @@ def globals_sigma(components: VarianceComponents, *, weather_known: bool) -> Flo
     )
     refraction = components.refraction, components.refraction_moving
     return np.array([*rotations, *translations, components.range_bias_m, scale_ppm, *refraction])
-
-
-def after(components: VarianceComponents, elapsed_s: float) -> VarianceComponents:
-    """Return the components of a scan this long after its reference: a mount creeps like a random walk.
-
-    Source: adjustment.md, 4: 0.01° in a day, 0.05° in a season.
-    """
-    root_days = math.sqrt(elapsed_s / 86_400)
-    return replace(
-        components,
-        tilt_rad=math.hypot(components.tilt_rad, MOUNT_CREEP_RAD * root_days),
-        heading_rad=math.hypot(components.heading_rad, MOUNT_CREEP_RAD * root_days),
-        translation_m=math.hypot(components.translation_m, MOUNT_CREEP_M * root_days),
-    )
-
-
-def as_wide_as(components: VarianceComponents, estimate: Floats) -> VarianceComponents:
-    """Return components that do not reject an estimated state (u,); the same unless it is unusual."""
-    sizes = {
-        "tilt_rad": float(np.hypot(*estimate[:2])),
-        "heading_rad": float(abs(estimate[2])),
-        "translation_m": float(np.linalg.norm(estimate[3:6])),
-    }
-    usual = asdict(components)
-    return replace(
-        components, **{name: size for name, size in sizes.items() if size > UNUSUAL_SIGMAS * usual[name]}
-    )
 
 
 @dataclass(frozen=True)

@@ -1,10 +1,10 @@
-"""Variance components of a station, re-estimated from the adjustments of its scans."""
+"""Variance components of a station: re-estimated from the adjustments of its scans, and widened by motion."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Iterable
-from dataclasses import replace
+from dataclasses import asdict, replace
 
 import numpy as np
 
@@ -14,6 +14,8 @@ from station.science.uncertainty.parameters import GLOBAL, ParameterLayout
 
 PRIOR_SCANS = 8  # weight of the start values, in scans
 EM_STEPS = 10
+MOUNT_CREEP_RAD, MOUNT_CREEP_M = math.radians(0.005), 0.001  # in a day, growing with the root of time
+UNUSUAL_SIGMAS = 3.0  # of the usual motion
 TILT_COMPONENTS = ("tilt_drift_rad", "tilt_jitter_rad", "line_jitter_rad")
 COMPONENT_SLICES = {  # variance components by the global parameters they describe
     "tilt_rad": slice(2),
@@ -70,3 +72,30 @@ def estimate_variance_components(
             )
         components = replace(components, **{name: math.sqrt(variances[name]) for name in TILT_COMPONENTS})
     return replace(start, **{name: shrunk_sigma(name, variance) for name, variance in variances.items()})
+
+
+def after(components: VarianceComponents, elapsed_s: float) -> VarianceComponents:
+    """Return the components of a scan this long after its reference: a mount creeps like a random walk.
+
+    Source: adjustment.md, 4: 0.01° in a day, 0.05° in a season.
+    """
+    root_days = math.sqrt(elapsed_s / 86_400)
+    return replace(
+        components,
+        tilt_rad=math.hypot(components.tilt_rad, MOUNT_CREEP_RAD * root_days),
+        heading_rad=math.hypot(components.heading_rad, MOUNT_CREEP_RAD * root_days),
+        translation_m=math.hypot(components.translation_m, MOUNT_CREEP_M * root_days),
+    )
+
+
+def as_wide_as(components: VarianceComponents, estimate: Floats) -> VarianceComponents:
+    """Return components that do not reject an estimated state (u,); the same unless it is unusual."""
+    sizes = {
+        "tilt_rad": float(np.hypot(*estimate[:2])),
+        "heading_rad": float(abs(estimate[2])),
+        "translation_m": float(np.linalg.norm(estimate[3:6])),
+    }
+    usual = asdict(components)
+    return replace(
+        components, **{name: size for name, size in sizes.items() if size > UNUSUAL_SIGMAS * usual[name]}
+    )

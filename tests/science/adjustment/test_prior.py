@@ -489,17 +489,17 @@ def test_tilt_correlations_fall_to_1_over_e_after_300_s_and_3_s():
 
 def test_usual_motion_grows_with_the_root_of_time():
     """Of a mount that moves by 0.01° in a day and 0.05° in a season of 100 days (adjustment.md, 4)."""
-    day, season = (prior.after(COMPONENTS, 86_400.0 * days) for days in (1, 100))
+    day, season = (variance_components.after(COMPONENTS, 86_400.0 * days) for days in (1, 100))
     assert math.degrees(day.tilt_rad) == pytest.approx(0.0094, abs=1e-4)
     assert math.degrees(season.tilt_rad) == pytest.approx(0.0506, abs=1e-4)
     assert season.range_bias_m == COMPONENTS.range_bias_m
-    assert prior.after(COMPONENTS, 0.0) == COMPONENTS
+    assert variance_components.after(COMPONENTS, 0.0) == COMPONENTS
 
 
 def test_a_prior_is_widened_by_unusual_motion_only():
     usual, moved = np.zeros(20), np.zeros(20)
     usual[:6] = COMPONENTS.tilt_rad, 0.0, 0.0, COMPONENTS.translation_m, 0.0, 0.0
     moved[:6] = 3 * COMPONENTS.tilt_rad, 4 * COMPONENTS.tilt_rad, 0.0, 0.0, 0.0, 0.0
-    assert prior.as_wide_as(COMPONENTS, usual) == COMPONENTS
-    widened = prior.as_wide_as(COMPONENTS, moved)
+    assert variance_components.as_wide_as(COMPONENTS, usual) == COMPONENTS
+    widened = variance_components.as_wide_as(COMPONENTS, moved)
     assert widened == replace(COMPONENTS, tilt_rad=pytest.approx(5 * COMPONENTS.tilt_rad))
