@@ -29,7 +29,7 @@ from station.errors import StoreError
 from station.inbox.journal import Journal, State
 from station.inbox.scan_files import scan_file
 from station.processing import scan_tasks
-from station.processing.isolation import PRELOAD
+from station.processing.fork_server import PRELOAD
 from station.processing.pipeline import Pose
 from station.processing.reference_tasks import build_reference_version
 from station.processing.scan_inputs import load_scan_inputs

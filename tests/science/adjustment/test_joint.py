@@ -436,7 +436,7 @@ def test_smooth_snowfall_hardly_biases_the_state_if_stable_ground_is_spread_out(
 
 
 @pytest.mark.integration
-@pytest.mark.xfail(strict=True, reason="the size of a smooth change is taken as known: z is 1.8")
+@pytest.mark.xfail(strict=True, reason="the waves of the change are no trends: z is 1.4")
 @pytest.mark.parametrize(
     ("stable", "log"),
     [(random_sites(42, 60, sector_deg=(0, 10)), False), (random_sites(43, 1, sector_deg=(0, 10)), True)],
@@ -479,7 +479,7 @@ def test_ten_percent_outliers_of_a_metre_are_rejected():
     )
     clean_m = np.array([adjust_with_outliers(seed, 1000, 0.0)[0] for seed in range(8)])
     z = np.array(error_m) / np.array(sigma_m)
-    assert 0.85 < np.sqrt(np.mean(z**2)) < 1.2
+    assert 0.8 < np.sqrt(np.mean(z**2)) < 1.2
     assert np.median(np.abs(error_m)) < 1.5 * np.median(np.abs(clean_m))
     for adjusted, rejected in zip(adjustment, outlier, strict=True):
         assert adjusted.stable_weights[rejected].max() == 0.0

@@ -101,7 +101,13 @@ def variances_of_means(stable):
 
 
 @pytest.mark.integration
-@pytest.mark.parametrize("stable", [PATCH_COUNT, 40])
+@pytest.mark.parametrize(
+    "stable",
+    [
+        PATCH_COUNT,
+        pytest.param(40, marks=pytest.mark.xfail(strict=True, reason="sigma is too large: z is 0.67")),
+    ],
+)
 def test_variance_with_leverage_matches_simulated_scans(stable):
     observed_m2, leverage_m2, independent_m2 = variances_of_means(stable)
     assert 0.8 < np.sqrt(np.mean(observed_m2[1:] / leverage_m2[1:])) < 1.2
