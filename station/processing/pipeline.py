@@ -313,6 +313,8 @@ def variance_factors(
                 point_m2 / sums.count,
                 sector.reference_variance_m2,
                 jacobian.variance(posterior),
+                np.nan_to_num(sums.standard_deviation()) ** 2,
+                sums.count - 1,
             )
         )
     return estimate_variance_factors(Residuals.concatenate(parts)) if parts else UNIT_FACTORS

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from station.quantities import Bools, Floats32, Ints, Reals
+from station.quantities import Bools, Floats, Floats32, Ints, Reals
 from station.science.geometry.robust_statistics import robust_scale
 
 NOISE_CLASSES = 512  # twice those of the reference's cells: points may scatter as modelled, or more
@@ -29,6 +29,10 @@ MIN_BLOCK_CELLS = 5
 CORRELATED_BLOCKS = 9.0  # blocks that share their systematic error: it varies over some 300 m
 PRIOR_BLOCKS = 3.0  # weight of the model, in independent blocks
 FACTOR_BOUNDS = (0.1, 100.0)  # random
+# Upper bound of what means of cells scatter on ground that may have changed, over what points within cells do:
+# on unchanged ground it is 1.3 at most, as points of a cell share the lattice; more is change, as of drifts.
+MAX_SCATTER_RATIO = 3.0
+MAX_POINT_SCATTER = 25.0  # of the points of one cell over their modelled variance; more is an edge
 MAX_SYSTEMATIC_FACTOR = 100.0
 BISECTIONS = 30
 
@@ -48,7 +52,8 @@ UNIT_FACTORS = VarianceFactors(np.ones(NOISE_CLASSES, np.float32), 1.0)
 class Residuals:
     """Residuals of cells (n,) of an adjusted scan, with their modelled variances.
 
-    The random variance is that of the scan and that of the reference, whose factor is its own.
+    The random variance is that of the scan and that of the reference, whose factor is its own. `scatter_m2` is
+    the variance of the points within a cell, with `freedom` degrees of freedom.
     """
 
     x_m: Reals
@@ -60,6 +65,8 @@ class Residuals:
     scan_m2: Reals
     reference_m2: Reals
     systematic_m2: Reals
+    scatter_m2: Reals
+    freedom: Ints
 
     @classmethod
     def concatenate(cls, parts: list[Residuals]) -> Residuals:
@@ -108,21 +115,44 @@ def _random_factors(residuals: Residuals) -> Floats32:
         weight / np.maximum(1 - own_share, 1 / MIN_GROUP_CELLS)
     )
     usable = count[residuals.group] >= MIN_GROUP_CELLS
-    factors = np.ones(NOISE_CLASSES, np.float32)
+    factors, upper_bounds = np.ones(NOISE_CLASSES, np.float32), _moving_upper_bounds(residuals)
     order = np.argsort(residuals.noise_class, kind="stable")
     order = order[usable[order]]
     edges = np.searchsorted(residuals.noise_class[order], np.arange(NOISE_CLASSES + 1))
     for index in np.flatnonzero(np.diff(edges) >= MIN_CLASS_CELLS):
         members = order[edges[index] : edges[index + 1]]
         stable = members[residuals.stable[members]]
+        upper_bound = FACTOR_BOUNDS[1]
         if len(stable) >= MIN_STABLE_CELLS:
             members = stable
+        else:
+            upper_bound = max(upper_bounds[index], FACTOR_BOUNDS[0])
         reference_share = float(residuals.reference_m2[members].sum() / residuals.scan_m2[members].sum())
         variance = robust_scale(ratio[members]) ** 2
         variance += (variance - 1) * reference_share
         factor = (len(members) * variance + PRIOR_CELLS) / (len(members) + PRIOR_CELLS)
-        factors[index] = np.clip(factor, *FACTOR_BOUNDS)
+        factors[index] = np.clip(factor, FACTOR_BOUNDS[0], upper_bound)
     return factors
+
+
+def _moving_upper_bounds(residuals: Residuals) -> Floats:
+    """Return the upper bound of the factor of moving ground by noise class (512,).
+
+    It comes from the scatter of points within cells; for classes with little of it, from that of all moving
+    ground.
+    """
+    moving = ~residuals.stable & (residuals.freedom > 0)
+    freedom, classes = residuals.freedom[moving].astype(np.float64), residuals.noise_class[moving]
+    ratio = residuals.scatter_m2[moving] / (residuals.scan_m2[moving] * (freedom + 1))
+    scatter = np.minimum(ratio, MAX_POINT_SCATTER) * freedom
+    total = freedom.sum()
+    if total < MIN_CLASS_CELLS:
+        return np.full(NOISE_CLASSES, FACTOR_BOUNDS[1])
+    of_class, weight = (np.bincount(classes, values, NOISE_CLASSES) for values in (scatter, freedom))
+    of_all = scatter.sum() / total
+    return np.asarray(
+        MAX_SCATTER_RATIO * (of_class + MIN_CLASS_CELLS * of_all) / (weight + MIN_CLASS_CELLS)
+    )
 
 
 def _systematic_factor(residuals: Residuals, random: Floats32) -> float:

@@ -12,7 +12,7 @@ from station.science.uncertainty.variance_factors import (
     noise_class,
 )
 
-SIDE_M, CELL_M, GROUP_M = 3000.0, 5.0, 50.0
+SIDE_M, CELL_M, GROUP_M, POINTS = 3000.0, 5.0, 50.0, 3
 
 
 def residuals(seed, true_factor, systematic_sigma_m=0.0, stable_share=1.0, reference_share=0.125):
@@ -29,7 +29,9 @@ def residuals(seed, true_factor, systematic_sigma_m=0.0, stable_share=1.0, refer
     group = (y_m // GROUP_M).astype(int) * 60 + (x_m // GROUP_M).astype(int)
     stable = y_m < stable_share * SIDE_M
     model = scan_m2, reference_m2, np.full(len(x_m), 0.001**2)
-    return Residuals(x_m, y_m, group, classes, stable, residual_m, *model)
+    freedom = np.full(len(x_m), POINTS - 1)
+    scatter_m2 = np.asarray(true_factor)[classes] * scan_m2 * POINTS * rng.chisquare(freedom) / freedom
+    return Residuals(x_m, y_m, group, classes, stable, residual_m, *model, scatter_m2, freedom)
 
 
 @pytest.mark.parametrize("factors", [(1.0, 1.0), (4.0, 0.25), (0.5, 9.0)])
@@ -68,17 +70,28 @@ def test_change_of_moving_ground_does_not_widen_the_noise_of_stable_ground():
     assert estimate_variance_factors(changed).random[:2] == pytest.approx([1, 1], rel=0.03)
 
 
+@pytest.mark.parametrize("drift_m", [0.3, 1.0])
+def test_drifts_on_ground_without_any_stable_ground_do_not_count_as_noise(drift_m):
+    quiet = residuals(3, (1.0, 4.0), stable_share=0.0)
+    drifts_m = np.random.default_rng(4).normal(0, drift_m, len(quiet.x_m))
+    changed = Residuals(**{**vars(quiet), "residual_m": quiet.residual_m + drifts_m})
+    assert estimate_variance_factors(quiet).random[:2] == pytest.approx([1, 4], rel=0.03)
+    assert estimate_variance_factors(changed).random[:2] == pytest.approx([3, 12], rel=0.1)
+
+
 def test_a_few_cells_do_not_show_a_variance():
     few = residuals(5, (9.0, 9.0))
     few = Residuals(*(column[:20] for column in vars(few).values()))
     assert (estimate_variance_factors(few).random == 1).all()
 
 
-def test_robust_scale_is_the_sigma_of_normal_values_and_covers_heavy_tails():
+def test_robust_scale_is_the_sigma_of_normal_values_and_is_between_middle_and_tails():
     rng = np.random.default_rng(2)
     assert robust_scale(rng.normal(0, 3, 100_000)) == pytest.approx(3, rel=0.01)
     heavy = rng.standard_t(3, 100_000)
-    assert np.mean(np.abs(heavy) < 1.96 * robust_scale(heavy)) == pytest.approx(0.93, abs=0.015)
+    # Quantiles of Student's t with 3 degrees of freedom: 0.7649 (50 % of the absolute values), 3.1824 (95 %).
+    assert robust_scale(heavy) == pytest.approx((0.7649 / 0.6745) ** 0.7 * (3.1824 / 1.96) ** 0.3, rel=0.02)
+    assert np.mean(np.abs(heavy) < 1.96 * robust_scale(heavy)) == pytest.approx(0.915, abs=0.01)
 
 
 def test_noise_classes_fit_a_byte_and_part_range_roughness_and_sampling():
