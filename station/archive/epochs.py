@@ -18,7 +18,7 @@ from station.archive.netcdf_layout import Series, create_file, create_variable, 
 from station.archive.raster_io import Array, rounded, write_rasters
 from station.archive.schema import BY_NAME, TERMS, VARIABLES, VERDICTS
 from station.errors import StoreError
-from station.quantities import Measurement, SharedParameters
+from station.quantities import Floats, Measurement, SharedParameters
 
 TIME_FORMAT = "%Y%m%dT%H%M%SZ"
 COMPACTED = {"days": "%Y%m%d", "months": "%Y%m"}  # kinds of compacted files: time format in their names
@@ -53,6 +53,7 @@ class Epoch:
     verdict_reason: str
     scalars: dict[str, float]
     provenance: dict[str, str]
+    redundancy: Floats | None = None  # (p,) of the shared parameters
 
 
 @dataclass(frozen=True)
@@ -229,6 +230,8 @@ def _write(file: netCDF4.Dataset, series: Series, epoch: Epoch, name: str) -> No
         create_variable(file, BY_NAME["shared_parameter_line_tilt_variance"], series, 1)[0] = (
             shared.line_tilt_variance
         )
+        if epoch.redundancy is not None:
+            create_variable(file, BY_NAME["shared_parameter_redundancy"], series, 1)[0] = epoch.redundancy
         if shared.change_errors is not None:
             create_variable(file, BY_NAME["change_errors"], series, 1)[0] = shared.change_errors.modes
             create_variable(file, BY_NAME["change_pattern"], series, 1)[0] = shared.change_errors.polar_change

@@ -166,6 +166,16 @@ VARIABLES: tuple[Variable, ...] = (
         comment="independent between groups of 0.2 degree each; units are squares of parameter_unit",
     ),
     Variable(
+        "shared_parameter_redundancy",
+        ("time", "parameter"),
+        "f4",
+        "share of the prior variance of each parameter that the scan removed",
+        "1",
+        None,
+        3,
+        comment="0: known from the prior only; 1: determined by ground, inclination log and weather",
+    ),
+    Variable(
         "change_errors",
         ("time", "parameter", "change_mode"),
         "f4",

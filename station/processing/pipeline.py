@@ -314,7 +314,7 @@ def variance_factors(
                 sector.reference_variance_m2,
                 jacobian.variance(posterior),
                 np.nan_to_num(sums.standard_deviation()) ** 2,
-                sums.count - 1,
+                sums.count.astype(np.int64) - 1,
             )
         )
     return estimate_variance_factors(Residuals.concatenate(parts)) if parts else UNIT_FACTORS

@@ -310,6 +310,7 @@ def _compute_epoch(
         scan_id=scan.path.stem,
         measurement=measurement,
         shared=shared,
+        redundancy=adjustment[1].redundancy if adjustment else None,
         verdict=verdict_name,
         verdict_reason=reason,
         scalars=scalars | clock_scalars,

@@ -29,8 +29,8 @@ MIN_BLOCK_CELLS = 5
 CORRELATED_BLOCKS = 9.0  # blocks that share their systematic error: it varies over some 300 m
 PRIOR_BLOCKS = 3.0  # weight of the model, in independent blocks
 FACTOR_BOUNDS = (0.1, 100.0)  # random
-# Upper bound of what means of cells scatter on ground that may have changed, over what points within cells do:
-# on unchanged ground it is 1.3 at most, as points of a cell share the lattice; more is change, as of drifts.
+# Upper bound of the variance of means of cells on ground that may have changed, over what points within cells
+# show: on unchanged ground it is 1.3 at most (equations.md, 6.7); more is change, as by drifts of snow.
 MAX_SCATTER_RATIO = 3.0
 MAX_POINT_SCATTER = 25.0  # of the points of one cell over their modelled variance; more is an edge
 MAX_SYSTEMATIC_FACTOR = 100.0
@@ -52,8 +52,8 @@ UNIT_FACTORS = VarianceFactors(np.ones(NOISE_CLASSES, np.float32), 1.0)
 class Residuals:
     """Residuals of cells (n,) of an adjusted scan, with their modelled variances.
 
-    The random variance is that of the scan and that of the reference, whose factor is its own. `scatter_m2` is
-    the variance of the points within a cell, with `freedom` degrees of freedom.
+    The random variance is that of the scan and that of the reference, whose factor is its own. `scatter_m2`
+    is the variance of the points within a cell, with `freedom` degrees of freedom.
     """
 
     x_m: Reals
@@ -150,9 +150,7 @@ def _moving_upper_bounds(residuals: Residuals) -> Floats:
         return np.full(NOISE_CLASSES, FACTOR_BOUNDS[1])
     of_class, weight = (np.bincount(classes, values, NOISE_CLASSES) for values in (scatter, freedom))
     of_all = scatter.sum() / total
-    return np.asarray(
-        MAX_SCATTER_RATIO * (of_class + MIN_CLASS_CELLS * of_all) / (weight + MIN_CLASS_CELLS)
-    )
+    return np.asarray(MAX_SCATTER_RATIO * (of_class + MIN_CLASS_CELLS * of_all) / (weight + MIN_CLASS_CELLS))
 
 
 def _systematic_factor(residuals: Residuals, random: Floats32) -> float:

@@ -280,6 +280,12 @@ def test_estimate_and_covariance_match_dense_least_squares(params, with_log, mon
     assert_allclose(shared.covariance, condensed.covariance, rtol=1e-6, atol=1e-9 * sigma[0] ** 2)
     assert_allclose(shared.line_tilt_variance, condensed.line_tilt_variance, rtol=1e-6)
     assert_allclose(shared.estimate, condensed.estimate, rtol=1e-6, atol=1e-12)
+    prior_variance = np.diag(covariance)[:GLOBAL_COUNT]
+    assert_allclose(
+        adjustment.redundancy[:GLOBAL_COUNT], 1 - sigma[:GLOBAL_COUNT] ** 2 / prior_variance, atol=1e-6
+    )
+    assert adjustment.redundancy[0] > 0.9
+    assert adjustment.redundancy[GLOBAL_COUNT - 1] < 0.1  # there is no moving ground
 
 
 @pytest.mark.integration
@@ -422,6 +428,7 @@ def test_posterior_without_observations_is_the_prior():
     sigma = np.sqrt(np.diag(covariance))
     scale = np.outer(sigma, sigma)
     assert_allclose(adjustment.covariance / scale, covariance / scale, rtol=0, atol=1e-6)
+    assert_allclose(adjustment.redundancy, 0.0, atol=1e-6)
 
 
 def test_smooth_snowfall_hardly_biases_the_state_if_stable_ground_is_spread_out():

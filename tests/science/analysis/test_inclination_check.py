@@ -93,8 +93,9 @@ def make_adjustment(estimate, covariance, log):
         line_covariance=lambda: covariance,
         sight_tilt_covariance=lambda _: LINE_DESIGN @ covariance @ LINE_DESIGN.T,
     )
+    redundancy, predicted_rad = np.ones(len(estimate)), LINE_DESIGN @ estimate
     return Adjustment(
-        PARAMS, estimate, posterior, 0.001, np.ones(9), (1.0, 1.0), 0.0, log, LINE_DESIGN @ estimate
+        PARAMS, estimate, posterior, 0.001, np.ones(9), (1.0, 1.0), 0.0, redundancy, log, predicted_rad
     )
 
 
