@@ -35,14 +35,12 @@ CONVERGED_M = 0.0003  # stop when an iteration changes the residuals by less (ro
 WARMUP_ITERATIONS = 2
 MIN_WEIGHT = 0.1  # a patch of smaller weight counts as rejected
 TUKEY = 4.685  # 95 % efficient for normal errors
-EXCESS_BOUNDS_M = (
-    0.002,
-    0.02,
-)  # bounds of the excess sigma of stable patches over their cells' random errors
+EXCESS_BOUNDS_M = (0.002, 0.02)  # of the excess sigma of stable patches over their cells' random errors
 MAX_MOVING_EXCESS_M = 1.0  # upper bound for moving patches
 # Of the response of ground to a motion of the beams, over its sampling ratio: on fractal relief the median
-# response of cells is 5 % too small where their ratio is a third, the mean 2 % too large.
-RESPONSE_ERROR = 0.15
+# response of cells is 5 % too small where their ratio is a third, the mean 2 % too large. Larger ratios do not
+# make the response of many cells together more uncertain than the bound.
+RESPONSE_ERROR, MAX_RESPONSE_ERROR = 0.15, 0.03
 MAX_GROUP_SIZE = 40.0  # patches that share one error
 
 
@@ -100,7 +98,8 @@ class Adjustment:
         responds to a motion of the beams by a little more or less than modelled. Source: equations.md, 6.8.
         """
         shared = self.posterior.to_shared_parameters(self.estimate)
-        beam = np.where(self.params.moves_beam, RESPONSE_ERROR * sampling_ratio * shared.estimate, 0.0)
+        response_error = min(RESPONSE_ERROR * sampling_ratio, MAX_RESPONSE_ERROR)
+        beam = np.where(self.params.moves_beam, response_error * shared.estimate, 0.0)
         return replace(shared, covariance=shared.covariance + np.outer(beam, beam))
 
 
