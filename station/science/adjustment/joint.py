@@ -35,11 +35,11 @@ CONVERGED_M = 0.0003  # stop when an iteration changes the residuals by less (ro
 WARMUP_ITERATIONS = 2
 MIN_WEIGHT = 0.1  # a patch of smaller weight counts as rejected
 TUKEY = 4.685  # 95 % efficient for normal errors
-EXCESS_BOUNDS_M = (0.002, 0.02)  # of the excess sigma of stable patches over their cells' random errors
+EXCESS_BOUNDS_M = (0.002, 0.02)  # of the excess sigma of stable patches over the random errors of cells
 MAX_MOVING_EXCESS_M = 1.0  # upper bound for moving patches
 # Of the response of ground to a motion of the beams, over its sampling ratio: on fractal relief the median
-# response of cells is 5 % too small where their ratio is a third, the mean 2 % too large. Larger ratios do not
-# make the response of many cells together more uncertain than the bound.
+# response of cells is 5 % too small where their ratio is a third, the mean 2 % too large. Larger ratios do
+# not make the response of many cells together more uncertain than the bound.
 RESPONSE_ERROR, MAX_RESPONSE_ERROR = 0.15, 0.03
 MAX_GROUP_SIZE = 40.0  # patches that share one error
 
