@@ -65,17 +65,19 @@ def require_known(data: Path, state: Path) -> None:
     """
     if data == state or state in data.parents:  # they come and go together
         return
-    path, remembered = state / "data_folder", ""
+    path, remembered_path, remembered = state / "data_folder", "", ""
     with suppress(OSError):
-        remembered = path.read_text(encoding="utf-8", errors="replace")
+        remembered_path, _, remembered = path.read_text(encoding="utf-8", errors="replace").partition("\n")
     identity = read_identity(data)
-    if remembered.startswith(f"{data}\n") and remembered != f"{data}\n{identity}\n":
+    if remembered_path == str(data) and remembered.strip() not in {"", identity}:
         raise StoreError(
             f"{data}: is not the folder of the stored series: is its disk mounted? To begin a new series in"
             f" this folder, delete {path}"
         )
-    with suppress(OSError):
-        path.write_text(f"{data}\n{identity or _identify(data)}\n", encoding="utf-8")
+    identity = identity or _identify(data)
+    if identity:  # a folder that is yet to be created has none
+        with suppress(OSError):
+            path.write_text(f"{data}\n{identity}\n", encoding="utf-8")
 
 
 def read_identity(data: Path) -> str:

@@ -72,3 +72,12 @@ def test_deleted_lock_is_taken_again_unless_another_process_has_it(data):
         (data / LOCK).unlink()
         with exclusive_lock(data), pytest.raises(StoreError, match="another process uses it"):
             folder.require_same()
+
+
+def test_a_data_folder_that_the_first_start_creates_is_known_afterwards(data, state):
+    data.rmdir()
+    for _ in range(3):
+        require_known(data, state)
+        with exclusive_lock(data):
+            pass
+    assert (state / "data_folder").read_text() == f"{data}\n{read_identity(data)}\n"
