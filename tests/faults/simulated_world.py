@@ -1,0 +1,572 @@
+"""Years of a station's faults in minutes: the service's own loop in one process, on a simulated clock.
+
+Everything is the production code but for what a `World` stands for: the clock (nobody waits for it), the
+process of a task (it runs here, and may die or never start), the disk (any change of a file in the data
+folder may fail, or be the last of the service), the network folder with the inbox, and the events of file
+watcher and scheduler. A year has a scan every ten days and two faults around each; what happens follows from
+the seed. Deaths here run `finally` blocks; `test_kills.py` kills real processes.
+
+    python tests/faults/simulated_world.py --seed 0 --years 100
+"""
+
+from __future__ import annotations
+
+import argparse
+import errno
+import logging
+import os
+import random
+import shutil
+import sqlite3
+import sys
+import tempfile
+import time
+from contextlib import ExitStack, contextmanager, suppress
+from datetime import UTC, datetime
+from pathlib import Path
+from unittest import mock
+
+if __name__ == "__main__":
+    sys.path[:0] = [str(Path(__file__).parents[1]), str(Path(__file__).parents[2])]
+
+import laspy
+import numpy as np
+from hooks import boundaries
+from support.tiny_station import PENDING, build, scan_name, values
+
+from station.errors import InconclusiveError, StationError
+from station.inbox import inbox, journal
+from station.inbox.journal import Journal, State
+from station.inbox.lock import IDENTITY
+from station.processing import isolation
+from station.service import background_compaction, worker
+from station.service.daemon import Daemon, LoopTiming
+from station.service.scheduler import LoopEvent
+
+START_S = datetime(2035, 7, 15, tzinfo=UTC).timestamp()  # later than the real clock, which stamps the files
+BASE_SCANS = 12  # simulated ones, of which all others are copies with bytes of their own
+DAY_S, HOUR_S = 86_400.0, 3600.0
+SCAN_INTERVAL_S = 10 * DAY_S
+SCANS_PER_YEAR = 36
+HOUSEKEEPING_S = 5 * DAY_S
+MAX_RECOVERY_S = 40 * DAY_S  # after the last fault; the longest pause of a scan is hours
+TIMING = LoopTiming(period_s=6 * HOUR_S, first_pause_s=5.0)
+
+
+class _DiedError(BaseException):
+    """The service or the process of a task is killed: nothing handles it."""
+
+
+class World:
+    """A station's folder and all that happens to it."""
+
+    def __init__(self, folder: Path, seed: int, years: int = 1) -> None:
+        self.folder, self.seed = folder, seed
+        self.rng = random.Random(seed)  # noqa: S311 - no secret
+        self.elapsed_s = self.clock_error_s = 0.0
+        self.timeline: list[tuple[float, int, object]] = []
+        self.names: list[str] = []  # of the good scans
+        self.daemon: Daemon | None = None
+        self.starts = self.deaths = self.faults = 0
+        self.in_child = self.is_acting = False
+        self.countdown: dict[str, int] = {}  # boundaries until the death of "child" or "service"
+        self.is_disk_full = self.is_out_of_space = False
+        self.child_fault: Exception | None = None
+        self.log: list[str] = []
+        self.data, self.inbox = folder / "data", folder / "inbox"
+        self.last_fault_s = 0.0
+        for number in range(years * SCANS_PER_YEAR):
+            self._plan_scan(number)
+        for number in range(1, int(years * 365 * DAY_S / HOUSEKEEPING_S)):
+            self.at(number * HOUSEKEEPING_S, self._housekeeping)
+
+    # ---- what will happen
+
+    def at(self, elapsed_s: float, action: object) -> None:
+        """Plan an action."""
+        self.timeline.append((elapsed_s, len(self.timeline), action))
+        self.timeline.sort(key=lambda planned: planned[:2], reverse=True)
+
+    def plan_faults(self) -> None:
+        """Plan two faults around each scan."""
+        kinds = [name for name in dir(self) if name.startswith("fault_")]
+        for number in range(1, len(self.names)):
+            for _ in range(2):
+                begin_s = number * SCAN_INTERVAL_S + self.rng.uniform(-2, 0.2) * HOUR_S
+                end_s = begin_s + self.rng.choice([0.1, 1.0, 5.0, 20.0]) * HOUR_S
+                fault = getattr(self, self.rng.choice(kinds))
+                self.at(begin_s, lambda fault=fault, end_s=end_s: self._begin(fault, end_s))
+                self.last_fault_s = max(self.last_fault_s, end_s)
+
+    def _begin(self, fault: object, end_s: float) -> None:
+        self.faults += 1
+        undo = fault()
+        if undo is not None:
+            self.at(max(end_s, self.elapsed_s), undo)
+
+    def _plan_scan(self, number: int) -> None:
+        start_s = START_S + number * SCAN_INTERVAL_S
+        name = datetime.fromtimestamp(start_s, UTC).strftime("%y%m%d_%H%M%S")
+        self.names.append(f"{name}.laz")
+        self.at(number * SCAN_INTERVAL_S + 120, lambda: self._deliver(number % BASE_SCANS, name))
+
+    def _deliver(self, base: int, name: str) -> None:
+        """Put a scan, its log and the weather of its time into their folders."""
+        pending = self.folder / PENDING
+        scan = laspy.read(pending / f"{scan_name(base)}.laz")
+        scan.header.generating_software = name
+        scan.write(pending / f"{name}.laz")
+        with (self.folder / "weather.dat").open("a", newline="") as weather:
+            for minute in range(-5, 15, 5):
+                at = datetime.fromtimestamp(START_S + self.elapsed_s + 60 * minute, UTC)
+                weather.write(f'"{at:%Y-%m-%d %H:%M:%S}",0,{-base / 3:.4f},80.0,690.0,12.6\r\n')
+        self._put((pending / f"{scan_name(base)}-incl.txt").read_bytes(), f"{name}-incl.txt")
+        content = (pending / f"{name}.laz").read_bytes()
+        if self.faults and self.rng.random() < 0.3:  # half an upload, which stalls for some minutes
+            self._put(content[: len(content) // 2], f"{name}.laz")
+            self.at(self.elapsed_s + self.rng.uniform(5, 50), lambda: self._put(content, f"{name}.laz"))
+        else:
+            self._put(content, f"{name}.laz")
+
+    def _put(self, content: bytes, name: str) -> None:
+        path = self.inbox / name
+        path.write_bytes(content)
+        os.utime(path, (self.now_s(), self.now_s()))
+        self._post(LoopEvent.INBOX_CHANGED)
+
+    def _housekeeping(self) -> None:
+        self._post(LoopEvent.MAINTENANCE)
+        self._post(LoopEvent.COMPACT)
+
+    def _post(self, event: LoopEvent) -> None:
+        if self.daemon is not None:
+            self.daemon.post(event)
+
+    # ---- faults; each returns what ends it
+
+    def fault_service_killed(self) -> None:
+        self.countdown["service"] = self.rng.randint(1, 150)
+
+    def fault_child_killed(self) -> None:
+        self.countdown["child"] = self.rng.randint(1, 40)
+
+    def fault_no_tasks(self) -> object:
+        self.child_fault = isolation._WorkerLostError("the worker process could not be started")
+        return self._end_child_fault
+
+    def fault_no_memory(self) -> object:
+        self.child_fault = InconclusiveError("needs more than 2 GB")
+        return self._end_child_fault
+
+    def _end_child_fault(self) -> None:
+        self.child_fault = None
+
+    def fault_disk_full(self) -> object:
+        self.is_disk_full = True
+        return lambda: setattr(self, "is_disk_full", False)
+
+    def fault_no_space(self) -> object:
+        self.is_out_of_space = True
+        return lambda: setattr(self, "is_out_of_space", False)
+
+    def fault_other_disk_mounted(self) -> object:
+        away = self.folder / "data.away"
+        if away.exists() or self.in_child:
+            return None
+        self.data.rename(away)
+        self.data.mkdir()
+        return self._mount_again
+
+    def _mount_again(self) -> None:
+        shutil.rmtree(self.data)
+        (self.folder / "data.away").rename(self.data)
+
+    def fault_inbox_away(self) -> object:
+        away = self.folder / "inbox.away"
+        if away.exists():
+            return None
+        self.inbox.rename(away)
+        self.inbox = away
+        return self._inbox_back
+
+    def _inbox_back(self) -> None:
+        self.inbox = self.inbox.rename(self.folder / "inbox")
+        self._post(LoopEvent.INBOX_CHANGED)
+
+    def fault_clock_wrong(self) -> object:
+        self.clock_error_s = self.rng.choice([-3 * DAY_S, -HOUR_S, HOUR_S, 3 * DAY_S])
+        return lambda: setattr(self, "clock_error_s", 0.0)
+
+    def fault_areas_broken(self) -> object:
+        return self._break(self.folder / "areas.geojson")
+
+    def fault_weather_broken(self) -> object:
+        return self._break(self.folder / "weather.dat")
+
+    def _break(self, path: Path) -> object:
+        good = path.with_suffix(".good")
+        if good.exists():
+            return None
+        path.rename(good)
+        path.write_bytes(self.rng.randbytes(200))
+
+        def repair() -> None:
+            appended = path.read_bytes()[200:]
+            good.replace(path)
+            with path.open("ab") as file:
+                file.write(appended)
+
+        return repair
+
+    def fault_bits_rot(self) -> None:
+        """Damage a derived file. Epochs are proved by `station check --store`, not by the service."""
+        files = [
+            path
+            for path in self.data.rglob("*")
+            if path.is_file() and path.suffix != ".damaged"
+            and path.name != IDENTITY
+            and not path.name.startswith(("journal", "reference"))
+            and path.relative_to(self.data).parts[0] not in {"epochs", "reference", "set_aside"}
+        ]  # fmt: skip
+        if files:
+            path = self.rng.choice(sorted(files))
+            content = bytearray(path.read_bytes())
+            if self.rng.random() < 0.3:
+                del content[len(content) // 2 :]
+            elif content:
+                content[self.rng.randrange(len(content))] ^= 0x55
+            with path.open("r+b") as file:
+                file.truncate(0)
+                file.write(content)
+
+    def fault_scan_touched(self) -> None:
+        path = self._some_scan()
+        if path is not None:
+            os.utime(path, (self.now_s(), self.now_s()))
+
+    def fault_scan_copied(self) -> None:
+        path = self._some_scan()
+        if path is not None:
+            at = datetime.fromtimestamp(START_S + self.elapsed_s + self.rng.randrange(3000), UTC)
+            name = at.strftime("%y%m%d_%H%M%S")
+            log = self.inbox / f"{path.stem}-incl.txt"
+            self._put(log.read_bytes() if log.exists() else b"", f"{name}-incl.txt")
+            self._put(path.read_bytes(), f"{name}.laz")
+
+    def fault_hostile_scan(self) -> None:
+        path = self._some_scan()
+        if path is not None:
+            at = datetime.fromtimestamp(START_S + self.elapsed_s - self.rng.randrange(3000), UTC)
+            content = bytearray(path.read_bytes())
+            for _ in range(20):
+                content[self.rng.randrange(300, len(content))] = self.rng.randrange(256)
+            name = at.strftime("%y%m%d_%H%M%S")
+            self._put(b"Time,Roll,Pitch\n", f"{name}-incl.txt")
+            self._put(bytes(content), f"{name}.laz")
+
+    def fault_limits_changed(self) -> None:
+        site = self.folder / "site.toml"
+        text = site.read_text().partition("[service]")[0]
+        site.write_text(f"{text}[service]\nmemory_gb = {self.rng.choice([2.0, 3.0, 4.0])}\n")
+        self._post(LoopEvent.RELOAD)
+
+    def _some_scan(self) -> Path | None:
+        scans = [self.inbox / name for name in self.names if (self.inbox / name).exists()]
+        return self.rng.choice(scans) if scans else None
+
+    # ---- the seam: clock, disk, child
+
+    def now_s(self) -> float:
+        """Wall clock of the station."""
+        return START_S + self.elapsed_s + self.clock_error_s
+
+    def monotonic_s(self) -> float:
+        """Clock that nobody sets."""
+        return 1000.0 + self.elapsed_s
+
+    def advance(self, duration_s: float) -> None:
+        """Let time pass, and happen what is planned for it."""
+        until_s = self.elapsed_s + duration_s
+        while self.timeline and self.timeline[-1][0] <= until_s:
+            at_s, _, action = self.timeline.pop()
+            self.elapsed_s = max(self.elapsed_s, at_s)
+            self.is_acting = True  # what the world changes on disk is no boundary
+            try:
+                action()
+            finally:
+                self.is_acting = False
+        self.elapsed_s = until_s
+
+    def next_s(self) -> float:
+        """Time until the next planned action [s]."""
+        return max(self.timeline[-1][0] - self.elapsed_s, 0.0) if self.timeline else TIMING.period_s
+
+    def cross(self, label: str, full: Exception | None = None) -> None:
+        """Pass a boundary of the disk: a death, a full disk, or nothing."""
+        if self.is_acting:
+            return
+        victims = ("child", "service") if self.in_child else ("service",)
+        for victim in victims:
+            if victim in self.countdown:
+                self.countdown[victim] -= 1
+                if self.countdown[victim] <= 0:
+                    del self.countdown[victim]
+                    raise _DiedError(victim)
+        if self.is_disk_full and self.rng.random() < 0.3:
+            raise full or OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), label)
+
+    def run_once(self, task, args, memory_gb, timeout_s, on_progress, should_stop):  # noqa: ARG002
+        """Run a task here, as `isolation._run_once` does in a process of its own."""
+        if self.child_fault is not None:
+            raise self.child_fault
+        was_in_child, self.in_child = self.in_child, True
+        try:
+            return task(*args, on_progress)
+        except _DiedError as death:
+            if str(death) == "service":
+                raise
+            self.deaths += 1
+            raise isolation._WorkerLostError("killed") from None
+        except StationError:
+            raise
+        except Exception as bug:
+            raise RuntimeError(f"a bug in {task.__name__}, in the worker process:\n{bug!r}") from bug
+        finally:
+            self.in_child = was_in_child
+
+    def statvfs(self, folder: object) -> os.statvfs_result:
+        """Free space of the disk."""
+        disk = self._statvfs(folder)
+        return os.statvfs_result((*disk[:3], 0, 0, *disk[5:])) if self.is_out_of_space else disk
+
+    @contextmanager
+    def installed(self):
+        """Replace clock, disk and processes of this interpreter by those of the world."""
+        self._statvfs = os.statvfs
+        handler = logging.Handler()
+        handler.emit = lambda record: self.log.append(record.getMessage())
+        logger = logging.getLogger("station")
+        with ExitStack() as stack:
+            replace = lambda target, name, value: stack.enter_context(mock.patch.object(target, name, value))  # noqa: E731
+            replace(time, "time", self.now_s)
+            replace(time, "monotonic", self.monotonic_s)
+            replace(time, "sleep", self.advance)
+            for clocked in (inbox.Inbox, journal.Journal):
+                clocks = {"now_s": self.now_s, "monotonic_s": self.monotonic_s}
+                defaults = clocked.__init__.__kwdefaults__
+                stack.enter_context(
+                    mock.patch.dict(
+                        defaults, {name: clocks[name] for name in clocks.keys() & defaults.keys()}
+                    )
+                )
+            replace(os, "statvfs", self.statvfs)
+            replace(boundaries, "_cross", self.cross)
+            for name in ("fsync", "replace", "rename", "link", "unlink", "mkdir"):
+                replace(os, name, boundaries._watched(name, getattr(os, name)))
+            connect = sqlite3.connect
+            replace(
+                sqlite3,
+                "connect",
+                lambda *args, **kw: connect(*args, **{"factory": boundaries._Connection} | kw),
+            )
+            replace(isolation, "_run_once", self.run_once)
+            replace(worker, "BackgroundCompaction", _Compaction)
+            stack.enter_context(mock.patch.dict(os.environ, {"STATE_DIRECTORY": str(self.folder / "state")}))
+            logger.addHandler(handler)
+            stack.callback(logger.removeHandler, handler)
+            yield
+
+    # ---- running
+
+    def run(self) -> None:
+        """Run the service through all that is planned, and restart it whenever it dies, as systemd does."""
+        (self.folder / "state").mkdir(exist_ok=True)
+        with self.installed():
+            while not self.is_over():
+                self.starts += 1
+                self.daemon = None
+                try:
+                    self.daemon = _Daemon(self)
+                    self.daemon.serve()
+                except _DiedError:
+                    self.deaths += 1
+                except StationError as error:
+                    self.log.append(f"service ended: {error}")
+                self.in_child = False
+                self.advance(10.0)
+
+    def is_over(self) -> bool:
+        """Return True if nothing is planned any more and no scan waits, or time is up."""
+        if self.timeline or self.elapsed_s < self.last_fault_s + 2 * HOUSEKEEPING_S:
+            return False
+        if self.elapsed_s > max(self.last_fault_s, len(self.names) * SCAN_INTERVAL_S) + MAX_RECOVERY_S:
+            return True
+        rows = self.rows()
+        return set(self.names) <= rows.keys() and all(
+            row.state in {State.STORED, State.SET_ASIDE} for row in rows.values()
+        )
+
+    def rows(self) -> dict[str, object]:
+        """Return the rows of the journal by scan."""
+        if not (self.data / "journal.sqlite").exists():
+            return {}
+        with Journal(self.data / "journal.sqlite", read_only=True) as opened:
+            return {row.name: row for row in opened.rows()}
+
+    def defects(self, undisturbed: World) -> list[str]:
+        """Return what differs from a world in which nothing happened."""
+        rows = self.rows()
+        defects = [
+            f"{name}: {rows[name].state if name in rows else 'unknown'}"
+            f" {getattr(rows.get(name), 'reason', '')}"
+            for name in self.names
+            if name not in rows or rows[name].state is not State.STORED
+        ]
+        defects += [
+            f"{name}: stored although it is no good scan"
+            for name, row in rows.items()
+            if row.state is State.STORED and name not in self.names
+        ]
+        defects += [line for line in self.log if "a bug" in line]
+        for file in ("series.nc", "areas.nc"):
+            try:
+                actual, expected = values(self.data / file), values(undisturbed.data / file)
+            except (OSError, RuntimeError) as error:
+                defects.append(f"{file}: {error}")
+                continue
+            if actual.keys() != expected.keys():
+                defects.append(f"{file}: variables {actual.keys() ^ expected.keys()}")
+                continue
+            for name, (dims, value) in expected.items():
+                if actual[name][0] != dims or actual[name][1].tobytes() != value.tobytes():
+                    defects.append(f"{file}: {name} differs{_where(actual[name][1], value)}")
+        return defects
+
+
+def _where(actual: np.ndarray, expected: np.ndarray) -> str:
+    """Return the epochs in which a variable differs."""
+    if actual.shape != expected.shape:
+        return f": {actual.shape} instead of {expected.shape}"
+    axis = tuple(range(1, actual.ndim))
+    is_float = actual.dtype.kind == "f"
+    same = np.isclose(actual, expected, rtol=0, atol=0, equal_nan=True) if is_float else actual == expected
+    return f" in {np.flatnonzero(~np.all(same, axis=axis)).tolist()}"
+
+
+class _Compaction:
+    """Compaction at once instead of in another thread."""
+
+    def __init__(self, site: object, on_done: object) -> None:
+        self._site, self._on_done, self._checksums = site, on_done, None
+
+    def start(self, checksums: object, *, in_backlog: bool) -> None:
+        with suppress(isolation.NotReadyError):
+            self._checksums = isolation.run_isolated(
+                background_compaction.compact_low_priority, self._site, dict(checksums), in_backlog,
+                memory_gb=1.0, timeout_s=1e9,
+            )  # fmt: skip
+            self._on_done()
+
+    def result(self) -> object:
+        checksums, self._checksums = self._checksums, None
+        return checksums
+
+    def close(self) -> None:
+        pass
+
+
+class _Nothing:
+    """File watcher and scheduler: their events come from the world."""
+
+    def __init__(self, *_: object, **__: object) -> None:
+        pass
+
+    def ensure_watching(self) -> None:
+        pass
+
+    def resync_clock(self) -> float:
+        return 0.0
+
+    def close(self) -> None:
+        pass
+
+    def stop(self) -> None:
+        pass
+
+
+class _Daemon(Daemon):
+    """The service, which waits by letting the time of its world pass."""
+
+    def __init__(self, world: World) -> None:
+        self._world = world
+        super().__init__(world.folder / "site.toml", worker.Worker, TIMING)
+
+    def _create_components(self, site):
+        components = dict.fromkeys(("InboxWatcher", "JobScheduler"), _Nothing)
+        with mock.patch.multiple("station.service.daemon", **components):
+            return super()._create_components(site)
+
+    def _wait(self, wait_s: float) -> None:
+        until_s = self._world.elapsed_s + wait_s
+        while True:
+            while not self._events.empty():
+                event = self._events.get()
+                if event not in {LoopEvent.STOP, LoopEvent.INBOX_CHANGED}:
+                    self._due.add(event)
+                if event is not LoopEvent.INBOX_CHANGED or not self._consecutive_faults:
+                    until_s = self._world.elapsed_s
+            if self._world.elapsed_s >= until_s:
+                break
+            self._world.advance(min(self._world.next_s() + 1e-3, until_s - self._world.elapsed_s))
+        if self._world.is_over():
+            self.stop()
+
+
+def make_world(folder: Path, template: Path, seed: int, years: int = 1) -> World:
+    """Return a world in a new folder; `template` is a station made by `make_template`."""
+    shutil.copytree(template, folder)
+    return World(folder, seed, years)
+
+
+def make_template(folder: Path) -> Path:
+    """Simulate the scans of which all worlds have copies."""
+    build(folder, hours=BASE_SCANS)
+    site = folder / "site.toml"
+    text = site.read_text().replace("settle_s = 0.05", "settle_s = 60")
+    text = text.replace("250715_000000", "350715_000000")
+    text = text.replace("scans = 2  ", "scans = 3  ").replace(
+        "expected_every_s = 3600", "expected_every_s = 432000"
+    )
+    site.write_text(f"{text}[products]\npage = false\n")
+    return folder
+
+
+def main() -> int:
+    """Run worlds with consecutive seeds; print the defects of each."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--seed", type=int, default=0, help="the first seed")
+    parser.add_argument(
+        "--years", type=int, default=10, help="number of station-years, each with its own seed"
+    )
+    parser.add_argument("--log", action="store_true", help="print the service's log")
+    options = parser.parse_args()
+    failed = 0
+    with tempfile.TemporaryDirectory() as temporary:
+        template = make_template(Path(temporary) / "template")
+        undisturbed = make_world(Path(temporary) / "undisturbed", template, 0)
+        undisturbed.run()
+        for seed in range(options.seed, options.seed + options.years):
+            world = make_world(Path(temporary) / str(seed), template, seed)
+            world.plan_faults()
+            world.run()
+            defects = world.defects(undisturbed)
+            failed += bool(defects)
+            print(f"seed {seed}: {world.faults} faults, {world.deaths} deaths, {world.starts} starts,"
+                  f" {len(defects)} defects", flush=True)  # fmt: skip
+            print(*(world.log if options.log else []), *defects, sep="\n", end="\n" if defects else "")
+            shutil.rmtree(world.folder)
+    return min(failed, 1)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
