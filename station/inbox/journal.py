@@ -25,6 +25,8 @@ if TYPE_CHECKING:
 FIRST_RETRY_S = 30.0  # until a deferred scan is tried again; doubled after each attempt
 MAX_RETRY_S = 3600.0
 MAX_FAILURES = 12  # inconclusive attempts until a scan is set aside for now: 17 h, the last pause 8.5 h
+REJECTED_FOR_NOW = "rejected for now"
+RETRY_REJECTED_S = 7 * 86_400.0  # the machine may have recovered: one attempt, which costs little
 LONGEST_RETRY_S = FIRST_RETRY_S * 2.0 ** (MAX_FAILURES - 2)
 SETTLING_ATTEMPTS = 6  # a scan that failed as often, after a quarter of an hour, no longer delays others
 SETTLING_S = 6 * 3600.0  # nor does one that has waited unchanged for so long, as one that stays open
@@ -269,12 +271,26 @@ class Journal:
         failures = 1 + (entry.attempts if entry and entry.judged_under == judged_under else 0)
         if failures >= MAX_FAILURES:
             self.set_aside(
-                name, f"rejected for now, after {failures} attempts: {reason}", judged_under=judged_under
+                name, f"{REJECTED_FOR_NOW}, after {failures} attempts: {reason}", judged_under=judged_under
             )
             return None
         delay_s = FIRST_RETRY_S * 2.0 ** (failures - 1)
         self._retry_in(delay_s, name, reason, failures, judged_under)
         return delay_s
+
+    def rejected_for_now(self) -> list[str]:
+        """Return the names of scans that were rejected for now more than `RETRY_REJECTED_S` ago; sorted."""
+        query = (
+            "SELECT name FROM scan WHERE state = 'set_aside' AND reason LIKE ?"
+            " AND abs(changed_utc_s - ?) > ? ORDER BY name"
+        )
+        with self._store_errors():
+            parameters = f"{REJECTED_FOR_NOW}%", self._now_s(), RETRY_REJECTED_S
+            return [name for (name,) in self._connection.execute(query, parameters)]
+
+    def try_once(self, name: str, reason: str, judged_under: str) -> None:
+        """Queue a scan for a single attempt: if that fails, it is rejected for now again."""
+        self._retry_in(0.0, name, reason, MAX_FAILURES - 1, judged_under)
 
     def _retry_in(self, delay_s: float, name: str, reason: str, attempts: int, judged_under: str) -> None:
         with self._transaction():

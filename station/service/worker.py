@@ -349,6 +349,11 @@ class Worker:
         for name in names:
             log.info("%s", logfmt(scan=name, verdict="waiting", reason=reason))
         self._journal.requeue(names, reason)
+        reason = "rejected for now a week ago: one more attempt"
+        for name in self._journal.rejected_for_now():
+            if (self._site.scans.inbox / name).is_file():
+                log.info("%s", logfmt(scan=name, verdict="waiting", reason=reason))
+                self._journal.try_once(name, reason, self._site.judging_conditions)
 
     def _report_outdated(self) -> None:
         """Log the number of epochs with outdated settings, whenever it changes."""

@@ -271,7 +271,9 @@ class World:
         self._post(LoopEvent.RELOAD)
 
     def _some_scan(self) -> Path | None:
-        scans = [self.inbox / name for name in self.names if (self.inbox / name).exists()]
+        """Return a scan that is stored, at random."""
+        stored = {name for name, row in self.rows().items() if row.state is State.STORED}
+        scans = [self.inbox / name for name in self.names if name in stored]
         return self.rng.choice(scans) if scans else None
 
     # ---- the seam: clock, disk, child

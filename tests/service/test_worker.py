@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import shutil
+import time
 from types import SimpleNamespace
 
 import pytest
@@ -114,6 +115,25 @@ def test_inconclusive_failure_is_repeated_ever_more_rarely_then_rejected_for_now
     entry = journal.entry(NAME)
     assert entry.state is State.SET_ASIDE
     assert entry.reason == "rejected for now, after 12 attempts: took longer than 1800 s"
+
+
+def test_scan_rejected_for_now_gets_one_attempt_a_week(pretend, monkeypatch):
+    site, journal, worker = pretend()
+    worker.errors = {NAME: InconclusiveError("needs more than 2 GB")}
+    for _ in range(MAX_FAILURES):
+        worker.process(scan(site, 1))
+    worker.run_maintenance()
+    assert journal.entry(NAME).state is State.SET_ASIDE  # only just now
+    true_s = time.time()
+    for week in (1, 2):
+        monkeypatch.setattr(journal, "_now_s", lambda week=week: true_s + 8 * week * 86_400)
+        worker.run_maintenance()
+        assert journal.entry(NAME).state is State.LATER
+        if week == 1:
+            worker.process(scan(site, 1))
+            assert journal.entry(NAME).state is State.SET_ASIDE  # at once
+    worker.errors = {}
+    assert worker.process(scan(site, 1))
 
 
 def test_failure_that_is_surely_not_the_scans_is_never_given_up(pretend):
