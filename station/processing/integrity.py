@@ -100,7 +100,10 @@ def add_checksums(site: Site, checksums: Mapping[str, str], progress: Progress) 
 
 
 def unreadable_files(site: Site, progress: Progress) -> tuple[str, ...]:
-    """Return the epoch and compacted files that cannot be opened; fast, but blind to flipped bits."""
+    """Return the epoch and compacted files that cannot be opened, or a variable of which cannot be.
+
+    That is fast, but blind to flipped bits in the values.
+    """
     series = series_for(site)
     unreadable = []
     for path in store_files(series):
@@ -108,9 +111,17 @@ def unreadable_files(site: Site, progress: Progress) -> tuple[str, ...]:
         try:
             if not is_reference(path):
                 epochs_in_file(path)
-        except StoreError:
+                _open_variables(path)
+        except (StoreError, OSError, RuntimeError, KeyError):
             unreadable.append(str(path.relative_to(series.folder)))
     return tuple(unreadable)
+
+
+def _open_variables(path: Path) -> None:
+    """Open every variable of a file, whose description has a checksum; raise KeyError if one is damaged."""
+    with h5py.File(path, "r") as file:
+        for name in file:
+            file[name]
 
 
 def is_readable(path: Path, progress: Progress) -> bool:

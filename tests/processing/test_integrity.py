@@ -1,0 +1,34 @@
+"""Damage to files of the store that opening them does not show."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+import pytest
+
+from station.archive import epochs
+from station.processing import integrity
+
+OBJECT_HEADER = b"OHDR"  # signature in HDF5, one for each variable
+
+
+@pytest.fixture
+def site(series, monkeypatch):
+    monkeypatch.setattr(integrity, "series_for", lambda _: series)
+    return SimpleNamespace()
+
+
+def test_a_damaged_description_of_any_variable_is_found(series, epoch, site):
+    path = epochs.write_epoch(series, epoch(1)).path
+    content = path.read_bytes()
+    assert integrity.unreadable_files(site, lambda: None) == ()
+    first = content.index(OBJECT_HEADER)  # the file itself
+    headers, at = [], first
+    while (at := content.find(OBJECT_HEADER, at + 1)) > 0:
+        headers.append(at)
+    assert len(headers) > 40
+    for at in headers:
+        damaged = bytearray(content)
+        damaged[at + 12] ^= 0xFF
+        path.write_bytes(damaged)
+        assert integrity.unreadable_files(site, lambda: None) == (str(path.relative_to(series.folder)),), at
