@@ -80,6 +80,38 @@ class StationSection(Section):
     institution: str = ""
 
 
+class MetadataSection(Section):
+    """Who made the data, and how they may be used and cited: global attributes (ACDD 1.3) of all files."""
+
+    summary: str = ""
+    keywords: tuple[str, ...] = ()
+    license: str = ""
+    creator_name: str = ""
+    creator_email: str = ""
+    creator_orcid: Annotated[str, Field(pattern=r"^(\d{4}-\d{4}-\d{4}-\d{3}[\dX])?$")] = ""
+    publisher_name: str = ""
+    publisher_email: str = ""
+    publisher_url: str = ""
+    project: str = ""
+    acknowledgement: str = ""
+    naming_authority: str = ""
+    references: str = ""
+    comment: str = ""
+    doi: Annotated[str, Field(pattern=r"^(10\.\d{4,9}/\S+)?$")] = ""
+
+    @property
+    def attributes(self) -> dict[str, str]:
+        """Global attributes of what is given, by their names in the convention."""
+        given = self.model_dump(exclude={"keywords", "creator_orcid", "doi"}, exclude_defaults=True)
+        if self.keywords:
+            given["keywords"] = ", ".join(self.keywords)
+        if self.creator_orcid:
+            given["creator_url"] = f"https://orcid.org/{self.creator_orcid}"
+        if self.doi:
+            given |= {"id": self.doi, "metadata_link": f"https://doi.org/{self.doi}"}
+        return given
+
+
 class ScansSection(Section):
     """Where scans arrive and how they are named."""
 
@@ -367,6 +399,7 @@ class SiteFile(Section):
     """The whole file."""
 
     station: StationSection
+    metadata: MetadataSection = MetadataSection()
     scans: ScansSection
     scanner: ScannerSection = ScannerSection.model_validate({})
     sop: tuple[SopSection, ...] = ()

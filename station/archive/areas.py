@@ -21,6 +21,7 @@ from station.archive.checksums import (
     read_checked_json,
     to_checked_json,
 )
+from station.archive.discovery import time_coverage
 from station.archive.epochs import EpochRef
 from station.archive.netcdf_layout import (
     TIMES_PER_CHUNK,
@@ -63,7 +64,15 @@ class AreaChange:
 def _with_uncertainty(quantity: str, description: str, units: str, comment: str) -> tuple[Variable, ...]:
     """Return the variables of a quantity: value, one sigma, and the bounds of the 95 % interval."""
     return (
-        Variable(quantity, _OVER_TIME, "f8", f"{description} of the area", units, comment=comment),
+        Variable(
+            quantity,
+            _OVER_TIME,
+            "f8",
+            f"{description} of the area",
+            units,
+            comment=comment,
+            ancillary=tuple(f"{quantity}_{bound}" for bound in ("uncertainty", "low", "high")),
+        ),
         Variable(
             f"{quantity}_uncertainty",
             _OVER_TIME,
@@ -140,6 +149,7 @@ def update_areas(
         with netCDF4.Dataset(tmp_path, "w", clobber=False) as file:
             _write(file, series, tuple(areas), size_m2, columns, unchanged)
             file.setncattr(MASKS_ATTRIBUTE, masks)
+            file.setncatts(time_coverage(epochs.start_s[0], columns["time_bnds"][-1, 1]))
         if unchanged:
             with h5py.File(path, "r") as old_file, h5py.File(tmp_path, "r+", libver=LIBVER_COMPAT) as file:
                 copy_unchanged(old_file, file, tuple(columns), unchanged)

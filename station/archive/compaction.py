@@ -37,7 +37,7 @@ from station.archive.series.epoch_reader import (
 )
 from station.archive.series.index import SeriesIndex, list_epochs
 from station.archive.series.manifest import listed_sources
-from station.archive.series.virtual import write_scalars
+from station.archive.series.virtual import write_scalars, write_time_coverage
 
 DAY_CLOSED = timedelta(hours=6)  # after its end; a later scan causes a new revision
 MONTH_CLOSED = timedelta(days=2)
@@ -149,6 +149,7 @@ def write_compacted(
                 if any(spec.name in source.raster_shapes for source in epoch_sources):
                     create_variable(file, spec, series, len(file["time"]))
         with h5py.File(tmp_path, "r+", libver=LIBVER_COMPAT, meta_block_size=METADATA_BLOCK_BYTES) as file:
+            write_time_coverage(file)
             for spec in LARGE_VARIABLES:
                 if spec.name in file:
                     file[spec.name].resize(len(file["time"]), axis=0)

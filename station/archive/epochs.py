@@ -14,6 +14,7 @@ import netCDF4
 import numpy as np
 
 from station.archive.atomic_files import atomic_write
+from station.archive.discovery import time_coverage
 from station.archive.netcdf_layout import Series, create_file, create_variable, decode_text, encode_text
 from station.archive.raster_io import Array, rounded, write_rasters
 from station.archive.schema import BY_NAME, TERMS, VARIABLES, VERDICTS
@@ -222,6 +223,7 @@ def _write(file: netCDF4.Dataset, series: Series, epoch: Epoch, name: str) -> No
     create_file(file, series, title, 1, parameters)
     file["time"][0] = (epoch.start_s + epoch.end_s) / 2
     file["time_bnds"][0] = (epoch.start_s, epoch.end_s)
+    file.setncatts(time_coverage(epoch.start_s, epoch.end_s))
     for variable in _measurement_variables(epoch.measurement):
         create_variable(file, BY_NAME[variable], series, 1)
     if shared is not None:

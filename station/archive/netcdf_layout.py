@@ -11,13 +11,13 @@ import netCDF4
 import numpy as np
 from pyproj import CRS
 
-from station._version import __version__
+from station.archive import discovery
 from station.archive.schema import CHANGE_LENGTH, FILL, TEXT_LENGTH, Variable
 from station.quantities import Grid
 
 CHUNK = 128  # rows and columns of a chunk
 TIMES_PER_CHUNK = 512  # epochs per chunk of a variable that is small per scan, in a file of many epochs
-CONVENTIONS = "CF-1.11"
+CONVENTIONS = "CF-1.11, ACDD-1.3"
 ENCODING = "utf-8"  # of texts; older files declare ascii, a subset
 
 
@@ -32,6 +32,14 @@ class Series:
     vertical_datum: str = ""
     name: str = ""
     institution: str = ""
+    metadata: tuple[tuple[str, str], ...] = ()  # global attributes that the site file gives
+
+    @property
+    def has_ellipsoidal_heights(self) -> bool:
+        """True if heights are above the ellipsoid of the CRS: no geoid and no vertical CRS is named."""
+        if self.crs is None or self.vertical_datum:
+            return False
+        return not CRS.from_user_input(self.crs).is_compound
 
     @property
     def path(self) -> Path:
@@ -65,16 +73,18 @@ def create_file(
 
 
 def write_global_attrs(file: netCDF4.Dataset, series: Series, title: str) -> None:
-    """Write the global attributes: conventions, title, origin, station."""
+    """Write the global attributes: conventions, title, station, origin and extent."""
+    name = series.name or series.station_id
     file.setncatts(
         {
             "Conventions": CONVENTIONS,
             "title": title,
-            "institution": series.institution or "not given",
-            "source": "terrestrial laser scanner, permanently mounted",
-            "history": f"written by station {__version__}",
+            "id": series.station_id,
             "station_id": series.station_id,
-            "station_name": series.name or series.station_id,
+            "station_name": name,
+            **discovery.descriptive_attributes(name, series.institution, dict(series.metadata)),
+            **discovery.extent(series.grid, series.crs),
+            **({"geospatial_bounds_vertical_crs": "EPSG:4979"} if series.has_ellipsoidal_heights else {}),
         }
     )
 
@@ -196,11 +206,11 @@ def create_variable(
         fill_value=fill,
         least_significant_digit=spec.digits,
     )
-    variable.setncatts(attributes(spec, mapped=series.crs is not None))
+    variable.setncatts(attributes(spec, series))
     return variable
 
 
-def attributes(spec: Variable, *, mapped: bool) -> dict[str, Any]:
+def attributes(spec: Variable, series: Series) -> dict[str, Any]:
     """Return the NetCDF attributes of a variable of the schema."""
     attrs: dict[str, Any] = {
         key: getattr(spec, key)
@@ -212,13 +222,25 @@ def attributes(spec: Variable, *, mapped: bool) -> dict[str, Any]:
             attrs[key] = np.array(getattr(spec, key), dtype=spec.dtype)
     if spec.digits is not None:  # netCDF4 writes 64 bits, which classic files cannot hold
         attrs["least_significant_digit"] = np.int32(spec.digits)
-    if spec.is_raster and mapped:
+    attrs["coverage_content_type"] = _content_type(spec)
+    if spec.ancillary:
+        attrs["ancillary_variables"] = " ".join(spec.ancillary)
+    if spec.standard_name == "surface_altitude" and series.has_ellipsoidal_heights:
+        attrs["standard_name"] = "height_above_reference_ellipsoid"
+    if spec.is_raster and series.crs is not None:
         attrs["grid_mapping"] = "crs"
     if spec.standard_name == "air_temperature":
         attrs["units_metadata"] = "temperature: on_scale"
     if spec.dtype == "S1":
         attrs["_Encoding"] = ENCODING
     return attrs
+
+
+def _content_type(spec: Variable) -> str:
+    """Return the ISO 19115 code of what a variable contains."""
+    if spec.flag_meanings or "uncertainty" in spec.name or "covariance" in spec.name:
+        return "qualityInformation"
+    return "physicalMeasurement" if spec.is_raster else "auxiliaryInformation"
 
 
 def encode_text(values: Sequence[str], dim: str) -> np.ndarray[Any, Any]:

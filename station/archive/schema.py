@@ -33,6 +33,7 @@ class Variable:
     flag_masks: tuple[int, ...] = ()
     flag_values: tuple[int, ...] = ()
     flag_meanings: str | None = None
+    ancillary: tuple[str, ...] = ()  # variables that qualify this one
 
     @property
     def is_raster(self) -> bool:
@@ -62,6 +63,7 @@ VARIABLES: tuple[Variable, ...] = (
         None,
         _MEAN,
         _QUANTUM,
+        ancillary=("elevation_spread", "point_count", "quality"),
     ),
     Variable(
         "elevation_change",
@@ -73,6 +75,12 @@ VARIABLES: tuple[Variable, ...] = (
         None,
         _MEAN,
         f"mean height of the points above the reference surface of reference.nc; {_QUANTUM}",
+        ancillary=(
+            "elevation_change_uncertainty",
+            "elevation_change_random_uncertainty",
+            "point_count",
+            "quality",
+        ),
     ),
     Variable(
         "elevation_change_uncertainty",

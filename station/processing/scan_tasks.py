@@ -119,6 +119,10 @@ def series_for(site: Site) -> Series:
         vertical_datum=site.map.vertical_datum,
         name=site.station.name,
         institution=site.station.institution,
+        metadata=(
+            *site.metadata.attributes.items(),
+            ("time_coverage_resolution", f"PT{site.scans.expected_every_s:.0f}S"),
+        ),
     )
 
 

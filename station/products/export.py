@@ -90,7 +90,7 @@ def _write_stac(
         description=f"Elevation change at {site.station.name or series.station_id}, measured by a permanently"
         " mounted laser scanner",
         title=site.station.name or series.station_id,
-        license="other",
+        license=site.metadata.license or "other",
         extent=pystac.Extent(
             pystac.SpatialExtent([bbox or [-180.0, -90.0, 180.0, 90.0]]),
             pystac.TemporalExtent([[min(starts), max(starts)]]),

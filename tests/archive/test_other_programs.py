@@ -18,6 +18,7 @@ from station.archive.areas import AreaChange, update_areas
 from station.archive.compaction import compact
 from station.archive.series.virtual import build_series
 from station.quantities import Reference
+from station.sections import MetadataSection
 
 pytestmark = pytest.mark.integration
 
@@ -51,11 +52,11 @@ def built(series, epoch):
     return build_series(series)
 
 
-def findings(report, *paths):
-    """Return the objections of the CF checker to files: path, check, messages."""
+def findings(report, *paths, convention="cf:1.11"):
+    """Return the objections of the compliance checker to files: path, check, messages."""
     checker = shutil.which("compliance-checker", path=f"{sys.prefix}/bin") or tool("compliance-checker")
     subprocess.run(
-        [checker, "--test=cf:1.11", "--format=json_new", f"--output={report}", *paths],
+        [checker, f"--test={convention}", "--format=json_new", f"--output={report}", *paths],
         capture_output=True,
         check=False,
         timeout=120,
@@ -66,7 +67,7 @@ def findings(report, *paths):
         (path, check["name"], check["msgs"])
         for path, result in results.items()
         for priority in ("high_priorities", "medium_priorities", "low_priorities")
-        for check in result["cf:1.11"][priority]
+        for check in result[convention][priority]
         if check["msgs"]
     ]
 
@@ -74,6 +75,31 @@ def findings(report, *paths):
 def test_compliance_checker_accepts_epoch_series_and_reference(built, tmp_path):
     epoch = built.parent / "epochs/2025/11/21/hef_20251121T010000Z.nc"
     assert findings(tmp_path / "report.json", built, built.parent / "reference.nc", epoch) == []
+
+
+def test_data_discovery_checker_misses_only_what_is_not_computed(series, epoch, tmp_path):
+    """ACDD 1.3. The checker takes projected coordinates for degrees, and wants standard names everywhere."""
+    texts = dict.fromkeys(MetadataSection.model_fields, "text") | {
+        "keywords": ("ice", "laser"),
+        "license": "CC-BY-4.0",
+        "creator_email": "a@example.org",
+        "creator_orcid": "0000-0002-1825-0097",
+        "publisher_email": "b@example.org",
+        "publisher_url": "https://example.org",
+        "doi": "10.5281/zenodo.1",
+    }
+    metadata = (*MetadataSection(**texts).attributes.items(), ("time_coverage_resolution", "PT3600S"))
+    described = dataclasses.replace(series, metadata=metadata, vertical_datum="")
+    epochs.write_epoch(described, epoch(0))
+    found = findings(tmp_path / "report.json", build_series(described), convention="acdd:1.3")
+    of_file = {name: messages for _, name, messages in found if not name.startswith("variable")}
+    missing = of_file.pop("Global Attributes")
+    assert missing == ["geospatial_vertical_min not present", "geospatial_vertical_max not present"]
+    assert set(of_file) == {"geospatial_lat_extents_match", "geospatial_lon_extents_match"}
+    of_variables = {
+        message for _, name, messages in found if name.startswith("variable") for message in messages
+    }
+    assert of_variables <= {"standard_name", "units"}
 
 
 def test_compliance_checker_accepts_compacted_files(built, series, tmp_path):

@@ -14,6 +14,7 @@ import netCDF4
 import numpy as np
 
 from station.archive.atomic_files import atomic_write
+from station.archive.discovery import time_coverage
 from station.archive.epochs import list_files
 from station.archive.netcdf_layout import TIMES_PER_CHUNK, Series, attributes, create_file, create_variable
 from station.archive.schema import FILL, Variable
@@ -127,6 +128,13 @@ def write_scalars(
         variable[first:count] = values
 
 
+def write_time_coverage(file: Any) -> None:  # noqa: ANN401 - h5py has no types
+    """Write from when to when the epochs of a file extend, after they were written."""
+    bounds_s = file["time_bnds"]
+    for name, value in time_coverage(float(bounds_s[0, 0]), float(bounds_s[-1, 1])).items():
+        file.attrs[name] = np.bytes_(value)
+
+
 def _parameter_indices(source: EpochSource, parameters: Parameters) -> list[int]:
     """Return the indices of the shared parameters of a source among all parameters (p,)."""
     if source.parameters is parameters:  # nearly always, when a series grows
@@ -145,6 +153,7 @@ def _link_rasters(
 
     Uses h5py's low-level API, because the high-level API dominates the time for a hundred files.
     """
+    write_time_coverage(file)
     paths = [str(source.path.relative_to(series.folder)).encode() for source in epoch_sources]
     spaces: dict[tuple[object, ...], list[tuple[Any, Any]]] = {}  # the same for all rasters
     for spec in LARGE_VARIABLES:
@@ -205,7 +214,7 @@ def _write_raster_attrs(dataset: Any, file: Any, spec: Variable, series: Series)
     """Write dimensions and attributes of a virtual dataset the way netCDF expects them."""
     for axis, dim in enumerate(spec.dims):
         dataset.dims[axis].attach_scale(file[dim])
-    for key, value in attributes(spec, mapped=series.crs is not None).items():
+    for key, value in attributes(spec, series).items():
         dataset.attrs[key] = np.bytes_(value) if isinstance(value, str) else value
     if spec.dtype[0] == "f":
         dataset.attrs["_FillValue"] = np.array([FILL], dtype=spec.dtype)
