@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import xarray as xr
 from support.epochs import GRID, make_epoch
+from support.series import without_dates
 
 import station
 from station.archive import epochs
@@ -32,10 +33,7 @@ def compact_and_build(series, now, progress=lambda: None):
 
 def values(series):
     with station.open(series.folder) as dataset:
-        loaded = dataset.load()
-    for name in ("date_created", "history"):  # when the file was written
-        del loaded.attrs[name]
-    return loaded
+        return without_dates(dataset.load())
 
 
 @pytest.fixture(scope="module")

@@ -51,10 +51,13 @@ def growing(series):
     return small, update
 
 
+WHEN_WRITTEN = {"_NCProperties", "date_created", "history"}
+
+
 def file_contents(path):
     """Return values, types, chunks, attributes and virtual sources of all variables of a file."""
     with h5py.File(path) as file:
-        attributes = {key: str(value) for key, value in file.attrs.items() if key != "_NCProperties"}
+        attributes = {key: str(value) for key, value in file.attrs.items() if key not in WHEN_WRITTEN}
         return {name: describe(dataset) for name, dataset in file.items()} | {"attributes": attributes}
 
 
