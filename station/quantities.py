@@ -219,7 +219,7 @@ class VarianceComponents:
     range_bias_m: float = 0.004
     range_scale_ppm: float = 0.8
     refraction: float = 0.08
-    refraction_moving: float = 0.02
+    refraction_moving: float = 0.05
     refraction_by_azimuth: float = 0.02
     tilt_drift_rad: float = radians(0.0018)
     tilt_jitter_rad: float = radians(0.0010)
@@ -234,6 +234,7 @@ class Quality(IntFlag):
     OUTSIDE_REFERENCE = 4  # observed, but without a reference to measure change from
     STABLE_GROUND = 8
     CHANGE_SIGNIFICANT = 16  # at the 95 % level
+    BARE_GROUND = 64  # not known to be stable, but as dark as stable ground: rock, not ice or snow
 
 
 ROWS_PER_BLOCK = 32  # of the grid: few enough to stay in the processor's cache

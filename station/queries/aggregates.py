@@ -239,7 +239,7 @@ class Aggregates:
             return None
         grid, (row, column) = self._series.grid, np.nonzero(common_cells)
         holdout = ground_classes.is_holdout(grid.x_m[column], grid.y_m[row])
-        stable_ground = _stable_ground(epoch_cells.epoch, common_cells)
+        stable_ground = _has_quality(epoch_cells.epoch, common_cells, Quality.STABLE_GROUND)
         smooth = np.hypot(*jacobian.pose[3:5]) < ground_classes.MAX_MOVING_SLOPE
         ground_class = ground_classes.classify(stable_ground, holdout, smooth, np.zeros_like(stable_ground))
         random_m2 = independent_m2 + epoch_cells.reference.random_variance_m2[common_cells]
@@ -307,10 +307,8 @@ class Aggregates:
         window_m = elevation_m[rows, columns]
         window_grid = Grid(*corner_m, grid.cell_m, window_m.shape[1], window_m.shape[0])
         gradient = smooth_gradient(window_m, grid.cell_m)
-        stable = _stable_ground(epoch_cells.epoch, cells)
-        return cell_jacobian(
-            params, window_grid, position_m, window_m, gradient, cells[rows, columns], stable
-        )
+        rock = _has_quality(epoch_cells.epoch, cells, Quality.STABLE_GROUND | Quality.BARE_GROUND)
+        return cell_jacobian(params, window_grid, position_m, window_m, gradient, cells[rows, columns], rock)
 
     def read_cells(self, epoch: EpochRef, cells: Bools) -> EpochCells:
         """Return the data of an epoch at the selected cells (ny, nx); raise ValueError on another grid."""
@@ -397,11 +395,11 @@ def observed_in_all(epochs: list[EpochCells], cells: Bools) -> Bools:
     return observed
 
 
-def _stable_ground(epoch: EpochRef, cells: Bools) -> Bools:
-    """Return True for selected cells (n,) that are stable ground in an epoch."""
+def _has_quality(epoch: EpochRef, cells: Bools, flags: Quality) -> Bools:
+    """Return True for selected cells (n,) that have any of the flags in an epoch."""
     with netCDF4.Dataset(epoch.path) as file:
         quality = read_cells_of(file["quality"], epoch.index, cells).astype(np.int64)
-    return np.asarray((quality & Quality.STABLE_GROUND) > 0)
+    return np.asarray((quality & flags) > 0)
 
 
 def read_cells_of(variable: Any, index: int, cells: Bools) -> Floats:  # noqa: ANN401 - netCDF4 has no types

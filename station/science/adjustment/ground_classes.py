@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from station.quantities import Bools, Floats, Floats32, Ints
+from station.quantities import Bools, Floats, Floats32, Ints, Reals
 from station.science.adjustment.patches import GroundClass
 from station.science.geometry.terrain import smooth_gradient
 
@@ -24,6 +24,11 @@ BRIGHT_SNOW_RATIOS = (0.5, 1.25)
 DARK_SNOW_RATIOS = (0.55, 1 / 0.55)
 MAX_GAIN_CHANGE = 0.15  # of the receiver, usually 5 % from scan to scan; beyond, the ground has changed
 MIN_GAIN_CELLS = 50
+# At 1064 nm ice and snow reflect 0.5 to 0.9 of the light, rock 0.2 to 0.3 (Deems et al., 2013; Warren, 1982).
+ICE_RATIO = 1.5  # of the brightness of ice or snow to that of rock, and of dark snow the inverse
+ICE_RANGE_M = 500.0  # rings within which brightness is compared: it may fall with the distance
+MIN_COS = 0.05  # of the incidence; rough ground is not seen at less
+MIN_ICE_SHARE = 0.2  # of moving ground; if less of it looks like ice, brightness does not tell ice from rock
 NOISE_CLASS_RANGE_M = 500.0
 NOISE_CLASS_SLOPE = 0.25
 
@@ -92,6 +97,61 @@ def snow_test(intensity: Floats32, reference: Floats32, wavelength_um: float) ->
     ratio = ratio[np.isfinite(ratio)]
     gain = float(np.median(ratio)) if len(ratio) >= MIN_GAIN_CELLS else 1.0
     return SnowTest(gain if abs(gain - 1) <= MAX_GAIN_CHANGE else 1.0, ratios)
+
+
+@dataclass(frozen=True)
+class RockBrightness:
+    """Median brightness of stable ground by ring of range (k,); NaN in rings with too few cells.
+
+    With `lambertian` it is that of perpendicular incidence, and brightness falls with the cosine.
+    """
+
+    by_ring: Floats
+    lambertian: bool
+    snow_is_dark: bool
+
+    def resembles(self, intensity: Floats32, range_m: Reals, cos_incidence: Reals) -> Bools:
+        """Return True for cells (n,) that are no brighter than rock, or no darker where snow is dark.
+
+        Cells of unknown brightness do not.
+        """
+        ring = np.minimum((range_m / ICE_RANGE_M).astype(np.int64), len(self.by_ring) - 1)
+        rock = self.by_ring[ring] * (np.maximum(cos_incidence, MIN_COS) if self.lambertian else 1.0)
+        return np.asarray(intensity > rock / ICE_RATIO if self.snow_is_dark else intensity < rock * ICE_RATIO)
+
+
+def rock_brightness(
+    intensity: Floats32,
+    range_m: Reals,
+    cos_incidence: Reals,
+    stable: Bools,
+    moving: Bools,
+    wavelength_um: float,
+) -> RockBrightness:
+    """Return the brightness of rock, from cells (n,) of stable ground.
+
+    Their own brightness tells whether it falls with the cosine of the incidence, by Lambert's law, or is
+    corrected for it. That of rock is unknown where too little of the moving ground looks otherwise: then it
+    may all be ice under debris.
+    """
+    ring = (range_m / ICE_RANGE_M).astype(np.int64)
+    known = stable & (intensity > 0)
+    log_cos, log_intensity = np.log(np.maximum(cos_incidence[known], MIN_COS)), np.log(intensity[known])
+    count = np.maximum(np.bincount(ring[known]), 1)
+    log_cos, log_intensity = (
+        values - (np.bincount(ring[known], values) / count)[ring[known]]
+        for values in (log_cos, log_intensity)
+    )
+    lambertian = bool(log_cos @ log_intensity > 0.5 * (log_cos @ log_cos))
+    normal = intensity / np.maximum(cos_incidence, MIN_COS) if lambertian else intensity
+    by_ring = np.full(int(ring.max(initial=0)) + 1, np.nan)
+    for index in np.flatnonzero(np.bincount(ring[known]) >= MIN_GAIN_CELLS):
+        by_ring[index] = float(np.median(normal[known & (ring == index)]))
+    rock = RockBrightness(by_ring, lambertian, wavelength_um >= DARK_SNOW_UM)
+    compared = moving & np.isfinite(intensity * by_ring[ring])
+    like_rock = rock.resembles(*(values[compared] for values in (intensity, range_m, cos_incidence)))
+    is_distinct = compared.any() and 1 - like_rock.mean() >= MIN_ICE_SHARE
+    return rock if is_distinct else replace(rock, by_ring=np.full_like(by_ring, np.nan))
 
 
 def _ratio(intensity: Floats32, reference: Floats32) -> Floats32:

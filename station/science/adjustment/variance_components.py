@@ -13,6 +13,7 @@ from station.science.adjustment.prior import LineTimes, tilt_correlations, tilt_
 from station.science.uncertainty.parameters import GLOBAL, ParameterLayout
 
 PRIOR_SCANS = 8  # weight of the start values, in scans
+ICE_PRIOR_SCANS = 2  # of `refraction_moving`: from site to site it differs tenfold (Hirt et al., 2010)
 EM_STEPS = 10
 MOUNT_CREEP_RAD, MOUNT_CREEP_M = math.radians(0.005), 0.001  # in a day, growing with the root of time
 UNUSUAL_SIGMAS = 3.0  # of the usual motion
@@ -56,8 +57,9 @@ def estimate_variance_components(
     second_moment, tilt_moment = second_moment / (count - 1), tilt_moment / count
 
     def shrunk_sigma(name: str, variance: float) -> float:
-        scan_count = count + PRIOR_SCANS
-        return math.sqrt((variance * count + getattr(start, name) ** 2 * PRIOR_SCANS) / scan_count)
+        prior_scans = ICE_PRIOR_SCANS if name == "refraction_moving" else PRIOR_SCANS
+        total = variance * count + getattr(start, name) ** 2 * prior_scans
+        return math.sqrt(total / (count + prior_scans))
 
     variances = {name: float(second_moment[columns].mean()) for name, columns in COMPONENT_SLICES.items()}
     variances["refraction_by_azimuth"] = float(second_moment[last : last + params.refraction_knots].mean())

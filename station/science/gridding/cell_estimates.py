@@ -312,6 +312,7 @@ class CellEstimator:
         flags = Quality.FEW_POINTS * (sums.count < FEW_POINTS).view(np.uint8)
         flags |= Quality.HIGH_INCIDENCE * sector.in_class(CellClass.GRAZING).view(np.uint8)
         flags |= Quality.CHANGE_SIGNIFICANT * significance.significant(change_m, sigma_m).view(np.uint8)
+        flags |= Quality.BARE_GROUND * sector.in_class(CellClass.BARE).view(np.uint8)
         if self.snow_test is not None:
             changed = self.snow_test.changed(
                 sums.intensity(), viewing.intensity(cell_index), sector.in_class(CellClass.STEEP)

@@ -75,6 +75,7 @@ class CellClass(IntFlag):
     STEEP = 16  # above 50°: sheds its snow
     ENCLOSED = 32  # all cells around it are known
     EVEN = 64  # of so little roughness that a tilt of the scanner has the expected effect
+    BARE = 128  # not stable, but as bright as stable ground: rock, not ice or snow
 
 
 @dataclass(frozen=True)
@@ -207,7 +208,7 @@ class ViewingGeometry:
             sector.east_gradient,
             sector.north_gradient,
             sector.knot_position,
-            sector.in_class(CellClass.STABLE),
+            sector.in_class(CellClass.STABLE | CellClass.BARE),
         )
 
     def observation(self, sector: AzimuthSector) -> Observation:
@@ -255,6 +256,8 @@ def compute_viewing_geometry(
         for name, values in arrays.items():
             cells[name][first:end] = values
         first = end
+    if position_m is not None:
+        _mark_bare(cells, grid, position_m, surface.datum_m, scanner.wavelength_um)
     is_stable = (cells["cell_class"] & np.uint8(CellClass.STABLE)) > 0
     sampled, sampling_step = _sampled(grid, cells["cell"], is_stable, _well_sampled(cells["cell_class"]))
     if params is None:  # any small blocks will do
@@ -361,6 +364,35 @@ def _cells(
         "cell_class": cell_class,
         "noise_class": noise_class,
     }
+
+
+def _mark_bare(
+    cells: dict[str, Array], grid: Grid, position_m: Position, datum_m: float, wavelength_um: float
+) -> None:
+    """Add the class `BARE` to cells that are as bright as the stable ground at their range."""
+
+    def brightness(block: slice) -> tuple[Floats32, Reals, Reals]:
+        row, column = grid.row_and_column(cells["cell"][block])
+        observation = Observation.from_points(
+            (grid.x_m[column], grid.y_m[row], cells["height_m"][block] + datum_m),
+            position_m,
+            cells["east_gradient"][block],
+            cells["north_gradient"][block],
+        )
+        range_m = np.hypot(*observation.offset_m[:2])
+        return cells["intensity"][block], range_m, observation.cos_incidence
+
+    count = len(cells["cell"])
+    sample = visibility_step(count)
+    stable, smooth = (
+        (cells["cell_class"][sample] & np.uint8(flag)) > 0 for flag in (CellClass.STABLE, CellClass.SMOOTH)
+    )
+    rock = ground_classes.rock_brightness(*brightness(sample), stable, smooth & ~stable, wavelength_um)
+    for first in range(0, count, MAX_VISIBILITY_CELLS):
+        block = slice(first, first + MAX_VISIBILITY_CELLS)
+        cell_class = cells["cell_class"][block]
+        bare = rock.resembles(*brightness(block)) & ((cell_class & np.uint8(CellClass.STABLE)) == 0)
+        cell_class |= np.where(bare, np.uint8(CellClass.BARE), np.uint8(0))
 
 
 def sampling_ratio(roughness_m: Reals, cell_m: float, cos_incidence: Reals) -> Reals:

@@ -1,7 +1,7 @@
 """Jacobian of cell heights with respect to the parameters that all points of a scan share.
 
-Ten global parameters apply to all points, but for one: the refraction of paths to moving ground, in excess of
-that of paths to stable ground. Three more depend on azimuth: tilt along the line of sight (knots
+Ten global parameters apply to all points, but for one: the refraction of paths to ice and snow, in excess of
+that of paths to rock. Three more depend on azimuth: tilt along the line of sight (knots
 every 1°), refraction and tilt across the line of sight (knots every 5°). The Jacobian of a cell's height is
 analytic in the cell's position and the terrain gradient, so it is never stored. These functions and the
 covariance stored with an epoch give the uncertainty of a cell, a box, a volume or a difference.
@@ -204,12 +204,13 @@ def height_jacobian(
     east_gradient: Reals,
     north_gradient: Reals,
     knot_position: Reals | None = None,
-    stable: Bools | None = None,
+    rock: Bools | None = None,
 ) -> HeightJacobian:
     """Return the Jacobian of the heights of cells at `offset_m` (each (n,)) from the scanner.
 
-    `knot_position` (n,) skips its computation where it is known already. `stable` (n,) marks stable ground;
-    by default all ground is moving. Signs: scanner state minus assumed state. Source: equations.md, 6.1.
+    `knot_position` (n,) skips its computation where it is known already. `rock` (n,) marks ground that
+    is no ice or snow; by default there is none. Signs: scanner state minus assumed state.
+    Source: equations.md, 6.1.
     """
     x_m, y_m, z_m = offset_m
     horizontal_m2 = x_m**2 + y_m**2  # np.hypot takes five times as long
@@ -241,7 +242,7 @@ def height_jacobian(
                 normal_m / np.sqrt(np.maximum(range_m2, 1e-12)),
                 normal_m * 1e-6,
                 refraction_m,
-                refraction_m * (True if stable is None else ~stable),
+                refraction_m * (True if rock is None else ~rock),
             ]
         ),
         sight_tilt=-rise_m,
@@ -258,11 +259,11 @@ def cell_jacobian(
     elevation_m: Floats | Floats32,
     gradient: tuple[Floats32, Floats32],
     selection: Bools,
-    stable: Bools | None = None,
+    rock: Bools | None = None,
 ) -> HeightJacobian:
     """Return the Jacobian of the heights of the selected cells (ny, nx) of a surface, in row-major order.
 
-    `stable` (n,) marks those of stable ground; by default all ground is moving.
+    `rock` (n,) marks those that are no ice or snow; by default there are none.
     """
     row, column = np.nonzero(selection)
     east, north = (np.nan_to_num(component[row, column].astype(np.float64)) for component in gradient)
@@ -271,7 +272,7 @@ def cell_jacobian(
         grid.y_m[row] - position_m[1],
         elevation_m[row, column].astype(np.float64) - position_m[2],
     )
-    return height_jacobian(params, offset_m, east, north, stable=stable)
+    return height_jacobian(params, offset_m, east, north, rock=rock)
 
 
 def sight_tilt_of(azimuth_rad: Floats) -> Floats:

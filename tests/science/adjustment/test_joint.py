@@ -83,7 +83,7 @@ class Sites:
 
     def jacobian(self, params=PARAMS):
         stable = np.full(len(self.line), self.stable)
-        return height_jacobian(params, self.offset_m, self.east, self.north, stable=stable)
+        return height_jacobian(params, self.offset_m, self.east, self.north, rock=stable)
 
     def patches(self, residual_m, sigma_m=0.01, ground_class=GroundClass.STABLE, params=PARAMS):
         count = len(self.line)

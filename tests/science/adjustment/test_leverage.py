@@ -53,7 +53,7 @@ def random_sites(seed):
     )
     slopes = rng.uniform(-0.5, 0.5, (2, PATCH_COUNT))
     stable = np.full(PATCH_COUNT, True)
-    return height_jacobian(PARAMS, offset_m, *slopes, stable=stable), range_bin, offset_m[2]
+    return height_jacobian(PARAMS, offset_m, *slopes, rock=stable), range_bin, offset_m[2]
 
 
 def make_patches(residual_m, ground_class, sampling_step=(1, 1)):

@@ -32,7 +32,7 @@ def make_patches(seed, change_m):
     )
     stable = np.arange(COUNT) < STABLE
     offset_m = range_m * np.sin(azimuth), range_m * np.cos(azimuth), height_m
-    jacobian = height_jacobian(PARAMS, offset_m, *rng.uniform(-0.3, 0.3, (2, COUNT)), stable=stable)
+    jacobian = height_jacobian(PARAMS, offset_m, *rng.uniform(-0.3, 0.3, (2, COUNT)), rock=stable)
     residual_m = rng.normal(0, SIGMA_M, COUNT) + np.where(stable, 0.0, change_m)
     ground_class = np.where(stable, GroundClass.STABLE, GroundClass.MOVING).astype(np.int64)
     variance_m2, cells = np.full(COUNT, SIGMA_M**2), np.full(COUNT, 20.0)

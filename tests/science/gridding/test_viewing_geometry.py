@@ -86,6 +86,17 @@ def test_ground_above_50_degrees_is_steep(slope_deg, steep):
     assert len(viewing.select(CellClass.STEEP)) == (GRID.nx * GRID.ny if steep else 0)
 
 
+def test_bare_ground_is_off_the_stable_ground_and_as_dark_as_it():
+    ice = np.add.outer(np.arange(GRID.ny) // 20, np.arange(GRID.nx) // 20) % 3 == 0
+    intensity = np.where(ice & ~STABLE, 0.6, 0.25).astype(np.float32)
+    viewing = compute_viewing_geometry(replace(plane(), intensity=intensity), STABLE, VZ6000, POSITION_M)
+    bare = viewing.cells["cell"][viewing.select(CellClass.BARE)]
+    assert np.array_equal(np.sort(bare), np.flatnonzero(KNOWN & ~ice & ~STABLE))
+    moving_column = np.concatenate([viewing.jacobian(sector).pose[9] for _, sector in viewing.sectors()])
+    at_ice = np.flatnonzero(moving_column)
+    assert np.array_equal(np.sort(viewing.cells["cell"][at_ice]), np.flatnonzero(KNOWN & ice & ~STABLE))
+
+
 @pytest.mark.parametrize("max_moving", [3000, 9000])
 def test_adjustment_uses_a_sample_of_very_many_cells(monkeypatch, max_moving):
     all_arrays = all_cells(
@@ -131,7 +142,11 @@ def test_single_precision_suffices_for_the_jacobian():
             assert single.sight_tilt.dtype == np.float32
             observation = viewing.observation(sector)
             double = height_jacobian(
-                params, observation.offset_m, observation.east_gradient, observation.north_gradient
+                params,
+                observation.offset_m,
+                observation.east_gradient,
+                observation.north_gradient,
+                rock=sector.in_class(CellClass.STABLE),
             )
             assert np.sqrt(single.variance(shared)) == pytest.approx(
                 np.sqrt(double.variance(shared)), rel=1e-3
