@@ -12,7 +12,8 @@ from station.quantities import Floats, VarianceComponents
 from station.science.adjustment.prior import LineTimes, tilt_correlations, tilt_covariance
 from station.science.uncertainty.parameters import GLOBAL, ParameterLayout
 
-PRIOR_SCANS = 8  # weight of the start values, in scans
+INITIAL = VarianceComponents()
+PRIOR_SCANS = 8  # weight of the initial values, in scans
 ICE_PRIOR_SCANS = 2  # of `refraction_moving`: from site to site it differs tenfold (Hirt et al., 2010)
 EM_STEPS = 10
 MOUNT_CREEP_RAD, MOUNT_CREEP_M = math.radians(0.005), 0.001  # in a day, growing with the root of time
@@ -34,9 +35,9 @@ def estimate_variance_components(
 ) -> VarianceComponents:
     """Return the variance components shown by estimates (u,) and covariances (u, u) of several scans.
 
-    Each variance is the mean of estimate squared plus posterior variance, shrunk towards its start value as
+    Each variance is the mean of estimate squared plus posterior variance, shrunk towards its initial value as
     if that came from `PRIOR_SCANS` scans. The tilt components differ in their correlation in time and are
-    separated by expectation-maximisation. With fewer than two scans the start values are returned.
+    separated by expectation-maximisation from `start`, which is returned with fewer than two scans.
     """
     first, last = len(GLOBAL), len(GLOBAL) + params.line_groups
     tilt_slice = slice(first, last)
@@ -58,7 +59,7 @@ def estimate_variance_components(
 
     def shrunk_sigma(name: str, variance: float) -> float:
         prior_scans = ICE_PRIOR_SCANS if name == "refraction_moving" else PRIOR_SCANS
-        total = variance * count + getattr(start, name) ** 2 * prior_scans
+        total = variance * count + getattr(INITIAL, name) ** 2 * prior_scans
         return math.sqrt(total / (count + prior_scans))
 
     variances = {name: float(second_moment[columns].mean()) for name, columns in COMPONENT_SLICES.items()}
