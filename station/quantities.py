@@ -234,6 +234,7 @@ class Quality(IntFlag):
     OUTSIDE_REFERENCE = 4  # observed, but without a reference to measure change from
     STABLE_GROUND = 8
     CHANGE_SIGNIFICANT = 16  # at the 95 % level
+    NOT_SEEN = 32  # no points, or fewer than grid.min_points; set when an epoch is written
 
 
 ROWS_PER_BLOCK = 32  # of the grid: few enough to stay in the processor's cache

@@ -256,6 +256,14 @@ VARIABLES: tuple[Variable, ...] = (
         "1",
     ),
     Variable("coverage", ("time",), "f8", "share of the grid's cells with points", "1"),
+    Variable(
+        "valid_count",
+        ("time",),
+        "f8",
+        "number of cells with a value of elevation_change",
+        "1",
+        comment="as written; if elevation_change has fewer, files that it is read from are missing",
+    ),
     Variable("stable_count", ("time",), "f8", "number of hold-out cells of stable ground", "1"),
     Variable("stable_median", ("time",), "f8", "median change on hold-out stable ground", "m"),
     Variable(

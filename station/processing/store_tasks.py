@@ -16,7 +16,7 @@ from station.archive.series.virtual import build_series
 from station.config import Site
 from station.errors import StoreError
 from station.inbox.file_hash import sha256_file
-from station.processing.scan_tasks import Progress, load_areas, series_for
+from station.processing.scan_tasks import Progress, load_area_polygons, load_areas, series_for
 from station.queries.aggregates import Aggregates
 
 Checksums = dict[str, str]  # SHA-256 by file, relative to the data folder
@@ -40,7 +40,7 @@ def update_series(site: Site, progress: Progress) -> int:
     build_series(series)
     progress()
     try:
-        update_areas(series, load_areas(site), Aggregates(series), progress)
+        update_areas(series, load_areas(site), Aggregates(series), progress, load_area_polygons(site))
     except (OSError, RuntimeError) as error:
         raise StoreError(f"{series.folder}: an epoch is damaged: {error}") from error
     return compaction.count_compactable(series)

@@ -11,6 +11,7 @@ from datetime import UTC, datetime
 
 import numpy as np
 import pytest
+import shapely
 import xarray as xr
 
 from station.archive import epochs, reference_files
@@ -184,6 +185,24 @@ def areas_file(series, epoch):
 
 def test_compliance_checker_accepts_areas(areas_file, tmp_path):
     assert findings(tmp_path / "report.json", areas_file) == []
+
+
+def test_compliance_checker_accepts_outlines_of_areas(areas_file, series, tmp_path):
+    """Version 6.1 wants the dimension of the nodes in the data, and polygons of one ring (against CF 7.5)."""
+    part = shapely.box(632_100, 5_185_000, 632_300, 5_185_400) - shapely.box(
+        632_150, 5_185_100, 632_200, 5_185_200
+    )
+    outlines = {"Süd": part | shapely.box(632_400, 5_185_000, 632_500, 5_185_100), "unobserved": part}
+    everywhere = np.ones(series.grid.shape, bool)
+    masks = {"Süd": everywhere, "unobserved": np.tri(*series.grid.shape, dtype=bool)}
+    update_areas(series, masks, ConstantAggregator(), lambda: None, outlines)
+    found = {
+        message for *_, messages in findings(tmp_path / "report.json", areas_file) for message in messages
+    }
+    wrong = "does not include geometry dimension", "must have the same single dimension as interior ring"
+    assert {message for message in found if not any(text in message for text in wrong)} == set()
+    shown = run(tool("cdo"), "infon", areas_file).stderr
+    assert "warning" not in "".join(line for line in shown.splitlines() if "skipped" not in line).lower()
 
 
 def test_ncdump_prints_times_names_and_missing_values_of_areas(areas_file):

@@ -114,7 +114,7 @@ def test_a_damaged_chunk_raises_an_error(copied):
 def test_read_column_equals_h5py(stored, tmp_path):
     with h5py.File(stored.path) as file:
         columns = [dataset for dataset in file.values() if dataset.chunks and len(dataset) == len(HOURS)]
-        assert {"epoch_file", "time", "verdict", "point_total"} <= {column.name[1:] for column in columns}
+        assert {"epoch_file", "verdict", "point_total"} <= {column.name[1:] for column in columns}
         for column in columns:
             assert read_column(column).dtype == column.dtype
             assert np.array_equal(read_column(column), column[:])

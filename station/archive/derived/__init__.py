@@ -1,0 +1,1 @@
+"""Parts of files that are computed from the epochs: fingerprints, outlines of areas."""
