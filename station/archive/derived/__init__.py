@@ -1,1 +1,1 @@
-"""Parts of files that are computed from the epochs: fingerprints, outlines of areas."""
+"""Files that are computed from the epochs, and parts of them: fingerprints, outlines of areas, boxes."""
