@@ -60,6 +60,11 @@ class Blocks:
         return np.asarray(self.count > 0)
 
     @property
+    def parameters(self) -> tuple[str, ...]:
+        """Names of the shared parameters; they depend on the position of the scanner."""
+        return () if self.cells.shared is None else self.cells.shared.names
+
+    @property
     def shared(self) -> SharedParameters | None:
         """Shared parameters relative to the reference."""
         own, reference = self.cells.shared, self.cells.reference.shared
@@ -100,11 +105,13 @@ class BlockQueries:
     def daily_mean(self, epochs: Sequence[EpochRef]) -> Rasters:
         """Return the rasters of `daily.nc` of the epochs of a day, which have one reference.
 
-        Every epoch in which a block was observed has the same weight. The errors of the reference, and those
-        that similar change causes, are common to all epochs. Blocks that some epochs did not observe get the
-        mean covariance of the day.
+        Every epoch in which a block was observed has the same weight, except those with other shared
+        parameters than the last, which are left out. The errors of the reference, and those that similar
+        change causes, are common to all epochs. Blocks that some epochs did not observe get the mean
+        covariance of the day.
         """
         day = [self._read(epoch) for epoch in epochs]
+        day = [blocks for blocks in day if blocks.parameters == day[-1].parameters]
         epoch_count = np.sum([blocks.observed for blocks in day], axis=0)
         seen, count = epoch_count > 0, np.maximum(epoch_count, 1)
         change_m, random_m2, reference_m2, cells = (
@@ -200,10 +207,10 @@ class BlockQueries:
 def mean_covariances(day: Sequence[Blocks]) -> tuple[SharedParameters | None, SharedParameters | None]:
     """Return the mean covariance of the shared parameters of epochs, and the mean of that between two epochs.
 
-    Both as shared parameters relative to the reference; None if an epoch has none, or is of another position.
+    Both as shared parameters relative to the reference; None if the epochs have none.
     """
     known = [params for params in (blocks.shared for blocks in day) if params is not None]
-    if len(known) < len(day) or any(params.names != known[0].names for params in known):
+    if not known:
         return None, None
     single = replace(
         known[-1],

@@ -13,7 +13,7 @@ from station.archive import epochs
 from station.archive.derived.fingerprints import is_intact
 from station.archive.netcdf_layout import Series
 from station.archive.reference_files import write_reference
-from station.archive.series.index import SeriesIndex
+from station.archive.series.index import SeriesIndex, list_epochs
 from station.archive.series.virtual import build_series
 from station.quantities import Grid, Measurement, Quality, Reference
 from station.queries.blocks import BlockQueries, update_boxes
@@ -170,6 +170,24 @@ def test_only_new_epochs_are_computed_and_the_result_is_that_of_a_new_file(store
     update_boxes(stored, BlockQueries(stored), lambda: None)
     for name, old in zip(("boxes.nc", "daily.nc"), grown, strict=True):
         xr.testing.assert_equal(read(stored, name), old)
+
+
+@pytest.mark.parametrize(
+    ("with_parameters", "expected"), [((False, True, True), 2), ((True, True, False), 1)]
+)
+def test_a_daily_mean_is_of_epochs_with_the_same_shared_parameters(tmp_path, with_parameters, expected):
+    """Otherwise the systematic error of some epochs would be missing."""
+    series = Series(tmp_path, "hef", GRID, "EPSG:32632")
+    write_reference(series, reference())
+    for hour, known in zip((1, 5, 20), with_parameters, strict=True):
+        epoch = make_epoch(hour)
+        epochs.write_epoch(series, epoch if known else replace(epoch, shared=None, scalars={}))
+    rasters = BlockQueries(series).daily_mean(list_epochs(series))
+    assert rasters["epoch_count"].max() == expected
+    has_systematic = np.nanmax(
+        rasters["elevation_change_uncertainty"] - rasters["elevation_change_random_uncertainty"]
+    )
+    assert (has_systematic > 1e-3) == (expected == 2)
 
 
 def test_a_damaged_file_is_computed_again(stored):
