@@ -17,7 +17,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from datetime import UTC, datetime, timedelta
 from itertools import groupby
@@ -33,9 +33,11 @@ from scipy import ndimage
 from benchmarks.process_cost import cpu_of, family, peak_of
 from station.archive import compaction, epochs
 from station.archive.areas import AreaChange, update_areas
+from station.archive.derived.boxes import Rasters
 from station.archive.netcdf_layout import Series, encode_text
 from station.archive.reference_files import write_reference
 from station.archive.series.epoch_reader import EpochSource, read_source
+from station.archive.series.index import SeriesIndex
 from station.archive.series.lazy import open_series
 from station.archive.series.virtual import build_series
 from station.config import Site, read_site
@@ -46,6 +48,7 @@ from station.processing.previews import PreviewRecorder
 from station.processing.scan_tasks import StoredResult, load_areas, series_for
 from station.processing.store_tasks import update_series
 from station.quantities import Bools, Grid, Measurement, Reference, SharedParameters
+from station.queries.blocks import BlockQueries, update_boxes
 from station.science.uncertainty.parameters import parameter_layout
 from station.service.publishing import publish
 
@@ -199,6 +202,7 @@ def fill(
         )
     build_series(series)
     update_areas(series, load_areas(site), _InstantAggregator(), lambda: None)
+    update_boxes(series, _RepeatedBlocks(series), lambda: None)
     update_series(site, lambda: None)
     for _ in range(PAGE_UPDATES):
         publish(site, None, lambda: None)
@@ -223,6 +227,24 @@ class _InstantAggregator:
         """Return a change that depends on the time only."""
         value_m = epoch.time_s % 1e5 / 1e5 + cells[0, 0]
         return AreaChange(value_m, 0.01, value_m, 0.01, 1.0)
+
+
+class _RepeatedBlocks(BlockQueries):
+    """Blocks of the newest epoch, for all epochs and days."""
+
+    def __init__(self, series: Series) -> None:
+        """Read the newest epoch."""
+        super().__init__(series)
+        newest = SeriesIndex(series)[-1]
+        self._boxes, self._mean = super().boxes(newest), super().daily_mean([newest])
+
+    def boxes(self, epoch: epochs.EpochRef) -> Rasters:  # noqa: ARG002 - all epochs are alike
+        """Return the boxes of the newest epoch."""
+        return self._boxes
+
+    def daily_mean(self, day: Sequence[epochs.EpochRef]) -> Rasters:  # noqa: ARG002
+        """Return the blocks of the newest epoch."""
+        return self._mean
 
 
 def _closed_periods(starts: list[datetime]) -> Iterator[tuple[str, str, list[datetime]]]:

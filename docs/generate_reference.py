@@ -20,6 +20,7 @@ from pydantic_core import PydanticUndefined
 import station
 from station import errors
 from station.archive.areas import AREA_VARIABLES
+from station.archive.derived.boxes import DAILY_VARIABLES
 from station.archive.schema import VARIABLES
 from station.cli import app
 from station.sections import Section, SiteFile
@@ -228,6 +229,7 @@ def _variables() -> str:
     for heading, variables in (
         ("`series.nc` and the epoch files", VARIABLES),
         ("`areas.nc`", AREA_VARIABLES),
+        ("`boxes.nc` and `daily.nc`", DAILY_VARIABLES),
     ):
         rows = [
             (

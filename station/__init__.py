@@ -19,17 +19,23 @@ if TYPE_CHECKING:
     import shapely
     import xarray as xr
 
-    Epoch = int | str | np.datetime64
+    from station.archive.series.lazy import Chunks
+    from station.queries.grid_arrays import Epoch
 
 
-def open(site_or_folder: str | Path) -> xr.Dataset:  # noqa: A001 - reads well as station.open(...)
+def open(site_or_folder: str | Path, chunks: Chunks = None) -> xr.Dataset:  # noqa: A001 - reads well as station.open(...)
     """Return the whole series of a station as one lazy dataset, also while the service is writing.
 
-    Takes a site file or the station's data folder. Raises StoreError if there is no series yet.
+    Takes a site file, the station's data folder, or its `series.nc`. `chunks` are those of
+    `xarray.open_dataset`, `{}` for chunks of 24 MB. The dataset has the coordinate system for rioxarray, can
+    be written in any part with `to_netcdf`, and answers queries with `ds.station`: `variance`, `volume`,
+    `between`, `at`. Raises StoreError if there is no series yet or a file is missing, and if one vanishes
+    while the dataset is in use.
     """
+    import station.queries.accessor  # noqa: F401 - registers ds.station
     from station.archive.series.lazy import open_series
 
-    return open_series(site_or_folder)
+    return open_series(site_or_folder, chunks)
 
 
 def variance(
@@ -37,21 +43,21 @@ def variance(
 ) -> float:
     """Return the variance of a weighted sum of elevation change [m² times squared weights].
 
-    The sum is over one epoch, or over its difference to a second epoch. `weights` (y, x), rows from north to
-    south, are zero outside the area: 1/n in each of n cells gives a mean, the cell size a volume. An epoch is
-    an index in the series or a time, which stands for the nearest epoch within 12 h. Errors that all cells of
-    a scan share are included at every scale. Raises StoreError if there is no series or no reference yet,
-    StationError if there is no epoch near a time, ValueError if the weights do not fit the grid.
+    The sum is over one epoch, or over its difference to a second epoch. `weights` (y, x) are zero outside the
+    area: 1/n in each of n cells gives a mean, the cell size a volume; a mask stands for the mean of its cells
+    with a change. A DataArray is aligned by its coordinates; an array has the rows from north to south. An
+    epoch is an index in the series or a time, which stands for the nearest epoch within 12 h. Errors that all
+    cells of a scan share are included at every scale. Raises StoreError if there is no series or no reference
+    yet, StationError if there is no such epoch, ValueError if the weights do not fit the grid or are NaN.
     Source: equations.md, 6.2.
     """
-    import numpy as np
-
     from station.archive.series.index import series_in
     from station.queries.aggregates import Aggregates
+    from station.queries.grid_arrays import to_grid
 
     aggregates = Aggregates(series_in(site_or_folder))
     other = None if epoch2 is None else aggregates.find_epoch(epoch2)
-    return aggregates.variance(np.asarray(weights, dtype=np.float64), aggregates.find_epoch(epoch), other)
+    return aggregates.variance(to_grid(weights, aggregates.grid), aggregates.find_epoch(epoch), other)
 
 
 def coarsen(site_or_folder: str | Path, epoch: Epoch, cells: int) -> xr.Dataset:
@@ -68,25 +74,26 @@ def coarsen(site_or_folder: str | Path, epoch: Epoch, cells: int) -> xr.Dataset:
 
 def volume(
     site_or_folder: str | Path,
-    area: npt.ArrayLike | shapely.Geometry,
+    area: str | npt.ArrayLike | shapely.Geometry,
     epoch: Epoch,
     epoch2: Epoch | None = None,
 ) -> xr.Dataset:
     """Return the volume change of an area with its uncertainty [m³].
 
-    The volume is that of one epoch, or of its difference to a second epoch. `area` is a mask (y, x), rows
-    from north to south, or a polygon in map coordinates. One sigma is given with the shared errors included
-    and once as in Hartzell et al. (2015), with every cell's error independent; maps hold the share of each
-    cell in the variance. Cells without a change are interpolated, as in `areas.nc`. Raises StoreError if
-    there is no series, no reference or no change.
+    The volume is that of one epoch, or of its difference to a second epoch. `area` is the name of an area in
+    `areas.nc`, a mask (y, x), or a polygon in map coordinates. A mask is aligned as weights are. One sigma is
+    given with the shared errors included and once as in Hartzell et al. (2015), with every cell's error
+    independent; maps hold the share of each cell in the variance. Cells without a change are interpolated,
+    as in `areas.nc`. Raises StoreError if there is no series, no reference or no change, StationError if
+    there is no area of this name.
     """
     from station.archive.series.index import series_in
-    from station.queries.volumes import Volumes, area_mask
+    from station.queries.grid_arrays import to_mask
+    from station.queries.volumes import Volumes
 
-    series = series_in(site_or_folder)
-    volumes = Volumes(series)
+    volumes = Volumes(series_in(site_or_folder))
     other = None if epoch2 is None else volumes.find_epoch(epoch2)
-    return volumes.volume_change(area_mask(area, series.grid), volumes.find_epoch(epoch), other)
+    return volumes.volume_change(to_mask(area, volumes.series), volumes.find_epoch(epoch), other)
 
 
 def point_covariance(site: str | Path, points_m: npt.ArrayLike, epoch: Epoch) -> npt.NDArray[np.float64]:

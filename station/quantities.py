@@ -234,6 +234,7 @@ class Quality(IntFlag):
     OUTSIDE_REFERENCE = 4  # observed, but without a reference to measure change from
     STABLE_GROUND = 8
     CHANGE_SIGNIFICANT = 16  # at the 95 % level
+    NOT_SEEN = 32  # no points, or fewer than grid.min_points; set when an epoch is written
     BARE_GROUND = 64  # not known to be stable, but as dark as stable ground: rock, not ice or snow
 
 

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Callable
-from contextlib import suppress
+from collections.abc import Callable, Mapping
 from dataclasses import astuple, dataclass
 from pathlib import Path
 from typing import Any, Protocol
@@ -13,14 +12,11 @@ from typing import Any, Protocol
 import h5py
 import netCDF4
 import numpy as np
+import shapely
 
 from station.archive.atomic_files import atomic_write
-from station.archive.checksums import (
-    fingerprint,
-    matches_fingerprint,
-    read_checked_json,
-    to_checked_json,
-)
+from station.archive.derived import area_geometry
+from station.archive.derived.fingerprints import is_intact, write_fingerprints
 from station.archive.discovery import time_coverage
 from station.archive.epochs import EpochRef
 from station.archive.netcdf_layout import (
@@ -34,13 +30,13 @@ from station.archive.netcdf_layout import (
 from station.archive.schema import BY_NAME, FILL, TEXT, TEXT_LENGTH, Variable
 from station.archive.series.epoch_reader import LIBVER_COMPAT, contiguous_runs, copy_unchanged, read_source
 from station.archive.series.index import SeriesIndex
+from station.errors import StoreError
 from station.quantities import Bools
 from station.science.gridding.significance import SIGNIFICANT_SIGMAS
 
 Columns = dict[str, np.ndarray[Any, Any]]  # variables over time, as stored
 
 FILE_NAME = "areas.nc"
-_FINGERPRINTS = ".areas.json"  # of the file, and of the one it replaces
 MASKS_ATTRIBUTE = "area_masks_sha256"
 MISSING = -1
 _OVER_TIME = ("time", "area")
@@ -109,13 +105,18 @@ class Aggregator(Protocol):
 
 
 def update_areas(
-    series: Series, areas: dict[str, Bools], aggregator: Aggregator, progress: Callable[[], None]
+    series: Series,
+    areas: dict[str, Bools],
+    aggregator: Aggregator,
+    progress: Callable[[], None],
+    polygons: Mapping[str, shapely.Geometry] | None = None,
 ) -> Path | None:
     """Bring `areas.nc` up to date with `series.nc` and return its path; `areas` are masks (ny, nx) by name.
 
-    Epochs already in the file are not computed again unless an area has changed or the file is damaged.
-    Returns None and writes nothing if there is no area or no epoch. `progress` is called after each epoch
-    computed. Raises StoreError if an epoch is damaged or the file cannot be written; the old file remains.
+    `polygons` are the outlines of the areas, which the file contains too. Epochs already in the file are not
+    computed again unless an area has changed or the file is damaged. Returns None and writes nothing if there
+    is no area or no epoch. `progress` is called after each epoch computed. Raises StoreError if an epoch is
+    damaged or the file cannot be written; the old file remains.
     """
     epochs = SeriesIndex(series) if areas else ()
     if not epochs:
@@ -123,7 +124,7 @@ def update_areas(
     path = series.folder / FILE_NAME
     masks = masks_hash(series, areas)
     unchanged, known = 0, _blank(0, len(areas))
-    if is_intact(series):
+    if is_intact(path):
         unchanged, known = _read_known(path, masks, len(areas), epochs)
     known_row = {
         key: index
@@ -133,7 +134,7 @@ def update_areas(
         known_row.get(key, MISSING)
         for key in _epoch_keys(epochs.time_s[unchanged:], epochs.epoch_file[unchanged:])
     ]
-    if known_rows == list(range(len(known_row))):
+    if known_rows == list(range(len(known_row))) and _has_outlines(path, polygons):
         return path
     size_m2 = np.array([np.count_nonzero(cells) for cells in areas.values()]) * series.grid.cell_m**2
     missing = [
@@ -148,29 +149,15 @@ def update_areas(
     with atomic_write(path) as tmp_path:
         with netCDF4.Dataset(tmp_path, "w", clobber=False) as file:
             _write(file, series, tuple(areas), size_m2, columns, unchanged)
+            if polygons:
+                _describe_outlines(file, series, polygons)
             file.setncattr(MASKS_ATTRIBUTE, masks)
             file.setncatts(time_coverage(epochs.start_s[0], columns["time_bnds"][-1, 1]))
         if unchanged:
             with h5py.File(path, "r") as old_file, h5py.File(tmp_path, "r+", libver=LIBVER_COMPAT) as file:
                 copy_unchanged(old_file, file, tuple(columns), unchanged)
-        _write_fingerprints(series, tmp_path)
+        write_fingerprints(path, tmp_path)
     return path
-
-
-def is_intact(series: Series) -> bool:
-    """Return True if `areas.nc` is as it was written."""
-    path = series.folder / FILE_NAME
-    expected = read_checked_json(series.folder / _FINGERPRINTS)
-    return bool(expected) and any(matches_fingerprint(path, known) for known in expected)
-
-
-def _write_fingerprints(series: Series, tmp_path: Path) -> None:
-    """Record the fingerprint of the new file and, because the process may be killed, that of the old one."""
-    known = [fingerprint(tmp_path)]
-    with suppress(OSError):
-        known.append(fingerprint(series.folder / FILE_NAME))
-    with atomic_write(series.folder / _FINGERPRINTS) as tmp_json:
-        tmp_json.write_text(to_checked_json(known), encoding="ascii")
 
 
 def masks_hash(series: Series, areas: dict[str, Bools]) -> str:
@@ -188,6 +175,40 @@ def matches(path: Path, series: Series, areas: dict[str, Bools]) -> bool:
             return bool(file.attrs[MASKS_ATTRIBUTE] == np.bytes_(masks_hash(series, areas)))
     except (OSError, RuntimeError, KeyError):
         return False
+
+
+def area_polygons(series: Series) -> dict[str, shapely.Geometry]:
+    """Return the outlines in `areas.nc` by the name of their area; empty without the file or outlines."""
+    path = series.folder / FILE_NAME
+    if not path.is_file():
+        return {}
+    try:
+        with netCDF4.Dataset(path) as file:
+            file.set_auto_chartostring(False)
+            names = decode_text(np.ma.getdata(file["area_name"][:]))
+            return dict(zip(names, area_geometry.read_polygons(file), strict=False))
+    except (OSError, RuntimeError, KeyError, IndexError) as error:
+        raise StoreError(f"{path}: cannot be read: {error}") from error
+
+
+def _has_outlines(path: Path, polygons: Mapping[str, shapely.Geometry] | None) -> bool:
+    """Return True if a file contains these outlines, or none if there are none."""
+    expected = area_geometry.polygons_hash(polygons) if polygons else ""
+    with h5py.File(path, "r") as file:
+        return bool(file.attrs.get(area_geometry.POLYGONS_ATTRIBUTE, b"") == np.bytes_(expected))
+
+
+def _describe_outlines(
+    file: netCDF4.Dataset, series: Series, polygons: Mapping[str, shapely.Geometry]
+) -> None:
+    """Add the outlines of the areas, and refer to them from every variable over time and area."""
+    area_geometry.write_polygons(file, series, polygons)
+    for spec in AREA_VARIABLES:
+        if spec.dims == _OVER_TIME:
+            file[spec.name].setncatts(
+                {"geometry": area_geometry.CONTAINER}
+                | ({"grid_mapping": "crs"} if series.crs is not None else {})
+            )
 
 
 def _blank(times: int, areas: int) -> Columns:
@@ -302,6 +323,7 @@ def _write(
         "text": TEXT_LENGTH["text"],
     }.items():
         file.createDimension(dim, length)
+    file.setncatts({"featureType": "timeSeries", "cdm_data_type": "Station"})
     create_time_axis(file, times)
     for spec in AREA_VARIABLES:
         variable = create_variable(file, spec, series, times)
@@ -309,7 +331,7 @@ def _write(
             variable.coordinates = "area_name"  # a label that CDO and NCO preserve and xarray selects by
     file.set_auto_mask(False)
     file.set_auto_chartostring(False)
-    file["area_name"].setncattr("_Encoding", "utf-8")
+    file["area_name"].setncatts({"_Encoding": "utf-8", "cf_role": "timeseries_id"})
     characters = encoded_names.view("S1").reshape(len(names), -1)
     file["area_name"][:], file["area_size"][:] = characters, size_m2
     for name, column in columns.items():

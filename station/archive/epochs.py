@@ -17,9 +17,9 @@ from station.archive.atomic_files import atomic_write
 from station.archive.discovery import time_coverage
 from station.archive.netcdf_layout import Series, create_file, create_variable, decode_text, encode_text
 from station.archive.raster_io import Array, rounded, write_rasters
-from station.archive.schema import BY_NAME, TERMS, VARIABLES, VERDICTS
+from station.archive.schema import BY_NAME, FILL, TERMS, VARIABLES, VERDICTS
 from station.errors import StoreError
-from station.quantities import Floats, Measurement, SharedParameters
+from station.quantities import Floats, Measurement, Quality, SharedParameters
 
 TIME_FORMAT = "%Y%m%dT%H%M%SZ"
 COMPACTED = {"days": "%Y%m%d", "months": "%Y%m"}  # kinds of compacted files: time format in their names
@@ -109,8 +109,10 @@ def write_epoch(
             rasters = epoch.measurement.to_rasters(
                 *specs, rows=block, transform=lambda column, values: rounded(specs[column], values)
             )
+            by_name = dict(zip(columns, rasters, strict=True))
+            by_name["quality"][by_name["elevation"] == np.float32(FILL)] |= Quality.NOT_SEEN
             if on_rows is not None:
-                on_rows(block, dict(zip(columns, rasters, strict=True)))
+                on_rows(block, by_name)
             return rasters
 
         write_rasters(tmp_path, list(specs.values()), get_rows)
@@ -253,9 +255,12 @@ def _write_scalars(file: netCDF4.Dataset, series: Series, epoch: Epoch, name: st
         "epoch_file": name,
         **epoch.provenance,
     }
+    valid_count = int(np.count_nonzero(np.isfinite(epoch.measurement.change_m)))
+    verdict = VERDICTS.index(epoch.verdict)
+    numbers: dict[str, float] = {**epoch.scalars, "verdict": verdict, "valid_count": valid_count}
     for spec in VARIABLES:
         if spec.dims == ("time",):
-            value = VERDICTS.index(epoch.verdict) if spec.name == "verdict" else epoch.scalars.get(spec.name)
+            value = numbers.get(spec.name)
             variable = create_variable(file, spec, series, 1)
             variable[0] = value if value is not None and np.isfinite(value) else np.ma.masked
         elif spec.dtype == "S1":

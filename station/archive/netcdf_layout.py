@@ -68,7 +68,7 @@ def create_file(
     for dim, length in TEXT_LENGTH.items():
         file.createDimension(dim, length)
     if series.crs is not None:
-        _create_crs(file, series)
+        create_crs(file, series)
     _create_parameter_names(file, *parameters)
 
 
@@ -128,7 +128,7 @@ def create_time_axis(file: netCDF4.Dataset, times: int) -> None:
     file.createVariable("time_bnds", "f8", ("time", "bnds"), chunksizes=(chunk_times, 2))
 
 
-def _create_crs(file: netCDF4.Dataset, series: Series) -> None:
+def create_crs(file: netCDF4.Dataset, series: Series) -> None:
     """Write the map projection in every form that some tool needs: horizontal only, ASCII, no +type=crs.
 
     Each form fixes a tool that failed without it. Source: store.md, 4.

@@ -227,12 +227,17 @@ def read_reference(series: Series, version: str | None = None) -> Reference | No
 
 
 def open_reference(series: Series, version: str | None = None) -> Reference | None:
-    """Return the reference as `read_reference` does, but with rasters that are read on access."""
-    path = series.folder / "reference.nc" if version is None else version_path(series, version)
+    """Return the reference as `read_reference` does, but with rasters that are read on access.
+
+    If the file of a version is missing, as in a partial copy, `reference.nc` serves if it is that version.
+    """
+    path = series.folder / "reference.nc" if version is None else reference_path(series, version)
     if not path.is_file():
         return None
     try:
         with netCDF4.Dataset(path) as file:
+            if version not in (None, str(file.reference_version)):
+                return None
             return _reference_from_file(file, reference_path(series, str(file.reference_version)), series)
     except (OSError, RuntimeError, KeyError, IndexError, AttributeError) as error:
         raise StoreError(f"{path}: cannot be read: {error}") from error

@@ -48,6 +48,11 @@ class Variable:
 
 _MEAN = "area: mean"
 _ONE_SIGMA = "one standard deviation of a single cell"
+SAFE_BOUND = (
+    "not to be averaged or divided by sqrt(n), because values of a scan share errors: an upper bound for the"
+    " mean of n of them is hypot(sqrt(sum(r^2)) / n, mean(sqrt(u^2 - r^2))), where u is this uncertainty and"
+    " r the random uncertainty"
+)
 _QUANTUM = (
     "rounded to the power of two that is a 16th of the random uncertainty or just below, at most 1/1024 m"
 )
@@ -88,7 +93,7 @@ VARIABLES: tuple[Variable, ...] = (
         "f4",
         "uncertainty of the elevation change",
         "m",
-        comment=f"{_ONE_SIGMA}, three digits; do not average: the error shared by all cells does not shrink",
+        comment=f"{_ONE_SIGMA}, three digits; {SAFE_BOUND}; boxes.nc and station.variance are exact",
     ),
     Variable(
         "elevation_change_random_uncertainty",
@@ -256,6 +261,14 @@ VARIABLES: tuple[Variable, ...] = (
         "1",
     ),
     Variable("coverage", ("time",), "f8", "share of the grid's cells with points", "1"),
+    Variable(
+        "valid_count",
+        ("time",),
+        "f8",
+        "number of cells with a value of elevation_change",
+        "1",
+        comment="as written; if elevation_change has fewer, files that it is read from are missing",
+    ),
     Variable("stable_count", ("time",), "f8", "number of hold-out cells of stable ground", "1"),
     Variable("stable_median", ("time",), "f8", "median change on hold-out stable ground", "m"),
     Variable(

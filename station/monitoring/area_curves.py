@@ -9,6 +9,7 @@ import numpy as np
 
 from station.archive.netcdf_layout import decode_text
 from station.archive.schema import FILL, VERDICTS
+from station.archive.series.epoch_reader import middle
 from station.config import Site
 from station.errors import StoreError
 from station.quantities import Floats
@@ -35,7 +36,7 @@ def read_curves(site: Site, from_utc_s: float) -> list[AreaCurve]:
         return []
     try:
         with h5py.File(series, "r") as file:
-            rows = slice(int(np.searchsorted(file["time"][:], from_utc_s)), None)
+            rows = slice(int(np.searchsorted(middle(file["time_bnds"][:]), from_utc_s)), None)
             series_files = decode_text(file["epoch_file"][rows])
             usable = file["verdict"][rows] != VERDICTS.index("unusable")
         with h5py.File(areas, "r") as file:

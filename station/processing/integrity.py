@@ -14,8 +14,9 @@ import h5py
 import numpy as np
 
 from station.archive.areas import FILE_NAME as AREAS
-from station.archive.areas import is_intact as areas_intact
 from station.archive.atomic_files import DAMAGED
+from station.archive.derived.boxes import BOXES, DAILY
+from station.archive.derived.fingerprints import is_intact as is_derived_intact
 from station.archive.epochs import (
     EpochRef,
     compacted_files,
@@ -26,6 +27,7 @@ from station.archive.epochs import (
 from station.archive.netcdf_layout import Series, decode_text
 from station.archive.reference_files import version_path
 from station.archive.schema import VERDICTS
+from station.archive.series.epoch_reader import middle
 from station.archive.series.index import list_epochs, source_files
 from station.archive.series.manifest import index_if_current, is_intact
 from station.archive.tilt_offsets import (
@@ -268,10 +270,10 @@ def _check_references(series: Series) -> list[tuple[str, str, str]]:
 
 
 def _check_derived(series: Series) -> list[tuple[str, str, str]]:
-    """Return findings on `areas.nc` and the tilt offsets, which the service restores while it runs."""
+    """Return findings on the derived files and the tilt offsets, which the service restores while it runs."""
     paths = damaged_tilt_offsets(series.folder)
-    if (series.folder / AREAS).exists() and not areas_intact(series):
-        paths.append(series.folder / AREAS)
+    derived = [series.folder / name for name in (AREAS, BOXES, DAILY)]
+    paths += [path for path in derived if path.exists() and not is_derived_intact(path)]
     message = "damaged: the service restores it with the next scan"
     return [("fault", "file", f"{path.relative_to(series.folder)}: {message}") for path in paths]
 
@@ -287,7 +289,7 @@ def _check_series(series: Series, refs: list[EpochRef], *, is_complete: bool) ->
     try:
         missing = [path for path in source_files(series.path) if not path.is_file()]
         with h5py.File(series.path, "r") as file:
-            times = np.asarray(file["time"][:])
+            times = middle(file["time_bnds"][:])
             names = decode_text(file["epoch_file"][:])
     except (StoreError, OSError, RuntimeError, KeyError) as error:
         return [("fault", "series", f"series.nc cannot be read: {error}")]

@@ -14,6 +14,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 
 import numpy as np
+import shapely
 
 from station._version import __version__
 from station.archive import epochs
@@ -450,11 +451,14 @@ def file_version(file: Path) -> str:
     return f"{file.stem}-{sha256_file(file)[:8]}"
 
 
+def load_area_polygons(site: Site) -> dict[str, shapely.Geometry]:
+    """Return the outlines of the areas of a site by name, in map coordinates."""
+    return {} if site.areas is None else read_polygons(site.areas.file, site.map.crs)
+
+
 def load_areas(site: Site) -> dict[str, Bools]:
     """Return the cells (ny, nx) of the areas of a site by name."""
-    if site.areas is None:
-        return {}
-    polygons = read_polygons(site.areas.file, site.map.crs)
+    polygons = load_area_polygons(site)
     return {name: cells_inside(polygon, site.grid_cells) for name, polygon in polygons.items()}
 
 

@@ -16,8 +16,9 @@ from station.archive.series.virtual import build_series
 from station.config import Site
 from station.errors import StoreError
 from station.inbox.file_hash import sha256_file
-from station.processing.scan_tasks import Progress, load_areas, series_for
+from station.processing.scan_tasks import Progress, load_area_polygons, load_areas, series_for
 from station.queries.aggregates import Aggregates
+from station.queries.blocks import BlockQueries, update_boxes
 
 Checksums = dict[str, str]  # SHA-256 by file, relative to the data folder
 
@@ -29,7 +30,7 @@ MAX_UNCOMPACTED = 48  # of closed days, before they are compacted during a backl
 
 
 def update_series(site: Site, progress: Progress) -> int:
-    """Update `series.nc` to the stored epochs, then `areas.nc`; return the number of compactable epochs.
+    """Update `series.nc` and the files derived from the epochs; return the number of compactable epochs.
 
     If there are too many source files, epochs are compacted first.
     """
@@ -40,7 +41,8 @@ def update_series(site: Site, progress: Progress) -> int:
     build_series(series)
     progress()
     try:
-        update_areas(series, load_areas(site), Aggregates(series), progress)
+        update_areas(series, load_areas(site), Aggregates(series), progress, load_area_polygons(site))
+        update_boxes(series, BlockQueries(series), progress)
     except (OSError, RuntimeError) as error:
         raise StoreError(f"{series.folder}: an epoch is damaged: {error}") from error
     return compaction.count_compactable(series)

@@ -18,7 +18,13 @@ from station.archive.schema import VERDICTS
 from station.archive.series.index import list_epochs, nearest_epoch, series_in
 from station.config import Site
 from station.errors import ConfigError, StationError
-from station.products.epoch_table import AreaSeries, EpochTable, read_area_series, read_epoch_table
+from station.products.epoch_table import (
+    AreaSeries,
+    EpochTable,
+    csv_times,
+    read_area_series,
+    read_epoch_table,
+)
 from station.quantities import Bools
 from station.queries.aggregates import Aggregates
 from station.readers.polygons import cells_inside, read_polygons
@@ -30,9 +36,10 @@ REFERENCE, PREVIOUS = "reference", "previous"
 
 @dataclass(frozen=True)
 class AreaRecord:
-    """The change of one area at one time; `statistics` by the variable names of `areas.nc`."""
+    """The change of one area in one scan; `statistics` by the variable names of `areas.nc`."""
 
     start: datetime
+    end: datetime
     area: str
     size_m2: float
     verdict: str  # of the epoch; for a pair, the worse of the two
@@ -136,14 +143,16 @@ def _from_file(stored: list[AreaSeries], span: Span, table: EpochTable) -> Itera
     """Yield the records stored in `areas.nc`."""
     verdicts = dict(zip(table.start_s.tolist(), table.verdict, strict=True))
     for index, start_s in enumerate(stored[0].start_s):
-        start = datetime.fromtimestamp(float(start_s), UTC)
+        start, end = (
+            datetime.fromtimestamp(float(time_s), UTC) for time_s in (start_s, stored[0].end_s[index])
+        )
         if start not in span:
             continue
         for area in stored:
             statistics = {name: float(column[index]) for name, column in area.columns.items()}
             if np.isfinite(statistics["mean_change"]):
                 verdict = verdicts.get(float(start_s), "")
-                yield AreaRecord(start, area.name, area.size_m2, verdict, statistics)
+                yield AreaRecord(start, end, area.name, area.size_m2, verdict, statistics)
 
 
 def _compute(
@@ -156,6 +165,7 @@ def _compute(
     table = read_epoch_table(series)
     versions = dict(zip(table.texts["epoch_file"], table.texts["reference_version"], strict=True))
     verdicts = dict(zip(table.texts["epoch_file"], table.verdict, strict=True))
+    bounds_s = dict(zip(table.texts["epoch_file"], zip(table.start_s, table.end_s, strict=True), strict=True))
     measured = [epoch for epoch in list_epochs(series) if versions.get(epoch.epoch_file)]
     fixed_epoch = None if against in {REFERENCE, PREVIOUS} else find_epoch(series, against)
     previous = dict(zip(measured[1:], measured, strict=False)) if against == PREVIOUS else {}
@@ -165,11 +175,12 @@ def _compute(
         if epoch == fixed_epoch or (against == PREVIOUS and other is None):
             continue
         verdict = max((verdicts[ref.epoch_file] for ref in (epoch, other) if ref), key=VERDICTS.index)
+        start, end = (datetime.fromtimestamp(float(time_s), UTC) for time_s in bounds_s[epoch.epoch_file])
         for name, cells in areas.items():
             size_m2 = float(np.count_nonzero(cells)) * series.grid.cell_m**2
             if size_m2:
                 statistics = area_statistics(aggregates.area(cells, epoch, other), size_m2)
-                yield AreaRecord(epoch.start, name, size_m2, verdict, statistics)
+                yield AreaRecord(start, end, name, size_m2, verdict, statistics)
 
 
 def as_csv(records: Iterable[AreaRecord]) -> str:
@@ -182,13 +193,14 @@ def as_csv(records: Iterable[AreaRecord]) -> str:
         for quantity in UNITS
         for suffix in COLUMN_SUFFIXES
     ]
-    writer.writerow(["time_utc", "area", "area_size_m2", *headings, "coverage", "verdict"])
+    writer.writerow(
+        ["time_utc", "start_utc", "end_utc", "area", "area_size_m2", *headings, "coverage", "verdict"]
+    )
     for record in records:
         values = [record.statistics[name] for name in (*names, "coverage")]
         texts = [f"{value:.6g}" if np.isfinite(value) else "" for value in values]
-        writer.writerow(
-            [f"{record.start:%Y-%m-%dT%H:%M:%SZ}", record.area, f"{record.size_m2:g}", *texts, record.verdict]
-        )
+        times = csv_times(record.start.timestamp(), record.end.timestamp()).values()
+        writer.writerow([*times, record.area, f"{record.size_m2:g}", *texts, record.verdict])
     return stream.getvalue()
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from datetime import UTC, datetime
 from typing import Any
 
 import h5py
@@ -28,6 +29,7 @@ class EpochTable:
     """Values of all epochs, in time order."""
 
     start_s: Floats  # (t,) seconds since 1970, start of the scan
+    end_s: Floats
     verdict: list[str]
     scalars: dict[str, Floats]  # (t,) NaN where missing
     texts: dict[str, list[str]]
@@ -44,6 +46,7 @@ class AreaSeries:
     name: str
     size_m2: float
     start_s: Floats
+    end_s: Floats
     columns: dict[str, Floats]
 
 
@@ -51,8 +54,10 @@ def read_epoch_table(series: Series) -> EpochTable:
     """Return the epoch table of `series.nc`; raise StoreError if it cannot be read."""
     try:
         with h5py.File(series.path, "r") as file:
+            bounds_s = np.asarray(file["time_bnds"][:], dtype=np.float64)
             return EpochTable(
-                start_s=np.asarray(file["time_bnds"][:, 0], dtype=np.float64),
+                start_s=bounds_s[:, 0],
+                end_s=bounds_s[:, 1],
                 verdict=[VERDICTS[code] for code in file["verdict"][:].tolist()],
                 scalars={name: _nan_where_missing(file[name][:]) for name in SCALAR_VARIABLES},
                 texts={name: decode_text(read_column(file[name])) for name in TEXT_VARIABLES},
@@ -71,7 +76,7 @@ def read_area_series(series: Series) -> list[AreaSeries]:
             over_time = [variable.name for variable in AREA_VARIABLES if variable.dims == ("time", "area")]
             if not set(over_time) <= set(file):
                 return []
-            start_s = np.asarray(file["time_bnds"][:, 0], dtype=np.float64)
+            start_s, end_s = np.asarray(file["time_bnds"][:], dtype=np.float64).T
             names = [name.tobytes().rstrip(b"\0").decode() for name in file["area_name"][:]]
             size_m2 = file["area_size"][:]
             columns = {name: _nan_where_missing(read_column(file[name])) for name in over_time}
@@ -79,10 +84,25 @@ def read_area_series(series: Series) -> list[AreaSeries]:
         raise StoreError(f"{path}: cannot be read: {error}") from error
     return [
         AreaSeries(
-            name, float(size_m2[index]), start_s, {key: values[:, index] for key, values in columns.items()}
+            name,
+            float(size_m2[index]),
+            start_s,
+            end_s,
+            {key: values[:, index] for key, values in columns.items()},
         )
         for index, name in enumerate(names)
     ]
+
+
+def csv_times(start_s: float, end_s: float) -> dict[str, str]:
+    """Return the times of a scan for a CSV table, by column; the middle is the `time` of NetCDF files."""
+    times_s = {"time_utc": (start_s + end_s) / 2, "start_utc": start_s, "end_utc": end_s}
+    return {
+        name: datetime.fromtimestamp(round(time_s, 3), UTC)
+        .isoformat(timespec="milliseconds")
+        .replace("+00:00", "Z")
+        for name, time_s in times_s.items()
+    }
 
 
 def _nan_where_missing(values: np.ndarray[Any, Any]) -> Floats:

@@ -18,7 +18,7 @@ from station.archive.series.index import list_epochs, series_in
 from station.config import Site
 from station.errors import StationError
 from station.products.area_tables import REFERENCE, Span, area_records, as_csv
-from station.products.epoch_table import EpochTable, read_epoch_table
+from station.products.epoch_table import EpochTable, csv_times, read_epoch_table
 from station.products.gallery import default_limit, replace_if_changed
 from station.products.geotiff import KINDS, export_geotiff
 from station.science.geometry.pose import horizontal_crs
@@ -53,14 +53,14 @@ def export(site: Site, kind: str, span: Span | None, folder: Path, track: Track 
 def _write_csv(site: Site, table: EpochTable, span: Span, folder: Path) -> list[Path]:
     stream = io.StringIO()
     writer = csv.writer(stream, lineterminator="\n")
-    writer.writerow(["start_utc", "scan", "verdict", "reason", *table.scalars])
+    writer.writerow(["time_utc", "start_utc", "end_utc", "scan", "verdict", "reason", *table.scalars])
     for index, start_s in enumerate(table.start_s):
         start = datetime.fromtimestamp(float(start_s), UTC)
         if start in span:
             numbers = [float(column[index]) for column in table.scalars.values()]
             writer.writerow(
                 [
-                    f"{start:%Y-%m-%dT%H:%M:%SZ}",
+                    *csv_times(float(start_s), float(table.end_s[index])).values(),
                     table.texts["scan_id"][index],
                     table.verdict[index],
                     table.texts["verdict_reason"][index],

@@ -14,8 +14,9 @@ from station.archive.netcdf_layout import Series, decode_text
 from station.archive.raster_io import bounding_slices
 from station.archive.reference_files import open_reference
 from station.archive.series.index import list_epochs, nearest_epoch
-from station.errors import StoreError
+from station.errors import StationError, StoreError
 from station.quantities import Bools, ChangeErrors, Floats, Grid, Quality, Reals, Reference, SharedParameters
+from station.queries.grid_arrays import Epoch, to_index_or_time
 from station.science.adjustment import ground_classes
 from station.science.adjustment.leverage import leverage
 from station.science.analysis.voids import area_weights, void_variance
@@ -49,7 +50,8 @@ class Aggregates:
     """Means and variances over cells of the epochs of a store."""
 
     def __init__(self, series: Series) -> None:
-        self._series = series
+        self.series = series
+        self.grid = series.grid
         self._references: dict[str | None, Reference] = {}
         # Of the last cells, reused by the median; and of the last epoch: its areas are queried one by one.
         self._jacobian_cache: tuple[EpochCells, Bools, HeightJacobian] | None = None
@@ -58,40 +60,47 @@ class Aggregates:
     def reference(self, version: str | None = None) -> Reference:
         """Return the newest reference surface or a version; raise StoreError if there is none."""
         if version not in self._references:
-            reference = open_reference(self._series, version)
+            reference = open_reference(self.series, version)
             if reference is None:
-                raise StoreError(f"{self._series.folder}: no reference {version or 'yet'}: no change")
+                raise StoreError(f"{self.series.folder}: no reference {version or 'yet'}: no change")
             self._references[version] = reference
         return self._references[version]
 
-    def find_epoch(self, epoch: int | str | np.datetime64) -> EpochRef:
+    def find_epoch(self, epoch: Epoch) -> EpochRef:
         """Return the epoch at an index in the series, or the nearest one within 12 h of a time (UTC).
 
-        Raises StationError if there is none.
+        Raises StationError if there is none, ValueError if `epoch` is neither.
         """
-        epochs = list_epochs(self._series)
+        epochs, wanted = list_epochs(self.series), to_index_or_time(epoch)
         if not epochs:
-            raise StoreError(f"{self._series.folder}: nothing is stored yet")
-        if isinstance(epoch, (int, np.integer)):
-            return epochs[epoch]
-        requested_s = float((np.datetime64(str(epoch)) - np.datetime64(0, "s")) / np.timedelta64(1, "s"))
-        return nearest_epoch(epochs, requested_s)
+            raise StoreError(f"{self.series.folder}: nothing is stored yet")
+        if not isinstance(wanted, int):
+            return nearest_epoch(epochs, float((wanted - np.datetime64(0, "s")) / np.timedelta64(1, "s")))
+        if not -len(epochs) <= wanted < len(epochs):
+            raise StationError(f"no epoch {wanted}: the series has {len(epochs)}")
+        return epochs[wanted]
 
-    def variance(self, weights: Floats, epoch: EpochRef, other: EpochRef | None = None) -> float:
+    def variance(self, weights: Floats | Bools, epoch: EpochRef, other: EpochRef | None = None) -> float:
         """Return the variance of the weighted sum of change [m² times squared weights].
 
         The sum is over one epoch, or over its difference to another epoch. `weights` (ny, nx) are zero
-        outside the area. Cells without a change do not contribute. Source: equations.md, 6.2.
+        outside the area; a mask stands for the mean of its cells with a change, NaN if there is none. Cells
+        without a change do not contribute. Source: equations.md, 6.2.
         """
         if other == epoch:
             return 0.0
         cells = weights != 0
         epochs = self._read_epochs(cells, epoch, other)
         common_cells = observed_in_all(epochs, cells)
+        cell_weights = weights[common_cells].astype(np.float64)
+        if weights.dtype == np.bool_:
+            if not len(cell_weights):
+                return np.nan
+            cell_weights /= len(cell_weights)
         return self._weighted_sum_variance(
             epochs,
             common_cells,
-            weights[common_cells],
+            cell_weights,
             self._random_variances(epochs, common_cells, common_cells[cells]),
         )
 
@@ -138,7 +147,7 @@ class Aggregates:
         `cells` (ny, nx) selects cells of the surface `elevation_m` on `grid`, which may differ from the grid
         of the store. The random part of each cell is not included. Source: equations.md, 6.2.
         """
-        no_cells = np.zeros(self._series.grid.shape, np.bool_)
+        no_cells = np.zeros(self.grid.shape, np.bool_)
         epochs = [self.read_cells(epoch_ref, no_cells) for epoch_ref in (epoch, other)]
         contributions = [
             (epoch_cells.scanner, epoch_cells.shared)
@@ -157,7 +166,7 @@ class Aggregates:
         gradient = smooth_gradient(elevation_m, grid.cell_m)
         variance_m2 = np.zeros(np.count_nonzero(cells))
         for scanner, shared in contributions:
-            params, position_m = self._parameter_layout(scanner)
+            params, position_m = self.parameter_layout_of(scanner)
             jacobian = cell_jacobian(params, grid, position_m, elevation_m, gradient, cells)
             variance_m2 += jacobian.variance(shared)
         return variance_m2
@@ -237,7 +246,7 @@ class Aggregates:
             moving, stable = (float(np.ma.filled(file[name][index], np.nan)) for name in LEVERAGE_VARIABLES)
         if not np.isfinite([moving, stable]).all():
             return None
-        grid, (row, column) = self._series.grid, np.nonzero(common_cells)
+        grid, (row, column) = self.grid, np.nonzero(common_cells)
         holdout = ground_classes.is_holdout(grid.x_m[column], grid.y_m[row])
         stable_ground = _has_quality(epoch_cells.epoch, common_cells, Quality.STABLE_GROUND)
         smooth = np.hypot(*jacobian.pose[3:5]) < ground_classes.MAX_MOVING_SLOPE
@@ -261,7 +270,7 @@ class Aggregates:
         """
         import xarray as xr  # noqa: PLC0415 - the service does not need it
 
-        grid = self._series.grid
+        grid = self.grid
         ny, nx = grid.ny // cells, grid.nx // cells
         if not ny or not nx:
             raise ValueError(f"blocks of {cells} cells do not fit a grid of {grid.ny} × {grid.nx}")
@@ -300,8 +309,8 @@ class Aggregates:
         return self._jacobian_cache[2]
 
     def _compute_jacobian(self, epoch_cells: EpochCells, cells: Bools) -> HeightJacobian:
-        grid, elevation_m = self._series.grid, epoch_cells.reference.elevation_m
-        params, position_m = self._parameter_layout(epoch_cells.scanner)
+        grid, elevation_m = self.grid, epoch_cells.reference.elevation_m
+        params, position_m = self.parameter_layout_of(epoch_cells.scanner)
         rows, columns = _bounding_box(cells, MARGIN_CELLS)
         corner_m = grid.west_m + columns.start * grid.cell_m, grid.north_m - rows.start * grid.cell_m
         window_m = elevation_m[rows, columns]
@@ -312,8 +321,8 @@ class Aggregates:
 
     def read_cells(self, epoch: EpochRef, cells: Bools) -> EpochCells:
         """Return the data of an epoch at the selected cells (ny, nx); raise ValueError on another grid."""
-        if cells.shape != self._series.grid.shape:
-            raise ValueError(f"the array has shape {cells.shape}, the grid {self._series.grid.shape}")
+        if cells.shape != self.grid.shape:
+            raise ValueError(f"the array has shape {cells.shape}, the grid {self.grid.shape}")
         with netCDF4.Dataset(epoch.path) as file:
             reference = self.reference(str(file["reference_version"][epoch.index]))
             change_m, random_m = (read_cells_of(file[name], epoch.index, cells) for name in (CHANGE, RANDOM))
@@ -342,17 +351,17 @@ class Aggregates:
             )
             change_errors = ChangeErrors(*change_fields) if change_fields else None
             shared = SharedParameters(names, units, estimate, covariance, line_tilt_variance, change_errors)
-            self._shared_cache = epoch, align_to(self._parameter_layout(scanner)[0], shared)
+            self._shared_cache = epoch, align_to(self.parameter_layout_of(scanner)[0], shared)
         return self._shared_cache[1]
 
-    def _parameter_layout(
+    def parameter_layout_of(
         self, scanner: tuple[float, ...]
     ) -> tuple[ParameterLayout, tuple[float, float, float]]:
         """Return parameter layout and position [m] of a scanner."""
         east_m, north_m, height_m, axis_east, axis_north = scanner
         axis_up = float(np.sqrt(max(1 - axis_east**2 - axis_north**2, 0.0)))
         position_m = east_m, north_m, height_m
-        return parameter_layout(self._series.grid, position_m, (axis_east, axis_north, axis_up)), position_m
+        return parameter_layout(self.grid, position_m, (axis_east, axis_north, axis_up)), position_m
 
 
 SCANNER_VARIABLES = (

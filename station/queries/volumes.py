@@ -4,15 +4,14 @@ from __future__ import annotations
 
 import netCDF4
 import numpy as np
-import numpy.typing as npt
-import shapely
 import xarray as xr
 
 from station.archive.epochs import EpochRef
 from station.errors import StoreError
-from station.quantities import Bools, Floats, Grid, Scanner
+from station.quantities import Bools, Floats, Scanner
 from station.queries.aggregates import (
     CHANGE,
+    RANDOM,
     Aggregates,
     EpochCells,
     common_error_covariance,
@@ -24,17 +23,6 @@ from station.science.analysis.volume import common_contributions, shared_contrib
 from station.science.uncertainty.parameters import parameter_layout
 from station.science.uncertainty.point_covariance import shared_covariance, shot_covariance
 from station.science.uncertainty.propagation import difference_to_reference
-
-
-def area_mask(area: npt.ArrayLike | shapely.Geometry, grid: Grid) -> Bools:
-    """Return the mask (ny, nx) of an area given as a mask, or as a polygon that contains the cell centres."""
-    if isinstance(area, shapely.Geometry):
-        shapely.prepare(area)
-        return np.asarray(shapely.contains_xy(area, grid.x_m[None, :], grid.y_m[:, None]))
-    mask = np.asarray(area, np.bool_)
-    if mask.shape != grid.shape:
-        raise ValueError(f"the mask has shape {mask.shape}, the grid {grid.shape}")
-    return mask
 
 
 class Volumes(Aggregates):
@@ -52,7 +40,7 @@ class Volumes(Aggregates):
         common_cells = observed_in_all(epochs, cells)
         if not common_cells.any():
             raise StoreError(f"{epoch.path}: none of the {np.count_nonzero(cells)} cells has a change")
-        size_m2 = self._series.grid.cell_m**2 * np.count_nonzero(cells)
+        size_m2 = self.grid.cell_m**2 * np.count_nonzero(cells)
         weights_m2 = size_m2 * area_weights(cells, common_cells)[0][common_cells]
         random_part, shared_part = self._variance_contributions(
             epochs,
@@ -86,7 +74,38 @@ class Volumes(Aggregates):
                 "variance_share": share_map(random_part + shared_part),
                 "variance_share_hartzell2015": share_map(published),
             },
-            {"y": self._series.grid.y_m, "x": self._series.grid.x_m},
+            {"y": self.grid.y_m, "x": self.grid.x_m},
+        )
+
+    def change_between(self, epoch: EpochRef, other: EpochRef) -> xr.Dataset:
+        """Return the elevation change of each cell from another epoch to an epoch, with its uncertainty [m].
+
+        The errors of a common reference cancel, and the errors that both epochs share.
+        """
+        everywhere = np.ones(self.grid.shape, np.bool_)
+        epochs = self._read_epochs(everywhere, epoch, other)
+        cells = observed_in_all(epochs, everywhere)
+        random_m2 = np.sum(self._random_variances(epochs, cells, cells.ravel()), axis=0)
+        surface_m = np.asarray(epochs[0].reference.elevation_m)
+        shared_m2 = self.shared_variance_between(epoch, other, self.grid, surface_m, cells)
+        change_m = epochs[0].change_m - epochs[1].change_m
+
+        def on_map(values: Floats, long_name: str) -> tuple[tuple[str, str], Floats, dict[str, str]]:
+            raster = np.full(cells.shape, np.nan)
+            raster[cells] = values
+            return ("y", "x"), raster, {"long_name": long_name, "units": "m"}
+
+        return xr.Dataset(
+            {
+                CHANGE: on_map(change_m[cells.ravel()], "elevation change between two scans"),
+                f"{CHANGE}_uncertainty": on_map(
+                    np.sqrt(random_m2 + shared_m2), "uncertainty of the elevation change between two scans"
+                ),
+                RANDOM: on_map(
+                    np.sqrt(random_m2), "random uncertainty of the elevation change between two scans"
+                ),
+            },
+            {"y": self.grid.y_m, "x": self.grid.x_m},
         )
 
     def _sigma(self, epoch: EpochRef, common_cells: Bools) -> Floats:
@@ -124,7 +143,7 @@ class Volumes(Aggregates):
 
         Raises StoreError if the epoch has no shared parameters.
         """
-        epoch_cells = self.read_cells(epoch, np.zeros(self._series.grid.shape, np.bool_))
+        epoch_cells = self.read_cells(epoch, np.zeros(self.grid.shape, np.bool_))
         if epoch_cells.shared is None:
             raise StoreError(
                 f"{epoch.path}: no scanner pose is stored, because the scan is in map coordinates"
@@ -132,6 +151,6 @@ class Volumes(Aggregates):
         position_m, (east, north) = epoch_cells.scanner[:3], epoch_cells.scanner[3:]
         axis = east, north, float(np.sqrt(max(1 - east**2 - north**2, 0.0)))
         offset_m = points_m - np.array(position_m)
-        params = parameter_layout(self._series.grid, (position_m[0], position_m[1], position_m[2]), axis)
+        params = parameter_layout(self.grid, (position_m[0], position_m[1], position_m[2]), axis)
         shot_m2 = shot_covariance(offset_m, np.array(axis), scanner)
         return shot_m2 + shared_covariance(params, offset_m, epoch_cells.shared)

@@ -6,10 +6,11 @@ from datetime import UTC, datetime
 import h5py
 import numpy as np
 import pytest
+import shapely
 import xarray as xr
 
 from station.archive import epochs
-from station.archive.areas import AreaChange, update_areas
+from station.archive.areas import AreaChange, area_polygons, update_areas
 from station.archive.compaction import compact
 from station.archive.series.virtual import build_series
 from station.errors import StoreError
@@ -245,3 +246,30 @@ def test_progress_is_called_after_each_epoch(series, epoch, areas, aggregator):
     steps = []
     update_areas(series, areas, aggregator, lambda: steps.append(len(aggregator.calls)))
     assert steps == [2, 4, 6]
+
+
+def test_outlines_are_stored_as_rings(series, epoch, areas, aggregator):
+    """The rings are put together here from the arrays, as CF 7.5 defines them."""
+    outer, hole = shapely.box(0, 0, 9, 9), shapely.box(2, 2, 3, 4)
+    outlines = {"Zunge Süd": shapely.MultiPolygon([outer - hole, shapely.box(20, 0, 21, 1)]), "gate": outer}
+    write(series, epoch, 1)
+    build_series(series)
+    path = update_areas(series, areas, aggregator, lambda: None)
+    calls = len(aggregator.calls)
+    update_areas(series, areas, aggregator, lambda: None, outlines)
+    assert len(aggregator.calls) == calls  # the change is not computed again
+    stored = read(path)
+    container = stored[stored.mean_change.attrs["geometry"]].attrs
+    x, y = (stored[name].values for name in container["node_coordinates"].split())
+    ends = np.cumsum(stored[container["part_node_count"]].values)
+    rings = [shapely.LinearRing(ring) for ring in np.split(np.stack([x, y], axis=-1), ends[:-1])]
+    is_hole = stored[container["interior_ring"]].values.astype(bool)
+    assert is_hole.tolist() == [False, True, False, False]
+    assert [ring.is_ccw for ring in rings] == (~is_hole).tolist()
+    assert [shapely.Polygon(ring).area for ring in rings] == [81, 2, 1, 81]
+    assert stored[container["node_count"]].values.tolist() == [15, 5]
+    assert all(area_polygons(series)[name].equals(shape) for name, shape in outlines.items())
+    assert (stored.attrs["featureType"], stored.area_name.attrs["cf_role"]) == ("timeSeries", "timeseries_id")
+    moved = outlines | {"gate": shapely.box(1, 1, 9, 9)}
+    update_areas(series, areas, aggregator, lambda: None, moved)
+    assert area_polygons(series)["gate"].area == 64

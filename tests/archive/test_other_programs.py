@@ -11,6 +11,7 @@ from datetime import UTC, datetime
 
 import numpy as np
 import pytest
+import shapely
 import xarray as xr
 
 from station.archive import epochs, reference_files
@@ -18,6 +19,7 @@ from station.archive.areas import AreaChange, update_areas
 from station.archive.compaction import compact
 from station.archive.series.virtual import build_series
 from station.quantities import Reference
+from station.queries.blocks import BlockQueries, update_boxes
 from station.sections import MetadataSection
 
 pytestmark = pytest.mark.integration
@@ -186,6 +188,24 @@ def test_compliance_checker_accepts_areas(areas_file, tmp_path):
     assert findings(tmp_path / "report.json", areas_file) == []
 
 
+def test_compliance_checker_accepts_outlines_of_areas(areas_file, series, tmp_path):
+    """Version 6.1 wants the dimension of the nodes in the data, and polygons of one ring (against CF 7.5)."""
+    part = shapely.box(632_100, 5_185_000, 632_300, 5_185_400) - shapely.box(
+        632_150, 5_185_100, 632_200, 5_185_200
+    )
+    outlines = {"Süd": part | shapely.box(632_400, 5_185_000, 632_500, 5_185_100), "unobserved": part}
+    everywhere = np.ones(series.grid.shape, bool)
+    masks = {"Süd": everywhere, "unobserved": np.tri(*series.grid.shape, dtype=bool)}
+    update_areas(series, masks, ConstantAggregator(), lambda: None, outlines)
+    found = {
+        message for *_, messages in findings(tmp_path / "report.json", areas_file) for message in messages
+    }
+    wrong = "does not include geometry dimension", "must have the same single dimension as interior ring"
+    assert {message for message in found if not any(text in message for text in wrong)} == set()
+    shown = run(tool("cdo"), "infon", areas_file).stderr
+    assert "warning" not in "".join(line for line in shown.splitlines() if "skipped" not in line).lower()
+
+
 def test_ncdump_prints_times_names_and_missing_values_of_areas(areas_file):
     text = run(tool("ncdump"), "-t", "-v", "time,area_name,mean_change", areas_file).stdout
     assert '"2025-11-21 00:07:30"' in text
@@ -264,3 +284,34 @@ def test_rioxarray_reads_the_projection(built):
     with rioxarray.open_rasterio(f"netcdf:{built}:elevation_change") as ds:
         assert ds.rio.crs.to_epsg() == 32632
         assert ds.rio.transform().e == -10.0
+
+
+@pytest.fixture
+def box_files(series, epoch):
+    """`boxes.nc` and `daily.nc` of two epochs of a day, and one of the next."""
+    surface = np.full(series.grid.shape, 2800.0)
+    reference_files.write_reference(series, Reference.from_elevation(series.grid, "1", surface))
+    for hour in (1, 2, 30):
+        epochs.write_epoch(series, epoch(hour))
+    build_series(series)
+    update_boxes(series, BlockQueries(series), lambda: None)
+    return [series.folder / name for name in ("boxes.nc", "daily.nc")]
+
+
+def test_compliance_checker_accepts_boxes(box_files, tmp_path):
+    assert findings(tmp_path / "report.json", *box_files) == []
+
+
+def test_other_programs_read_boxes(box_files, tmp_path):
+    """The change is the hour in centimetres, σ of a cell 0.05 m; boxes have 10 × 10 cells."""
+    boxes, daily = box_files
+    run(tool("ncks"), "-O", "-d", "time,1", "-v", "elevation_change", boxes, tmp_path / "one.nc")
+    with xr.open_dataset(tmp_path / "one.nc") as ds:
+        assert float(ds.elevation_change[0, 3, 3]) == pytest.approx(0.02, abs=1e-4)
+    name, position = f"NETCDF:{boxes}:elevation_change_uncertainty", ("632055", "5185955")
+    value = run(tool("gdallocationinfo"), "-valonly", "-b", "1", "-geoloc", name, *position).stdout
+    assert float(value) == pytest.approx(0.05 / 10, rel=1e-2)
+    mean = run(
+        tool("cdo"), "-s", "outputf,%.4f,1", "-selindexbox,1,1,1,1", "-selname,elevation_change", daily
+    )
+    assert float(mean.stdout) == pytest.approx(0.015, abs=1e-4)

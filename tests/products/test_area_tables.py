@@ -88,7 +88,8 @@ def test_change_between_any_two_epochs(site, other_polygons):
 def test_csv_of_areas(site, small):
     rows = list(csv.DictReader(io.StringIO(as_csv(area_records(site, None, ALL, "reference")))))
     assert len(rows) == 12
-    assert rows[0]["time_utc"] == "2025-11-21T00:00:00Z"
+    times = [rows[0][column] for column in ("start_utc", "time_utc", "end_utc")]
+    assert times == ["2025-11-21T00:00:00.000Z", "2025-11-21T00:07:30.000Z", "2025-11-21T00:15:00.000Z"]
     assert rows[1]["area"] == small.EVIL
     assert [row["verdict"] for row in rows[:3]] == ["degraded", "degraded", "good"]
     for row in rows:

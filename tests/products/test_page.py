@@ -107,7 +107,7 @@ def test_unusable_epochs_are_gaps_in_the_curves(write, series, small):
     folder = write()
     assert len(page_data(folder)["health"]["time_s"]) == 7
     masked = page._mask_unusable(
-        AreaSeries("a", 1.0, read_epoch_table(series).start_s, {"mean_change": np.ones(7)}),
+        AreaSeries("a", 1.0, *2 * [read_epoch_table(series).start_s], {"mean_change": np.ones(7)}),
         read_epoch_table(series),
     )
     assert np.isnan(masked.columns["mean_change"]).tolist() == [False] * 6 + [True]
@@ -221,13 +221,16 @@ def test_page_size_is_limited_after_a_year_of_hourly_scans(write, context, monke
     }
     names = [f"area {'with a rather long name ' * 2}{n}" for n in range(12)]
     monkeypatch.setattr(
-        page, "read_area_series", lambda _: [AreaSeries(n, 1e6, start_s, columns) for n in names]
+        page,
+        "read_area_series",
+        lambda _: [AreaSeries(n, 1e6, start_s, start_s + 900, columns) for n in names],
     )
 
     def year_of_epochs(series):
         table = read_epoch_table(series)
         return EpochTable(
             start_s,
+            start_s + 900,
             ["degraded"] * count,
             {name: rng.normal(size=count) for name in table.scalars},
             {name: [f"251121_{n:06d} {name} {'why ' * 20}" for n in range(count)] for name in table.texts}

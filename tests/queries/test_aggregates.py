@@ -491,7 +491,7 @@ def test_epochs_are_found_by_index_and_by_the_nearest_time(stored):
     by_time = station.variance(stored.folder, weights, "2025-11-21T03:00")
     assert by_time == station.variance(stored.folder, weights, JOINT)
     assert station.variance(stored.folder, weights, JOINT, JOINT) == 0.0
-    with pytest.raises(IndexError):
+    with pytest.raises(StationError, match="no epoch 4: the series has 4"):
         queries.find_epoch(4)
 
 

@@ -118,6 +118,7 @@ def write_series(tmp_path):
         for name in ("series.nc", "areas.nc"):
             with h5py.File(tmp_path / "data" / name, "w") as file:
                 file["time"] = time_s
+                file["time_bnds"] = np.stack([time_s, time_s], axis=-1)
                 file["epoch_file"] = char_array([f"e{epoch_s:.0f}.nc" for epoch_s in time_s], 64)
                 if name == "series.nc":
                     file["verdict"] = np.zeros(len(time_s), "i1") if verdicts is None else verdicts

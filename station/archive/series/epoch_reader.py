@@ -37,6 +37,11 @@ class EpochSource:
     raster_shapes: dict[str, tuple[int, ...]]  # of the large variables
     parameters: Parameters
 
+    @property
+    def file_length(self) -> int:
+        """Number of epochs in the file."""
+        return next(iter(self.raster_shapes.values()))[0]
+
 
 def contiguous_runs(epochs: list[EpochRef]) -> list[tuple[Path, int, int, int]]:
     """Group epochs that are consecutive in one file: (path, index in the file, index in `epochs`, count)."""
@@ -53,18 +58,19 @@ def read_source(path: Path, file_start: int, series_start: int, count: int) -> E
     try:
         with h5py.File(path, "r") as file:
             names = set(file)
-            small_names = {"time", "time_bnds", *(spec.name for spec in SMALL_VARIABLES)} & names
+            small_names = {"time_bnds", *(spec.name for spec in SMALL_VARIABLES)} & names
             parameter_texts = [
                 decode_text(_read(file, name))
                 for name in ("parameter_name", "parameter_unit")
                 if name in names
             ]
+            scalars = {name: _read_epochs(file, name, file_start, count) for name in small_names}
             return EpochSource(
                 path=path,
                 file_start=file_start,
                 series_start=series_start,
                 count=count,
-                scalars={name: _read_epochs(file, name, file_start, count) for name in small_names},
+                scalars=scalars | {"time": middle(scalars["time_bnds"])},
                 raster_shapes={
                     spec.name: _open(file, spec.name).shape for spec in LARGE_VARIABLES if spec.name in names
                 },
@@ -72,6 +78,11 @@ def read_source(path: Path, file_start: int, series_start: int, count: int) -> E
             )
     except (OSError, RuntimeError, KeyError) as error:
         raise StoreError(f"{path}: damaged, cannot be read: {error}") from error
+
+
+def middle(bounds_s: np.ndarray[Any, Any]) -> np.ndarray[Any, Any]:
+    """Return the time (n,) of epochs with these bounds (n, 2) [s]; `series.nc` stores the bounds only."""
+    return np.asarray(bounds_s.mean(axis=1), dtype=np.float64)
 
 
 def _open(file: Any, name: str) -> Any:  # noqa: ANN401 - h5py has no types

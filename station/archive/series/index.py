@@ -26,6 +26,7 @@ from station.archive.epochs import (
 )
 from station.archive.netcdf_layout import Series
 from station.archive.schema import TEXT_LENGTH
+from station.archive.series.epoch_reader import middle
 from station.errors import StationError, StoreError
 from station.quantities import Grid
 
@@ -104,8 +105,8 @@ class SeriesIndex(Sequence[EpochRef]):
             return
         try:
             with h5py.File(series.path, "r") as file:
-                self.time_s = np.asarray(file["time"][:], dtype=np.float64)
-                self.start_s = np.asarray(file["time_bnds"][:, 0], dtype=np.float64)
+                bounds_s = np.asarray(file["time_bnds"][:], dtype=np.float64)
+                self.time_s, self.start_s = middle(bounds_s), bounds_s[:, 0]
                 self.epoch_file = read_column(file["epoch_file"]).view(self.epoch_file.dtype)[:, 0]
                 for source in file["elevation"].virtual_sources():
                     is_whole_file = source.src_space.get_select_type() == h5py.h5s.SEL_ALL
@@ -159,8 +160,10 @@ def source_files(series_path: Path) -> set[Path]:
 
 
 def data_folder(site_or_folder: str | Path) -> Path:
-    """Return the data folder of a site file, or the folder itself."""
+    """Return the data folder of a site file or a `series.nc`, or the folder itself."""
     path = Path(site_or_folder)
+    if path.name == "series.nc" and not path.is_dir():
+        return path.parent
     if path.is_file() and path.suffix == ".toml":
         from station.config import read_site  # noqa: PLC0415 - a folder does not need pydantic
 

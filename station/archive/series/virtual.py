@@ -30,8 +30,15 @@ from station.archive.series.epoch_reader import (
 from station.archive.series.index import list_epochs
 from station.archive.series.manifest import SeriesManifest, listed_sources, pending_epochs, write_manifest
 from station.errors import StoreError
+from station.quantities import Quality
 
 LIBVER_VIRTUAL = ("v110", "v110")  # HDF5 version bounds; with newer ones only xarray can read the file
+SCALE_ATTRIBUTES = ("CLASS", "NAME", "REFERENCE_LIST", "_FillValue")  # of a dimension scale, written by HDF5
+COMMENT = (
+    "This file is virtual: times and rasters are read from days/, months/ and epochs/ beside it; copy the"
+    " whole folder. Without a source, its times are 9.96921e36 and its rasters empty: the number of valid"
+    " cells of elevation_change is then below valid_count."
+)
 
 
 def build_series(series: Series) -> Path:
@@ -51,13 +58,13 @@ def build_series(series: Series) -> Path:
     last_chunk = read_source(series.path, unchanged, unchanged, manifest.count - unchanged)
     with atomic_write(series.path) as tmp_path:
         with netCDF4.Dataset(tmp_path, "w", clobber=False) as file:
-            write_scalars(file, series, _title(series), [last_chunk, *new_sources], manifest.parameters)
+            _write_stored(file, series, [last_chunk, *new_sources], manifest.parameters)
         with h5py.File(tmp_path, "r+", libver=LIBVER_VIRTUAL) as file:
             with h5py.File(series.path, "r") as old_file:
                 copy_unchanged(
-                    old_file, file, ("time", "time_bnds", *(spec.name for spec in SMALL_VARIABLES)), unchanged
+                    old_file, file, ("time_bnds", *(spec.name for spec in SMALL_VARIABLES)), unchanged
                 )
-            _link_rasters(file, series, [*manifest.sources, *new_sources], manifest.parameters)
+            _link_sources(file, series, [*manifest.sources, *new_sources], manifest.parameters)
     write_manifest(series, replace(manifest, sources=[*manifest.sources, *new_sources]))
     return series.path
 
@@ -72,17 +79,22 @@ def _rebuild(series: Series) -> Path:
         parameters = source.parameters | parameters
     with atomic_write(series.path) as tmp_path:
         with netCDF4.Dataset(tmp_path, "w", clobber=False) as file:
-            write_scalars(file, series, _title(series), epoch_sources, parameters)
+            _write_stored(file, series, epoch_sources, parameters)
         with h5py.File(tmp_path, "r+", libver=LIBVER_VIRTUAL) as file:
-            _link_rasters(file, series, epoch_sources, parameters)
+            _link_sources(file, series, epoch_sources, parameters)
         _touch_replaced(series, {source.path for source in epoch_sources})
     newest_start_s = max(epoch.start for epoch in epochs).timestamp()
     write_manifest(series, SeriesManifest(epoch_sources, parameters, epochs[-1].time_s, newest_start_s))
     return series.path
 
 
-def _title(series: Series) -> str:
-    return f"Elevation change at {series.name or series.station_id}"
+def _write_stored(
+    file: netCDF4.Dataset, series: Series, epoch_sources: list[EpochSource], parameters: Parameters
+) -> None:
+    """Write all that the series contains itself."""
+    title = f"Elevation change at {series.name or series.station_id}"
+    write_scalars(file, series, title, epoch_sources, parameters)
+    file.comment = " ".join(filter(None, [dict(series.metadata).get("comment"), COMMENT]))
 
 
 def _touch_replaced(series: Series, used: set[Path]) -> None:
@@ -143,25 +155,26 @@ def _parameter_indices(source: EpochSource, parameters: Parameters) -> list[int]
     return [index_of[name] for name in source.parameters]
 
 
-def _link_rasters(
+def _link_sources(
     file: Any,  # noqa: ANN401 - h5py has no types
     series: Series,
     epoch_sources: list[EpochSource],
     parameters: Parameters,
 ) -> None:
-    """Add the large variables as virtual datasets, with paths relative to the series.
+    """Add the time and the large variables as virtual datasets, with paths relative to the series.
 
     Uses h5py's low-level API, because the high-level API dominates the time for a hundred files.
     """
     write_time_coverage(file)
     paths = [str(source.path.relative_to(series.folder)).encode() for source in epoch_sources]
+    _link_time(file, epoch_sources, paths)
     spaces: dict[tuple[object, ...], list[tuple[Any, Any]]] = {}  # the same for all rasters
     for spec in LARGE_VARIABLES:
         if not any(spec.name in source.raster_shapes for source in epoch_sources):
             continue
         shape = tuple(len(file[dim]) for dim in spec.dims)
         layout = h5py.h5p.create(h5py.h5p.DATASET_CREATE)
-        layout.set_fill_value(np.array(FILL if spec.dtype[0] == "f" else 0, spec.dtype))
+        layout.set_fill_value(np.array(_fill_value(spec), spec.dtype))
         for source, path in zip(epoch_sources, paths, strict=True):
             if spec.name in source.raster_shapes:
                 key = (source.series_start, spec.dims, source.raster_shapes[spec.name])
@@ -174,6 +187,40 @@ def _link_rasters(
             file.id, spec.name.encode(), dtype, h5py.h5s.create_simple(shape), layout
         )
         _write_raster_attrs(h5py.Dataset(dataset_id), file, spec, series)
+
+
+def _fill_value(spec: Variable) -> float:
+    """Return the value of cells without a source."""
+    return FILL if spec.dtype[0] == "f" else int(Quality.NOT_SEEN) if spec.name == "quality" else 0
+
+
+def _link_time(file: Any, epoch_sources: list[EpochSource], paths: list[bytes]) -> None:  # noqa: ANN401
+    """Replace the time by a virtual dataset, so that an epoch has no valid time if its file is missing.
+
+    The fill value is a time that xarray refuses to decode; NaN would pass as missing.
+    """
+    stored = file["time"]
+    count, attached = len(stored), stored.attrs["REFERENCE_LIST"]
+    attributes_of_time = {key: stored.attrs[key] for key in stored.attrs if key not in SCALE_ATTRIBUTES}
+    dependents = [(h5py.Dataset(h5py.h5r.dereference(ref, file.id)), axis) for ref, axis in attached]
+    for variable, axis in dependents:
+        variable.dims[int(axis)].detach_scale(stored)
+    del file["time"]
+    layout = h5py.h5p.create(h5py.h5p.DATASET_CREATE)
+    layout.set_fill_value(np.array(FILL))
+    for source, path in zip(epoch_sources, paths, strict=True):
+        series_space = h5py.h5s.create_simple((count,), (h5py.h5s.UNLIMITED,))
+        series_space.select_hyperslab((source.series_start,), (source.count,))
+        file_space = h5py.h5s.create_simple((source.file_length,))
+        file_space.select_hyperslab((source.file_start,), (source.count,))
+        layout.set_virtual(series_space, path, b"time", file_space)
+    space = h5py.h5s.create_simple((count,), (h5py.h5s.UNLIMITED,))  # for tools that want a record dimension
+    time = h5py.Dataset(h5py.h5d.create(file.id, b"time", h5py.h5t.IEEE_F64LE, space, layout))
+    time.make_scale("time")
+    for key, value in attributes_of_time.items():
+        time.attrs[key] = value
+    for variable, axis in dependents:
+        variable.dims[int(axis)].attach_scale(time)
 
 
 def _hyperslabs(

@@ -5,8 +5,11 @@ from dataclasses import replace
 from datetime import UTC, datetime
 
 import h5py
+import netCDF4
 import numpy as np
 import pytest
+import rasterio
+import rioxarray  # noqa: F401 - ds.rio
 import xarray as xr
 from support.epochs import GRID, make_epoch
 
@@ -98,6 +101,43 @@ def test_an_open_series_stays_readable_while_the_service_writes(copied):
         assert ds.sizes["time"] == len(HOURS) + 1
 
 
+@pytest.mark.filterwarnings("ignore::PendingDeprecationWarning")  # of rioxarray, about affine
+def test_rasters_carry_the_coordinate_system_of_the_map(stored, tmp_path):
+    with station.open(stored.path) as ds:
+        assert ds.elevation_change.rio.crs.to_epsg() == 32632
+        ds.elevation_change[0].rio.to_raster(tmp_path / "change.tif")
+    with rasterio.open(tmp_path / "change.tif") as tif:
+        assert (tif.crs.to_epsg(), tif.bounds.top) == (32632, GRID.north_m)
+
+
+@pytest.mark.parametrize(
+    ("chunks", "expected"),
+    [({}, (6, 140, 150)), ({"time": 2, "x": 128}, (2, 140, 128)), ("auto", (6, 140, 150))],
+)
+def test_chunks_of_dask(stored, chunks, expected):
+    with station.open(stored.folder, chunks) as ds, station.open(stored.folder) as plain:
+        assert tuple(sizes[0] for sizes in ds.elevation_change.chunks) == expected
+        assert ds.scan_id.chunks is None
+        xr.testing.assert_identical(
+            ds.elevation_change.mean("time").load(), plain.elevation_change.mean("time")
+        )
+
+
+@pytest.mark.parametrize("chunks", [None, {}])
+def test_a_part_of_the_series_is_written_compressed_and_without_a_warning(stored, tmp_path, chunks):
+    """pytest turns warnings into errors."""
+    with station.open(stored.folder, chunks) as ds:
+        part = ds.isel(time=slice(1, 4), x=slice(10, 60))
+        part.to_netcdf(tmp_path / "part.nc")
+        assert "virtual" not in part.attrs.get("comment", "")
+        with xr.open_dataset(tmp_path / "part.nc", decode_timedelta=False) as written:
+            xr.testing.assert_equal(written.set_coords(["crs", "time_bnds", "x_bnds", "y_bnds"]), part)
+    with netCDF4.Dataset(tmp_path / "part.nc") as file:
+        assert file["elevation_change"].filters()["zlib"]
+        assert "_FillValue" not in file["time"].ncattrs()
+        assert file["elevation_change"].chunking() != "contiguous"
+
+
 def test_a_damaged_chunk_raises_an_error(copied):
     damaged = list_epochs(copied)[3]
     with h5py.File(damaged.path) as file:
@@ -114,7 +154,9 @@ def test_a_damaged_chunk_raises_an_error(copied):
 def test_read_column_equals_h5py(stored, tmp_path):
     with h5py.File(stored.path) as file:
         columns = [dataset for dataset in file.values() if dataset.chunks and len(dataset) == len(HOURS)]
-        assert {"epoch_file", "time", "verdict", "point_total"} <= {column.name[1:] for column in columns}
+        assert {"epoch_file", "time_bnds", "verdict", "point_total"} <= {
+            column.name[1:] for column in columns
+        }
         for column in columns:
             assert read_column(column).dtype == column.dtype
             assert np.array_equal(read_column(column), column[:])

@@ -1,0 +1,232 @@
+"""`boxes.nc` and `daily.nc`: change of blocks of cells over time with its σ, computed from the epochs.
+
+Ordinary files, which any program reads. They grow by one entry after the other: a new one is appended to a
+copy, which then replaces the file.
+"""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable, Mapping
+from contextlib import ExitStack
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import h5py
+import netCDF4
+import numpy as np
+
+from station.archive.atomic_files import atomic_write
+from station.archive.chunk_codec import read_column
+from station.archive.derived.fingerprints import is_intact, write_fingerprints
+from station.archive.discovery import time_coverage
+from station.archive.netcdf_layout import (
+    TIMES_PER_CHUNK,
+    Series,
+    create_file,
+    create_variable,
+    encode_text,
+    write_global_attrs,
+)
+from station.archive.schema import BY_NAME, FILL, RASTER, SAFE_BOUND, TEXT, TEXT_LENGTH, Variable
+from station.quantities import Floats, Grid
+
+Array = np.ndarray[Any, Any]
+Rasters = Mapping[str, Array]
+
+BOXES, DAILY = "boxes.nc", "daily.nc"
+BOX_M, DAILY_BLOCK_M = 100.0, 10.0
+_SOURCES = Variable("sources", TEXT, "S1", "name of the epoch file, or SHA-256 of the names of several")
+_KEYS = (_SOURCES, BY_NAME["reference_version"])
+
+
+@dataclass(frozen=True)
+class BlockFile:
+    """A file of blocks of cells."""
+
+    name: str
+    title: str
+    time: str  # what the time is
+    grid: Grid  # of the blocks
+    variables: tuple[Variable, ...]
+
+
+@dataclass(frozen=True)
+class Entries:
+    """Time intervals of a block file, in order of time, and what each is computed from."""
+
+    start_s: Floats  # (n,) since 1970
+    end_s: Floats
+    sources: Array  # (n,) texts as bytes
+    reference_version: Array
+
+    def __len__(self) -> int:
+        """Return the number of entries."""
+        return len(self.start_s)
+
+    @property
+    def keys(self) -> Array:
+        """What an entry is computed from, as one text (n,)."""
+        return _joined(self.sources, self.reference_version)
+
+
+def _joined(*texts: Array) -> Array:
+    """Return texts (n,) of the length of `text`, joined one by one."""
+    length = TEXT_LENGTH["text"]
+    characters = [column.astype(f"S{length}").view("S1").reshape(-1, length) for column in texts]
+    return np.concatenate(characters, axis=1).view(f"S{length * len(texts)}")[:, 0]
+
+
+def _variables(cell_methods: str) -> tuple[Variable, ...]:
+    one_sigma = "one standard deviation of the mean of the block"
+    return (
+        Variable(
+            "elevation_change",
+            RASTER,
+            "f4",
+            "mean elevation above the reference surface of the block's observed cells",
+            "m",
+            None,
+            4,
+            cell_methods,
+            ancillary=("elevation_change_uncertainty", "elevation_change_random_uncertainty", "coverage"),
+        ),
+        Variable(
+            "elevation_change_uncertainty",
+            RASTER,
+            "f4",
+            "uncertainty of the elevation change of the block",
+            "m",
+            None,
+            5,
+            None,
+            f"{one_sigma}, everything included; {SAFE_BOUND}",
+        ),
+        Variable(
+            "elevation_change_random_uncertainty",
+            RASTER,
+            "f4",
+            "random uncertainty of the elevation change of the block",
+            "m",
+            None,
+            5,
+            None,
+            f"{one_sigma}; the part that is independent between blocks",
+        ),
+        Variable("coverage", RASTER, "f4", "share of the block's cells that have a change", "1", None, 3),
+    )
+
+
+_COUNT = Variable(
+    "epoch_count", RASTER, "i2", "number of epochs of the day in which the block was observed", "1"
+)
+BOX_VARIABLES = _variables("area: mean")
+DAILY_VARIABLES = (*_variables("area: mean time: mean"), _COUNT)
+
+
+def box_file(grid: Grid, cells: int) -> BlockFile:
+    """Return the description of `boxes.nc`: blocks of `cells` × `cells`, every epoch."""
+    title = "Elevation change of blocks of cells"
+    return BlockFile(BOXES, title, "middle of the scan", _coarse(grid, cells), BOX_VARIABLES)
+
+
+def daily_file(grid: Grid, cells: int) -> BlockFile:
+    """Return the description of `daily.nc`: daily means of blocks of `cells` × `cells`."""
+    title = "Daily mean elevation change of blocks of cells"
+    return BlockFile(DAILY, title, "middle of the day", _coarse(grid, cells), DAILY_VARIABLES)
+
+
+def _coarse(grid: Grid, cells: int) -> Grid:
+    """Return the grid of blocks; those at the east and south edges may extend beyond the grid."""
+    return Grid(grid.west_m, grid.north_m, grid.cell_m * cells, -(-grid.nx // cells), -(-grid.ny // cells))
+
+
+def update_blocks(
+    series: Series,
+    block_file: BlockFile,
+    entries: Entries,
+    compute: Callable[[int], Rasters],
+    progress: Callable[[], None],
+) -> Path | None:
+    """Bring a file of blocks up to date with its entries and return its path.
+
+    `compute` returns the rasters of the entry at an index; those already in the file are copied, unless it is
+    damaged. Returns None and writes nothing without entries. `progress` is called after each entry written.
+    Raises StoreError if an epoch is damaged or the file cannot be written; the old file remains.
+    """
+    path = series.folder / block_file.name
+    if not len(entries):
+        return None
+    blocks = replace(series, grid=block_file.grid)
+    wanted = entries.keys
+    stored = _stored_keys(path, blocks) if is_intact(path) else wanted[:0]
+    if np.array_equal(stored, wanted):
+        return path
+    is_kept = 0 < len(stored) <= len(wanted)  # a file cannot become shorter
+    unchanged = np.zeros(len(wanted), np.bool_)
+    if is_kept:
+        unchanged[: len(stored)] = stored == wanted[: len(stored)]
+    position = {key: index for index, key in enumerate(stored.tolist())}
+    with atomic_write(path) as tmp_path, ExitStack() as stack:
+        if is_kept:
+            shutil.copyfile(path, tmp_path)
+        old = stack.enter_context(netCDF4.Dataset(path)) if position else None
+        with netCDF4.Dataset(tmp_path, "r+" if is_kept else "w") as file:
+            if is_kept:
+                write_global_attrs(file, blocks, _title(blocks, block_file))
+            else:
+                _create(file, blocks, block_file)
+            for index in np.flatnonzero(~unchanged).tolist():
+                old_index = position.get(wanted[index])
+                if old is None or old_index is None:
+                    rasters = compute(index)
+                else:
+                    rasters = _read(old, block_file, old_index)
+                _write(file, block_file, entries, index, rasters)
+                progress()
+            file.setncatts(time_coverage(entries.start_s[0], entries.end_s[-1]))
+        write_fingerprints(path, tmp_path)
+    return path
+
+
+def _stored_keys(path: Path, blocks: Series) -> Array:
+    """Return the keys of the entries in a file; none if it is of another grid."""
+    with h5py.File(path, "r") as file:
+        is_same_grid = all(
+            np.array_equal(file[axis][:], centres_m)
+            for axis, centres_m in (("x", blocks.grid.x_m), ("y", blocks.grid.y_m))
+        )
+        columns = [read_column(file[spec.name]) for spec in _KEYS]
+    texts = [np.ascontiguousarray(column).view(f"S{column.shape[1]}")[:, 0] for column in columns]
+    return _joined(*texts)[: None if is_same_grid else 0]
+
+
+def _title(blocks: Series, block_file: BlockFile) -> str:
+    return f"{block_file.title} at {blocks.name or blocks.station_id}"
+
+
+def _create(file: netCDF4.Dataset, blocks: Series, block_file: BlockFile) -> None:
+    create_file(file, blocks, _title(blocks, block_file), TIMES_PER_CHUNK)
+    file["time"].long_name = block_file.time
+    for spec in (*block_file.variables, *_KEYS):
+        create_variable(file, spec, blocks, TIMES_PER_CHUNK)
+
+
+def _write(
+    file: netCDF4.Dataset, block_file: BlockFile, entries: Entries, index: int, rasters: Rasters
+) -> None:
+    start_s, end_s = entries.start_s[index], entries.end_s[index]
+    file["time"][index] = (start_s + end_s) / 2
+    file["time_bnds"][index] = (start_s, end_s)
+    for spec, texts in zip(_KEYS, (entries.sources, entries.reference_version), strict=True):
+        file[spec.name][index] = encode_text([texts[index].decode()], "text")[0]
+    for spec in block_file.variables:
+        values = rasters[spec.name]
+        file[spec.name][index] = np.where(np.isfinite(values), values, FILL) if spec.dtype == "f4" else values
+
+
+def _read(file: netCDF4.Dataset, block_file: BlockFile, index: int) -> Rasters:
+    """Return the stored rasters of an entry."""
+    file.set_auto_mask(False)
+    return {spec.name: np.asarray(file[spec.name][index]) for spec in block_file.variables}

@@ -1,0 +1,279 @@
+"""Change of blocks of cells and its σ: of every epoch, and of daily means.
+
+The systematic errors of a block are those of its mean surface: the Jacobian is linear in the gradient and
+changes little within 10 m. Larger blocks are weighted sums of such blocks. Source: equations.md, 6.2.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from itertools import combinations
+from typing import Any
+
+import h5py
+import numpy as np
+from scipy import sparse
+
+from station.archive.chunk_codec import read_column
+from station.archive.derived.boxes import (
+    BOX_M,
+    DAILY_BLOCK_M,
+    Entries,
+    Rasters,
+    box_file,
+    daily_file,
+    update_blocks,
+)
+from station.archive.epochs import EpochRef
+from station.archive.netcdf_layout import CHUNK, Series
+from station.archive.raster_io import LazyRaster
+from station.archive.schema import FILL, VERDICTS
+from station.archive.series.index import SeriesIndex
+from station.quantities import Bools, Floats, Ints, Quality, SharedParameters
+from station.queries.aggregates import CHANGE, RANDOM, Aggregates, EpochCells
+from station.science.analysis.calibration import SparseJacobian
+from station.science.geometry.terrain import GRADIENT_CELLS, smooth_gradient
+from station.science.uncertainty.common_mode import cross_covariance
+from station.science.uncertainty.jacobian import HeightJacobian, height_jacobian
+from station.science.uncertainty.propagation import difference_to_reference
+
+DAY_S = 86_400.0
+MIN_GRADIENT_BLOCKS = 0.5  # one sigma of the Gaussian
+
+
+@dataclass(frozen=True)
+class Blocks:
+    """Means over blocks of cells (by, bx) of an epoch; zero where none has a change."""
+
+    count: Floats  # cells with a change
+    change_m: Floats
+    random_m2: Floats  # variance of the mean
+    reference_m2: Floats  # the part of it that comes from the reference
+    jacobian: HeightJacobian | None  # of the observed blocks; None if the epoch has no shared parameters
+    cells: EpochCells  # without cells: the shared parameters
+
+    @property
+    def observed(self) -> Bools:
+        """Blocks with a change."""
+        return np.asarray(self.count > 0)
+
+    @property
+    def parameters(self) -> tuple[str, ...]:
+        """Names of the shared parameters; they depend on the position of the scanner."""
+        return () if self.cells.shared is None else self.cells.shared.names
+
+    @property
+    def shared(self) -> SharedParameters | None:
+        """Shared parameters relative to the reference."""
+        own, reference = self.cells.shared, self.cells.reference.shared
+        return own if own is None or self.cells.adjusted else difference_to_reference(own, reference)
+
+
+class BlockQueries:
+    """Blocks of about 10 m, and boxes of about 100 m made of them, of the epochs of a store."""
+
+    def __init__(self, series: Series) -> None:
+        self._aggregates, self._grid = Aggregates(series), series.grid
+        self.cells = max(round(DAILY_BLOCK_M / series.grid.cell_m), 1)  # rows and columns of a block
+        self.blocks_per_box = max(round(BOX_M / (self.cells * series.grid.cell_m)), 1)
+
+    def boxes(self, epoch: EpochRef) -> Rasters:
+        """Return the rasters of `boxes.nc` of an epoch."""
+        blocks, size = self._read(epoch), self.blocks_per_box
+        shape = -(-blocks.count.shape[0] // size), -(-blocks.count.shape[1] // size)
+        row, column = np.nonzero(blocks.observed)
+        box, count = row // size * shape[1] + column // size, blocks.count[blocks.observed]
+        total = np.bincount(box, count, shape[0] * shape[1])
+        entries = count / total[box], (box, np.arange(len(box)))
+        weights = sparse.csr_array(entries, shape=(len(total), len(box)))
+        independent_m2 = blocks.random_m2[blocks.observed]
+        random_m2 = variance_m2 = weights.power(2) @ independent_m2
+        if blocks.jacobian is not None and blocks.shared is not None:
+            variance_m2 = (
+                SparseJacobian(blocks.jacobian).sums(weights).variance(independent_m2, blocks.shared)
+            )
+        rasters = {
+            CHANGE: weights @ blocks.change_m[blocks.observed],
+            f"{CHANGE}_uncertainty": np.sqrt(variance_m2),
+            RANDOM: np.sqrt(random_m2),
+            "coverage": total / (self.cells * size) ** 2,
+        }
+        return {name: np.where(total > 0, v, np.nan).reshape(shape) for name, v in rasters.items()}
+
+    def daily_mean(self, epochs: Sequence[EpochRef]) -> Rasters:
+        """Return the rasters of `daily.nc` of the epochs of a day, which have one reference.
+
+        Every epoch in which a block was observed has the same weight, except those with other shared
+        parameters than the last, which are left out. The errors of the reference, and those that similar
+        change causes, are common to all epochs. Blocks that some epochs did not observe get the mean
+        covariance of the day.
+        """
+        day = [self._read(epoch) for epoch in epochs]
+        day = [blocks for blocks in day if blocks.parameters == day[-1].parameters]
+        epoch_count = np.sum([blocks.observed for blocks in day], axis=0)
+        seen, count = epoch_count > 0, np.maximum(epoch_count, 1)
+        change_m, random_m2, reference_m2, cells = (
+            np.sum([getattr(blocks, name) for blocks in day], axis=0)
+            for name in ("change_m", "random_m2", "reference_m2", "count")
+        )
+        random_m2 = np.maximum(random_m2 - reference_m2, 0.0) / count**2 + reference_m2 / count
+        single, common = mean_covariances(day)
+        shared_m2, missing = np.zeros(count.shape), seen.copy()
+        for blocks in day:
+            first = missing & blocks.observed
+            if blocks.jacobian is not None and single is not None and common is not None:
+                jacobian = blocks.jacobian.take(first[blocks.observed])
+                single_m2, common_m2 = (np.asarray(jacobian.variance(shared)) for shared in (single, common))
+                shared_m2[first] = common_m2 + np.maximum(single_m2 - common_m2, 0.0) / count[first]
+            missing &= ~first
+        rasters = {
+            CHANGE: change_m / count,
+            f"{CHANGE}_uncertainty": np.sqrt(random_m2 + shared_m2),
+            RANDOM: np.sqrt(random_m2),
+            "coverage": cells / count / self.cells**2,
+        }
+        return {name: np.where(seen, values, np.nan) for name, values in rasters.items()} | {
+            "epoch_count": epoch_count
+        }
+
+    def _read(self, epoch: EpochRef) -> Blocks:
+        """Return the blocks of an epoch; its rasters are read band by band."""
+        epoch_cells = self._aggregates.read_cells(epoch, np.zeros(self._grid.shape, np.bool_))
+        sums = self._sums(epoch, epoch_cells)
+        count = np.maximum(sums["count"], 1)
+        change_m, random_m2, reference_m2 = (
+            sums[name] / divisor
+            for name, divisor in (("change_m", count), ("random_m2", count**2), ("reference_m2", count**2))
+        )
+        jacobian = self._jacobian(epoch_cells, sums) if epoch_cells.shared is not None else None
+        return Blocks(sums["count"], change_m, random_m2, reference_m2, jacobian, epoch_cells)
+
+    def _sums(self, epoch: EpochRef, epoch_cells: EpochCells) -> dict[str, Floats]:
+        """Return sums (by, bx) over the cells of each block that have a change, and over those known."""
+        change, random, quality = (
+            LazyRaster(epoch.path, name, index=epoch.index) for name in (CHANGE, RANDOM, "quality")
+        )
+        reference, grid = epoch_cells.reference, self._grid
+        height = -(-CHUNK // self.cells) * self.cells
+        bands: list[dict[str, Floats]] = []
+        for top in range(0, grid.ny, height):
+            rows = slice(top, min(top + height, grid.ny))
+            change_m = np.asarray(change[rows], np.float64)
+            reference_m = np.asarray(reference.elevation_m[rows], np.float64)
+            known = np.isfinite(reference_m)
+            observed = known & (change_m < FILL / 2)
+            fields = {
+                "count": observed,
+                "change_m": change_m,
+                "random_m2": np.asarray(random[rows], np.float64) ** 2,
+                "reference_m2": np.asarray(reference.random_variance_m2[rows], np.float64),
+                "stable": (np.asarray(quality[rows]) & int(Quality.STABLE_GROUND)) > 0,
+                "x_m": np.broadcast_to(grid.x_m, observed.shape),
+                "y_m": np.broadcast_to(grid.y_m[rows, None], observed.shape),
+            }
+            sums = {
+                name: self._block_sums(np.where(observed, values, 0.0)) for name, values in fields.items()
+            }
+            sums["known"] = self._block_sums(known.astype(np.float64))
+            sums["reference_m"] = self._block_sums(np.where(known, reference_m, 0.0))
+            bands.append(sums)
+        return {name: np.concatenate([band[name] for band in bands]) for name in bands[0]}
+
+    def _block_sums(self, values: Floats) -> Floats:
+        rows, columns = (np.arange(0, size, self.cells) for size in values.shape)
+        return np.asarray(np.add.reduceat(np.add.reduceat(values, columns, axis=1), rows, axis=0))
+
+    def _jacobian(self, epoch_cells: EpochCells, sums: dict[str, Floats]) -> HeightJacobian:
+        """Return the Jacobian of the mean surfaces of the observed blocks."""
+        observed = sums["count"] > 0
+        with np.errstate(invalid="ignore"):
+            surface_m = sums["reference_m"] / sums["known"]
+        block_m = self.cells * self._grid.cell_m
+        gradient = smooth_gradient(surface_m, block_m, max(GRADIENT_CELLS / self.cells, MIN_GRADIENT_BLOCKS))
+        east, north = (np.nan_to_num(component[observed].astype(np.float64)) for component in gradient)
+        params, position_m = self._aggregates.parameter_layout_of(epoch_cells.scanner)
+        count = sums["count"][observed]
+        offset_m = (
+            sums["x_m"][observed] / count - position_m[0],
+            sums["y_m"][observed] / count - position_m[1],
+            surface_m[observed] - position_m[2],
+        )
+        stable = sums["stable"][observed] > count / 2
+        return height_jacobian(params, offset_m, east, north, stable=stable)
+
+
+def mean_covariances(day: Sequence[Blocks]) -> tuple[SharedParameters | None, SharedParameters | None]:
+    """Return the mean covariance of the shared parameters of epochs, and the mean of that between two epochs.
+
+    Both as shared parameters relative to the reference; None if the epochs have none.
+    """
+    known = [params for params in (blocks.shared for blocks in day) if params is not None]
+    if not known:
+        return None, None
+    single = replace(
+        known[-1],
+        covariance=np.mean([params.covariance for params in known], axis=0),
+        line_tilt_variance=np.mean([params.line_tilt_variance for params in known], axis=0),
+    )
+    between = np.zeros_like(single.covariance)
+    for first, second in combinations(day, 2):
+        covariance = _covariance_between(first.cells, second.cells)
+        if covariance is not None:
+            between += covariance + covariance.T
+    between /= max(len(day) * (len(day) - 1), 1)
+    return single, replace(single, covariance=between, line_tilt_variance=np.zeros_like(between[0]))
+
+
+def _covariance_between(first: EpochCells, second: EpochCells) -> Floats | None:
+    """Return the covariance (p, p) of the errors of two epochs, each relative to their common reference."""
+    if first.shared is None or second.shared is None or first.adjusted != second.adjusted:
+        return None
+    if first.adjusted:
+        return cross_covariance(first.shared, second.shared)
+    reference = first.reference.shared
+    return reference.covariance if reference is not None and reference.names == first.shared.names else None
+
+
+def update_boxes(series: Series, queries: BlockQueries, progress: Callable[[], None]) -> None:
+    """Bring `boxes.nc` and `daily.nc` up to date with the epochs of `series.nc` that have a reference.
+
+    A day is in `daily.nc` when a later day has begun; unusable epochs do not count. Raises as
+    `update_blocks`.
+    """
+    index = SeriesIndex(series)
+    if not len(index):
+        return
+    with h5py.File(series.path, "r") as file:
+        versions = read_column(file["reference_version"]).view(index.epoch_file.dtype)[:, 0]
+        usable = read_column(file["verdict"]) != VERDICTS.index("unusable")
+    measured = np.flatnonzero(versions != b"")
+    start_s, end_s = index.start_s, 2 * index.time_s - index.start_s
+    update_blocks(
+        series,
+        box_file(series.grid, queries.cells * queries.blocks_per_box),
+        Entries(start_s[measured], end_s[measured], index.epoch_file[measured], versions[measured]),
+        lambda entry: queries.boxes(index[int(measured[entry])]),
+        progress,
+    )
+    days = list(_closed_days(start_s // DAY_S, measured, usable, versions))
+    day_s = np.array([start_s[day[0]] // DAY_S * DAY_S for day in days])
+    sources = [hashlib.sha256(index.epoch_file[day].tobytes()).hexdigest() for day in days]
+    update_blocks(
+        series,
+        daily_file(series.grid, queries.cells),
+        Entries(day_s, day_s + DAY_S, np.array(sources, "S64"), versions[[day[0] for day in days]]),
+        lambda entry: queries.daily_mean([index[position] for position in days[entry].tolist()]),
+        progress,
+    )
+
+
+def _closed_days(
+    day_number: Floats, measured: Ints, usable: Bools, versions: np.ndarray[Any, Any]
+) -> Iterator[Ints]:
+    """Yield the usable epochs of each day before the last one, of the newest reference of that day."""
+    for epochs in np.split(measured, np.flatnonzero(np.diff(day_number[measured])) + 1)[:-1]:
+        chosen = epochs[usable[epochs]]
+        if len(chosen):
+            yield chosen[versions[chosen] == versions[chosen[-1]]]

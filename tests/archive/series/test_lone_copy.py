@@ -1,0 +1,89 @@
+"""A `series.nc` without the files that it reads from: every reader must see that something is missing."""
+
+import json
+import shutil
+import subprocess
+
+import numpy as np
+import pytest
+import xarray as xr
+
+import station
+from station.archive.epochs import write_epoch
+from station.archive.series.virtual import build_series
+from station.errors import StoreError
+
+ENGINES = ("netcdf4", "h5netcdf")
+NO_TIME_S = 9.96921e36
+
+
+@pytest.fixture
+def stored(series, epoch):
+    for hour in range(4):
+        write_epoch(series, epoch(hour))
+    return build_series(series)
+
+
+@pytest.fixture
+def lone(stored, tmp_path_factory):
+    return shutil.copy(stored, tmp_path_factory.mktemp("mail") / "series.nc")
+
+
+def run(*command):
+    if shutil.which(command[0]) is None:
+        pytest.skip(f"{command[0]} is not installed")
+    return subprocess.run(command, capture_output=True, text=True, check=False, timeout=120)
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+def test_a_complete_store_has_as_many_valid_cells_as_were_written(stored, engine):
+    with xr.open_dataset(stored, engine=engine) as ds:
+        assert ds.valid_count.values.tolist() == [140 * 75] * 4  # the western half of the grid
+        assert (ds.elevation_change.count(("y", "x")) == ds.valid_count).all()
+        middle = ds.time_bnds[:, 0] + (ds.time_bnds[:, 1] - ds.time_bnds[:, 0]) / 2
+        assert (ds.time == middle).all()
+        assert "copy the whole folder" in ds.comment
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+def test_xarray_refuses_a_lone_copy(lone, engine):
+    with pytest.raises(ValueError, match="unable to decode time"):
+        xr.open_dataset(lone, engine=engine)
+    with pytest.raises(StoreError, match="4 of its source files are missing"):
+        station.open(lone)
+
+
+def test_an_epoch_without_its_file_shows_itself(stored, series):
+    (lost,) = series.folder.glob("epochs/*/*/*/*T020000Z.nc")
+    lost.unlink()
+    with pytest.raises(OverflowError, match="time values outside range"):
+        xr.open_dataset(stored)
+    with pytest.raises(StoreError, match=rf"1 of its source files are missing.*{lost.name}"):
+        station.open(series.folder)
+    with xr.open_dataset(stored, decode_times=False) as ds:
+        assert (ds.time == NO_TIME_S).values.tolist() == [False, False, True, False]
+        is_complete = ds.elevation_change.count(("y", "x")) == ds.valid_count
+        assert is_complete.values.tolist() == [True, True, False, True]
+
+
+def test_a_reader_learns_that_files_were_deleted(series, stored):
+    with station.open(stored) as ds:
+        assert np.isfinite(ds.elevation_change[0]).any()
+        (lost,) = series.folder.glob("epochs/*/*/*/*T020000Z.nc")
+        lost.unlink()
+        with pytest.raises(StoreError, match=rf"{lost.name}: deleted since .* open the series again"):
+            ds.elevation_change[0].load()
+
+
+@pytest.mark.integration
+def test_other_programs_show_that_a_lone_copy_has_no_times(lone, tmp_path):
+    assert f"{NO_TIME_S:g}" in run("ncdump", "-v", "time", str(lone)).stdout
+    a_date = "2025-11-21 01:00:00", "2025-11-21 03:00:00"
+    selected = run("ncks", "-O", "-3", "-d", f"time,{','.join(a_date)}", str(lone), str(tmp_path / "part.nc"))
+    assert selected.returncode != 0
+    assert "does not fall within valid coordinate range" in selected.stdout + selected.stderr
+    bands = json.loads(run("gdalinfo", "-json", f"NETCDF:{lone}:elevation_change").stdout)["bands"]
+    times_s = [float(band["metadata"][""]["NETCDF_DIM_time"]) for band in bands]
+    assert times_s == pytest.approx([NO_TIME_S] * 4)
+    (dates,) = run("cdo", "-s", "showdate", "-selname,elevation_change", str(lone)).stdout.splitlines()
+    assert "2025" not in dates

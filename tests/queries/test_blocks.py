@@ -1,0 +1,201 @@
+"""`boxes.nc` and `daily.nc`: σ of blocks against the propagation over all their cells, and how they grow."""
+
+import shutil
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import xarray as xr
+from support.shared_parameters import SCANNER, random_shared
+
+import station
+from station.archive import epochs
+from station.archive.derived.fingerprints import is_intact
+from station.archive.netcdf_layout import Series
+from station.archive.reference_files import write_reference
+from station.archive.series.index import SeriesIndex, list_epochs
+from station.archive.series.virtual import build_series
+from station.quantities import Grid, Measurement, Quality, Reference
+from station.queries.blocks import BlockQueries, update_boxes
+
+GRID = Grid(
+    west_m=632_000.0, north_m=5_186_000.0, cell_m=2.0, nx=130, ny=90
+)  # the boxes at the edges are cut
+START_S = 1_763_683_200.0  # 2025-11-21 00:00 UTC
+HOURS = (1, 5, 20, 26, 30)
+REFERENCE_M = 0.01
+RANDOM_M = 0.05
+
+
+def make_epoch(hour, *, verdict="good"):
+    rng = np.random.default_rng(hour)
+    observed = rng.uniform(size=GRID.shape) < 0.8
+    observed[60:, :40] = False
+    change_m = np.where(observed, rng.normal(hour / 10, 0.05, GRID.shape), np.nan).astype(np.float32)
+    sigma_m = np.where(observed, RANDOM_M, np.nan).astype(np.float32)
+    stable = np.where(GRID.x_m[None, :] < 632_100, int(Quality.STABLE_GROUND), 0)
+    measurement = Measurement.from_rasters(
+        GRID,
+        np.where(observed, stable, 0).astype(np.uint8),
+        elevation_m=np.where(observed, 2900.0, np.nan),
+        change_m=change_m,
+        uncertainty_m=2 * sigma_m,
+        random_uncertainty_m=sigma_m,
+        spread_m=sigma_m,
+        count=observed.astype(np.int32),
+    )
+    return epochs.Epoch(
+        start_s=START_S + 3600 * hour,
+        end_s=START_S + 3600 * hour + 900,
+        scan_id=f"scan_{hour}",
+        measurement=measurement,
+        shared=random_shared(hour, GRID),
+        verdict=verdict,
+        verdict_reason="",
+        scalars=SCANNER,
+        provenance={"adjustment": "joint", "reference_version": "1"},
+    )
+
+
+def reference():
+    """Rough terrain with a slope of 20 to 40 %."""
+    x_m, y_m = GRID.x_m[None, :] - GRID.west_m, GRID.y_m[:, None] - GRID.north_m
+    elevation_m = 2800 + 0.3 * x_m - 0.2 * y_m + 4 * np.sin(x_m / 15) * np.cos(y_m / 20)
+    surface = Reference.from_elevation(GRID, "1", elevation_m)
+    return replace(surface, random_variance_m2=np.full(GRID.shape, REFERENCE_M**2, np.float32))
+
+
+@pytest.fixture(scope="module")
+def base(tmp_path_factory):
+    series = Series(tmp_path_factory.mktemp("store"), "hef", GRID, "EPSG:32632")
+    write_reference(series, reference())
+    for hour in HOURS:
+        epochs.write_epoch(series, make_epoch(hour))
+    build_series(series)
+    update_boxes(series, BlockQueries(series), lambda: None)
+    return series
+
+
+@pytest.fixture
+def stored(base, tmp_path):
+    return replace(base, folder=shutil.copytree(base.folder, tmp_path / "store"))
+
+
+def read(series, name):
+    with xr.open_dataset(series.folder / name) as ds:
+        return ds.load()
+
+
+def box_mask(row, column, cells):
+    mask = np.zeros(GRID.shape, bool)
+    mask[row * cells : (row + 1) * cells, column * cells : (column + 1) * cells] = True
+    return mask
+
+
+@pytest.mark.parametrize("index", [0, 4])
+def test_boxes_have_the_sigma_of_the_mean_of_their_cells(base, index):
+    boxes, changes = read(base, "boxes.nc"), station.open(base.folder).elevation_change[index].values
+    assert (boxes.sizes["y"], boxes.sizes["x"]) == (2, 3)
+    assert (boxes.x[1] - boxes.x[0], boxes.y[0] - boxes.y[1]) == (100, 100)
+    for row in range(2):
+        for column in range(3):
+            mask, box = box_mask(row, column, 50), boxes.isel(time=index, y=row, x=column)
+            observed = np.isfinite(changes[mask])
+            assert box.elevation_change == pytest.approx(np.nanmean(changes[mask]), abs=1e-4)
+            assert box.coverage == pytest.approx(observed.sum() / 2500, abs=1e-3)
+            exact_m = station.variance(base.folder, mask, index) ** 0.5
+            assert exact_m > 2 * RANDOM_M / np.sqrt(observed.sum())  # shared errors dominate
+            assert box.elevation_change_uncertainty == pytest.approx(exact_m, rel=0.01)
+            assert box.elevation_change_random_uncertainty == pytest.approx(
+                RANDOM_M / np.sqrt(observed.sum()), rel=0.02
+            )
+
+
+def test_times_are_those_of_the_series(base):
+    boxes, daily = read(base, "boxes.nc"), read(base, "daily.nc")
+    with station.open(base.folder) as ds:
+        assert (boxes.time == ds.time).all()
+        assert (boxes.time_bnds.values == ds.time_bnds.values).all()
+    assert (daily.time.values == np.array(["2025-11-21T12"], "M8[ns]")).all()  # the next day is not over
+    assert daily.time_bnds.values[0, 1] == np.datetime64("2025-11-22")
+
+
+def test_a_daily_mean_has_the_sigma_of_three_epochs(base):
+    """Var(mean) = Σᵢⱼ covᵢⱼ / n², each covᵢⱼ from the variance of the difference of two epochs."""
+    daily = read(base, "daily.nc").isel(time=0)
+    with station.open(base.folder) as ds:
+        changes = ds.elevation_change[:3].values
+    for row, column in ((3, 4), (10, 20), (14, 11)):
+        mask, block = box_mask(row, column, 5), daily.isel(y=row, x=column)
+        expected_m = np.mean([np.nanmean(change[mask]) for change in changes])
+        assert block.elevation_change == pytest.approx(expected_m, abs=1e-4)
+        assert block.epoch_count == 3
+        common = mask & np.isfinite(changes).all(axis=0)
+        variances = [station.variance(base.folder, mask, index) for index in range(3)]
+        covariances = [
+            (
+                station.variance(base.folder, common, first)
+                + station.variance(base.folder, common, second)
+                - station.variance(base.folder, common, first, second)
+            )
+            / 2
+            for first, second in ((0, 1), (0, 2), (1, 2))
+        ]
+        exact_m = np.sqrt(sum(variances) + 2 * sum(covariances)) / 3
+        assert block.elevation_change_uncertainty == pytest.approx(exact_m, rel=0.03)
+    assert np.isnan(daily.elevation_change[15, 3])
+    assert daily.epoch_count[15, 3] == 0
+
+
+def test_only_new_epochs_are_computed_and_the_result_is_that_of_a_new_file(stored, monkeypatch):
+    computed = []
+    original = BlockQueries.boxes
+    monkeypatch.setattr(
+        BlockQueries, "boxes", lambda self, epoch: computed.append(epoch.epoch_file) or original(self, epoch)
+    )
+    update_boxes(stored, BlockQueries(stored), lambda: None)
+    assert computed == []
+    added = [epochs.write_epoch(stored, make_epoch(hour)).path.name for hour in (49, 3)]  # the second is late
+    replaced = epochs.write_epoch(stored, make_epoch(20, verdict="unusable")).path.name
+    build_series(stored)
+    licensed = replace(stored, metadata=(("license", "CC-BY-4.0"),))
+    update_boxes(licensed, BlockQueries(licensed), lambda: None)
+    assert sorted(computed) == sorted([*added, replaced])
+    grown = [read(stored, name) for name in ("boxes.nc", "daily.nc")]
+    assert grown[0].attrs["license"] == "CC-BY-4.0"
+    assert grown[0].sources.values.tolist() == [epoch.epoch_file for epoch in SeriesIndex(stored)]
+    assert grown[1].epoch_count.max(("y", "x")).values.tolist() == [3, 2]  # unusable epochs do not count
+    for name in ("boxes.nc", "daily.nc"):
+        (stored.folder / name).unlink()
+    update_boxes(stored, BlockQueries(stored), lambda: None)
+    for name, old in zip(("boxes.nc", "daily.nc"), grown, strict=True):
+        xr.testing.assert_equal(read(stored, name), old)
+
+
+@pytest.mark.parametrize(
+    ("with_parameters", "expected"), [((False, True, True), 2), ((True, True, False), 1)]
+)
+def test_a_daily_mean_is_of_epochs_with_the_same_shared_parameters(tmp_path, with_parameters, expected):
+    """Otherwise the systematic error of some epochs would be missing."""
+    series = Series(tmp_path, "hef", GRID, "EPSG:32632")
+    write_reference(series, reference())
+    for hour, known in zip((1, 5, 20), with_parameters, strict=True):
+        epoch = make_epoch(hour)
+        epochs.write_epoch(series, epoch if known else replace(epoch, shared=None, scalars={}))
+    rasters = BlockQueries(series).daily_mean(list_epochs(series))
+    assert rasters["epoch_count"].max() == expected
+    has_systematic = np.nanmax(
+        rasters["elevation_change_uncertainty"] - rasters["elevation_change_random_uncertainty"]
+    )
+    assert (has_systematic > 1e-3) == (expected == 2)
+
+
+def test_a_damaged_file_is_computed_again(stored):
+    path = stored.folder / "boxes.nc"
+    expected, content = read(stored, "boxes.nc"), bytearray(path.read_bytes())
+    content[len(content) // 2] ^= 1
+    path.write_bytes(content)
+    assert not is_intact(path)
+    update_boxes(stored, BlockQueries(stored), lambda: None)
+    assert is_intact(path)
+    xr.testing.assert_equal(read(stored, "boxes.nc"), expected)
