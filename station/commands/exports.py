@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
 from enum import StrEnum
 from functools import cache
 from pathlib import Path
@@ -26,6 +27,12 @@ class ExportFormat(StrEnum):
     stac = "stac"
     netcdf = "netcdf"
     zarr = "zarr"
+    references = "references"
+    ncml = "ncml"
+    erddap = "erddap"
+
+
+OF_EPOCHS = {ExportFormat.geotiff, ExportFormat.csv, ExportFormat.stac}  # the others are of the series
 
 
 class ExportPeriod(StrEnum):
@@ -35,11 +42,26 @@ class ExportPeriod(StrEnum):
     month = "1M"
 
 
+@dataclass(frozen=True)
+class SeriesOptions:
+    """Options of the formats that contain or describe the series."""
+
+    every: str | None
+    area: str | None
+    variables: str | None
+    chunks: str | None
+    url: str | None
+
+
 def export(
     site: SiteArgument,
     kind: Annotated[
         ExportFormat,
-        typer.Argument(metavar="geotiff|csv|stac|netcdf|zarr", help="The format.", show_default=False),
+        typer.Argument(
+            metavar="geotiff|csv|stac|netcdf|zarr|references|ncml|erddap",
+            help="The format.",
+            show_default=False,
+        ),
     ],
     out: Annotated[Path, typer.Argument(metavar="[OUT]", help="Folder or file to write.")] = Path(),
     first: FromOption = None,
@@ -59,13 +81,22 @@ def export(
     ] = None,
     chunks: Annotated[
         str | None,
-        typer.Option(metavar="TIME,Y,X", help="NetCDF, Zarr: size of a chunk.  [default: 1,128,128]"),
+        typer.Option(
+            metavar="TIME,Y,X", help="NetCDF, Zarr: size of a chunk; default 1,128,128.", show_default=False
+        ),
+    ] = None,
+    url: Annotated[
+        str | None,
+        typer.Option(
+            metavar="URL", help="References: address of the data folder; default here.", show_default=False
+        ),
     ] = None,
 ) -> None:
     """Write files to pass on, or for tools that cannot read the series.
 
     netcdf and zarr: the series itself, complete and compressed, with the same values. Files that exist and
     whose epochs did not change are kept, so an interrupted export continues when it is repeated.
+    references, ncml and erddap describe it for the cloud and for data servers, without a copy.
     geotiff, stac and csv: the newest epoch, or those of a span; change and its uncertainty as GeoTIFF with
     QGIS styles, a STAC catalogue of these, or scans and areas as CSV.
     """
@@ -74,16 +105,15 @@ def export(
     from station.products.export import export as write_files
 
     settings, span = read_site(site), Span.parse(first, last)
-    if kind in {ExportFormat.netcdf, ExportFormat.zarr}:
-        for path in _export_series(
-            settings, kind.value, out, span, every and every.value, area, variables, chunks
-        ):
+    if kind not in OF_EPOCHS:
+        options = SeriesOptions(every and every.value, area, variables, chunks, url)
+        for path in _export_series(settings, kind.value, out, span, options):
             print(path)
         return
     if given := [name for name, value in (
-        ("--every", every), ("--area", area), ("--variables", variables), ("--chunks", chunks)
+        ("--every", every), ("--area", area), ("--variables", variables), ("--chunks", chunks), ("--url", url)
     ) if value is not None]:  # fmt: skip
-        raise typer.BadParameter(f"{given[0]} is for netcdf and zarr only")
+        raise typer.BadParameter(f"{given[0]} is for the series, not for {kind.value}")
     for path in write_files(
         settings, kind.value, span if first or last else None, out, progress_bar("writing")
     ):
@@ -95,10 +125,7 @@ def _export_series(
     kind: str,
     out: Path,
     span: Span,
-    every: str | None,
-    area: str | None,
-    variables: str | None,
-    chunks: str | None,
+    options: SeriesOptions,
 ) -> Iterator[Path]:
     """Yield each file of the series when it is written; files that are up to date are kept."""
     from station.processing.scan_tasks import series_for
@@ -107,9 +134,11 @@ def _export_series(
 
     file_format = FORMATS[kind]
     areas = settings.areas.file if settings.areas else None
-    box_m = parse_box(area, areas, settings.map.crs) if area else None
-    selection = select(series_for(settings), span, box_m, variables, chunks)
-    parts = split(selection, out, file_format.suffix, every)
+    box_m = parse_box(options.area, areas, settings.map.crs) if options.area else None
+    selection = select(series_for(settings), span, box_m, options.variables, options.chunks)
+    if kind == "references":
+        selection = replace(selection, url=options.url or settings.station.data.resolve().as_uri())
+    parts = split(selection, out, file_format.suffix, options.every)
     remaining = pending(selection, parts, file_format.read_fingerprint)
     if kept := len(parts) - len(remaining):
         print(f"{kept} of {len(parts)} files are up to date", file=sys.stderr)

@@ -22,7 +22,7 @@ from station.archive.series.epoch_reader import EpochSource, Parameters, contigu
 from station.errors import StoreError
 from station.products.exports.selection import FINGERPRINT, Part, Selection
 
-BLOCK_BYTES = 2**25  # of a raster in memory
+BLOCK_BYTES = 2**26  # of a raster in memory: a month in chunks of 32 x 32 still covers those of the store
 EPOCHS_AT_ONCE = 64  # of the other variables
 MAX_OPEN_FILES = 48  # the epochs of a day and more, at some 5 MB each
 

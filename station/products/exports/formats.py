@@ -1,4 +1,4 @@
-"""The formats of self-contained files of the series."""
+"""The formats that contain or describe the series."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-from station.products.exports import netcdf, zarr_store
+from station.products.exports import netcdf, references, servers, zarr_store
 from station.products.exports.contents import Advance
 from station.products.exports.selection import Part, Selection
 
@@ -21,6 +21,9 @@ class SeriesFormat:
 
 
 FORMATS = {
+    "erddap": SeriesFormat(".xml", servers.recognise_erddap, servers.write_erddap),
+    "ncml": SeriesFormat(".ncml", servers.recognise_ncml, servers.write_ncml),
     "netcdf": SeriesFormat(".nc", netcdf.read_fingerprint, netcdf.write_netcdf),
+    "references": SeriesFormat(".json", references.read_fingerprint, references.write_references),
     "zarr": SeriesFormat(".zarr", zarr_store.read_fingerprint, zarr_store.write_zarr),
 }

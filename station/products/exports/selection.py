@@ -38,6 +38,7 @@ class Selection:
     columns: slice
     variables: frozenset[str]
     chunks: tuple[int, int, int]  # (time, y, x)
+    url: str | None = None  # of the data folder, for files that refer to those of the store
 
     @property
     def is_whole_grid(self) -> bool:
@@ -65,7 +66,8 @@ class Selection:
         series = replace(self.series, folder=Path())
         content = (FORMAT_VERSION, series, self.rows, self.columns, sorted(self.variables), self.chunks)
         names = [epoch.epoch_file for epoch in epochs]
-        return hashlib.sha256(json.dumps([str(content), names]).encode()).hexdigest()
+        places = [(self.url, str(epoch.path), epoch.index) for epoch in epochs] if self.url else []
+        return hashlib.sha256(json.dumps([str(content), names, places]).encode()).hexdigest()
 
 
 @dataclass(frozen=True)
@@ -99,6 +101,12 @@ def select(
     rows, columns = _window(series.grid, box_m)
     shape = len(epochs), rows.stop - rows.start, columns.stop - columns.start
     return Selection(series, epochs, rows, columns, _names(series, variables), _chunks(chunks, shape))
+
+
+def require_whole_grid(selection: Selection) -> None:
+    """Raise StationError if the grid is cropped: files of the store are referred to as a whole."""
+    if not selection.is_whole_grid:
+        raise StationError("references are to whole files of the store: leave --area out")
 
 
 def parse_box(text: str, areas: Path | None, crs: str | None) -> tuple[float, float, float, float]:

@@ -18,13 +18,14 @@ import numpy as np
 from station.archive.netcdf_layout import TIMES_PER_CHUNK, decode_text
 from station.archive.schema import TEXT_LENGTH
 from station.errors import StationError, StoreError
-from station.products.exports.contents import BLOCK_BYTES, EPOCHS_AT_ONCE, Advance, PartContents, fill_value
+from station.products.exports.contents import EPOCHS_AT_ONCE, Advance, PartContents, fill_value
 from station.products.exports.selection import FINGERPRINT, Part, Selection
 
 if TYPE_CHECKING:
     import zarr
 
-EPOCHS_PER_SHARD = 24  # a shard is a file of the store: about a day, and up to BLOCK_BYTES
+EPOCHS_PER_SHARD = 24  # a shard is a file of the store: about a day
+SHARD_BYTES = 2**25  # at most, before compression
 PROGRESS_FILE = "export.progress"  # in an unfinished store: the raster being written, and its finished blocks
 
 
@@ -136,7 +137,7 @@ def _create_raster(group: zarr.Group, variable: netCDF4.Variable[Any], contents:
 
     chunks = contents.selection.chunks
     times = chunks[0] * max(1, EPOCHS_PER_SHARD // chunks[0])
-    scale = max(1, isqrt(BLOCK_BYTES // (4 * times * chunks[1] * chunks[2])))
+    scale = max(1, isqrt(SHARD_BYTES // (4 * times * chunks[1] * chunks[2])))
     group.create_array(
         variable.name,
         shape=contents.shape,
