@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 import rasterio
 from PIL import Image
+from support.programs import readers_python, run
 
 import station
 from station.products.area_tables import Span
@@ -140,6 +141,34 @@ def test_stac_catalogue_is_valid(site, tmp_path):
     west, south, east, north = items[0].bbox  # corners of the grid computed with cs2cs of PROJ
     assert (west, east) == (pytest.approx(10.7298, abs=2e-3), pytest.approx(10.7378, abs=2e-3))
     assert 46.80 < south < north < 46.82
+
+
+OPEN_CATALOGUE = """
+import json, numpy, odc.stac, pystac_client
+items = pystac_client.Client.open(path).get_items(recursive=True)
+ds = odc.stac.load(items)
+change = ds.change.values
+print(json.dumps({
+    "shape": change.shape, "times": ds.time.astype("datetime64[s]").astype(str).values.tolist(),
+    "epsg": ds.odc.crs.epsg, "x": ds.x.values[:2].tolist(), "y": ds.y.values[:2].tolist(),
+    "sums": numpy.nansum(change.astype("f8"), axis=(1, 2)).tolist(),
+    "counts": numpy.isfinite(change).sum(axis=(1, 2)).tolist(),
+}))
+"""
+
+
+@pytest.mark.integration
+def test_odc_stac_and_pystac_client_open_the_catalogue_without_hints(site, tmp_path):
+    (path,) = export(site, "stac", Span.parse("2025-11-21T03:30", None), tmp_path / "stac")
+    program = f"path = {str(path)!r}\n{OPEN_CATALOGUE}"
+    actual = json.loads(run(readers_python(), "-W", "ignore", "-c", program).stdout)
+    with station.open(site.station.data) as ds:
+        change = ds.elevation_change[-2:]
+        assert actual["shape"] == [2, 45, 60]
+        assert actual["times"] == ds.time[-2:].values.astype("datetime64[s]").astype(str).tolist()
+        assert actual["sums"] == pytest.approx(change.astype("f8").sum(("y", "x")).values, rel=1e-9)
+        assert actual["counts"] == change.count(("y", "x")).values.tolist()
+    assert (actual["epsg"], actual["x"], actual["y"]) == (32632, [632005, 632015], [5185995, 5185985])
 
 
 def test_csv_of_scans(site, tmp_path, small):
