@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import json
+import re
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -19,16 +20,18 @@ from station.errors import StationError
 from station.products.exports.contents import Advance, PartContents, fill_value
 from station.products.exports.selection import FINGERPRINT, Part, Selection, require_whole_grid
 
+HEAD_CHARACTERS = 2**16  # of a file: the global attributes come first
 Refs = dict[str, Any]  # metadata, data in Base64, or [url, offset, size], by key of the Zarr store
 
 
 def read_fingerprint(path: Path) -> str | None:
     """Return the fingerprint of a file of references; None if it is no such file."""
     try:
-        document = json.loads(path.read_text(encoding="utf-8"))
-        return str(json.loads(document["refs"][".zattrs"])[FINGERPRINT])
-    except (OSError, ValueError, KeyError, TypeError):
+        with path.open(encoding="utf-8") as file:
+            found = re.search(rf"{FINGERPRINT}\W+([0-9a-f]{{64}})", file.read(HEAD_CHARACTERS))
+    except (OSError, ValueError):
         return None
+    return found[1] if found else None
 
 
 def write_references(

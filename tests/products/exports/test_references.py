@@ -132,8 +132,16 @@ def test_erddap_describes_the_exported_files(stored, tmp_path):
             assert raster.dtype == numpy_types[variable.find("dataType").text]
 
 
-def test_a_whole_datasets_xml_is_not_replaced(stored, tmp_path):
-    path = tmp_path / "datasets.xml"
-    path.write_text("<erddapDatasets></erddapDatasets>")
+@pytest.mark.parametrize(
+    ("kind", "name", "text"),
+    [
+        ("erddap", "datasets.xml", "<erddapDatasets></erddapDatasets>"),
+        ("ncml", "other.ncml", "<catalog></catalog>"),
+        ("references", "other.json", '{"refs": {}}'),
+    ],
+)
+def test_a_foreign_file_is_not_replaced(stored, tmp_path, kind, name, text):
+    (tmp_path / name).write_text(text)
     with pytest.raises(StationError, match="exists and is no export"):
-        write("erddap", select(stored, ALWAYS), path)
+        write(kind, select(stored, ALWAYS), tmp_path / name)
+    assert (tmp_path / name).read_text() == text
