@@ -11,6 +11,7 @@ from station.commands import (
     alarms,
     calibrate,
     check,
+    exports,
     papers,
     process,
     products,
@@ -34,7 +35,7 @@ app = typer.Typer(
 )
 COMMANDS = (
     check.init, check.check, process.process, retry.retry, reprocess.reprocess, run.run, run.status,
-    simulate.simulate, simulate.demo, products.areas, products.plot, products.export, products.serve,
+    simulate.simulate, simulate.demo, products.areas, products.plot, exports.export, products.serve,
     calibrate.calibrate, sensitivity.sensitivity, papers.papers,
 )  # fmt: skip
 for command in COMMANDS:

@@ -183,17 +183,13 @@ def _create_parameter_names(file: netCDF4.Dataset, names: tuple[str, ...], units
 
 
 def create_variable(
-    file: netCDF4.Dataset, spec: Variable, series: Series, times: int
+    file: netCDF4.Dataset,
+    spec: Variable,
+    series: Series,
+    times: int,
+    chunks: tuple[int, ...] | None = None,
 ) -> netCDF4.Variable[Any]:
-    """Create a variable of the schema in a file of `times` epochs."""
-    chunks = None
-    if spec.is_raster:
-        height, width = min(CHUNK, series.grid.ny), min(CHUNK, series.grid.nx)
-        chunks = (1, height, width)[-len(spec.dims) :]
-    elif spec.is_large:
-        chunks = (1, *(len(file.dimensions[dim]) for dim in spec.dims[1:]))
-    elif spec.dims[:1] == ("time",):
-        chunks = (min(times, TIMES_PER_CHUNK), *(len(file.dimensions[dim]) for dim in spec.dims[1:]))
+    """Create a variable of the schema in a file of `times` epochs, by default chunked as in the store."""
     fill = {"f4": FILL, "f8": FILL, "S1": None}.get(spec.dtype, False)
     variable = file.createVariable(
         spec.name,
@@ -202,12 +198,25 @@ def create_variable(
         compression="zlib",
         complevel=1,
         shuffle=True,
-        chunksizes=chunks,
+        chunksizes=chunks or _default_chunks(file, spec, series, times),
         fill_value=fill,
         least_significant_digit=spec.digits,
     )
     variable.setncatts(attributes(spec, series))
     return variable
+
+
+def _default_chunks(
+    file: netCDF4.Dataset, spec: Variable, series: Series, times: int
+) -> tuple[int, ...] | None:
+    """Return the chunks of a variable: a map is read without its neighbours in time."""
+    if spec.is_raster:
+        return (1, min(CHUNK, series.grid.ny), min(CHUNK, series.grid.nx))[-len(spec.dims) :]
+    if spec.is_large:
+        return (1, *(len(file.dimensions[dim]) for dim in spec.dims[1:]))
+    if spec.dims[:1] == ("time",):
+        return (min(times, TIMES_PER_CHUNK), *(len(file.dimensions[dim]) for dim in spec.dims[1:]))
+    return None
 
 
 def attributes(spec: Variable, series: Series) -> dict[str, Any]:

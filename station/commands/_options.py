@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 import sys
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated, TypeVar
 
@@ -36,6 +37,17 @@ def progress_bar(label: str) -> Callable[[list[T]], Iterable[T]]:
     return lambda rows: track(
         rows, label, console=Console(stderr=True), transient=True, disable=not sys.stderr.isatty()
     )
+
+
+@contextmanager
+def amount_bar(label: str, total: float) -> Iterator[Callable[[float], None]]:
+    """Yield a function that takes what was done of a total, for a progress bar if stderr is a terminal."""
+    from rich.console import Console
+    from rich.progress import Progress
+
+    with Progress(console=Console(stderr=True), transient=True, disable=not sys.stderr.isatty()) as progress:
+        task = progress.add_task(label, total=total)
+        yield lambda amount: progress.advance(task, amount)
 
 
 def json_safe(value: object) -> object:

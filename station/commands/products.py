@@ -1,4 +1,4 @@
-"""`station areas`, `station plot`, `station export` and `station serve`."""
+"""`station areas`, `station plot` and `station serve`."""
 
 from __future__ import annotations
 
@@ -29,14 +29,6 @@ class MapVariable(StrEnum):
     change = "change"
     sigma = "sigma"
     points = "points"
-
-
-class ExportFormat(StrEnum):
-    """What `station export` writes."""
-
-    geotiff = "geotiff"
-    csv = "csv"
-    stac = "stac"
 
 
 def areas(
@@ -126,29 +118,6 @@ def plot(
         records = area_records(settings, polygons, span, against, progress_bar("summing up"))
         plots.plot_curve(records, area, plots.curve_title(settings, against), out)
     print(out)
-
-
-def export(
-    site: SiteArgument,
-    kind: Annotated[
-        ExportFormat, typer.Argument(metavar="geotiff|csv|stac", help="The format.", show_default=False)
-    ],
-    folder: Annotated[Path, typer.Argument(metavar="[DIR]", help="Where to write.")] = Path(),
-    first: FromOption = None,
-    last: ToOption = None,
-) -> None:
-    """Write files for tools that do not read NetCDF.
-
-    The newest epoch, or those of a span: change and its uncertainty as GeoTIFF with QGIS styles, a STAC
-    catalogue of these, or scans and areas as CSV.
-    """
-    from station.config import read_site
-    from station.products.area_tables import Span
-    from station.products.export import export as write_files
-
-    span = Span.parse(first, last) if first or last else None
-    for path in write_files(read_site(site), kind.value, span, folder, progress_bar("writing")):
-        print(path)
 
 
 def serve(

@@ -40,14 +40,14 @@ def export_geotiff(series: Series, epoch: EpochRef, folder: Path, limit_m: float
             "time_start": f"{epoch.start:%Y-%m-%dT%H:%M:%SZ}",
             "software": f"station {__version__}",
         }
-        _write_cog(path, series, values, description, tags)
+        write_cog(path, series, values, description, tags)
         scale = change_scale(limit_m, "the reference") if kind == "change" else sigma_scale(limit_m)
         replace_if_changed(path.with_suffix(".qml"), _qgis_style(scale).encode())
         paths.append(path)
     return paths
 
 
-def _write_cog(path: Path, series: Series, values: Any, description: str, tags: dict[str, str]) -> None:  # noqa: ANN401
+def write_cog(path: Path, series: Series, values: Any, description: str, tags: dict[str, str]) -> None:  # noqa: ANN401
     """Write a raster as a COG of GDAL: tiled, with overviews by mean, the coarsest first in the file."""
     try:
         import rasterio  # noqa: PLC0415 - an extra

@@ -3,7 +3,6 @@
 import dataclasses
 import json
 import pickle
-import shutil
 import subprocess
 import sys
 from contextlib import contextmanager
@@ -13,6 +12,7 @@ import numpy as np
 import pytest
 import shapely
 import xarray as xr
+from support.programs import findings, run, tool
 
 from station.archive import epochs, reference_files
 from station.archive.areas import AreaChange, update_areas
@@ -23,17 +23,6 @@ from station.queries.blocks import BlockQueries, update_boxes
 from station.sections import MetadataSection
 
 pytestmark = pytest.mark.integration
-
-
-def tool(name):
-    path = shutil.which(name)
-    if path is None:
-        pytest.skip(f"{name} is not installed")
-    return path
-
-
-def run(*command):
-    return subprocess.run(command, capture_output=True, text=True, check=True, timeout=120)
 
 
 def gdal_value(path):
@@ -52,26 +41,6 @@ def built(series, epoch):
         Reference.from_elevation(series.grid, "1", elevation),
     )
     return build_series(series)
-
-
-def findings(report, *paths, convention="cf:1.11"):
-    """Return the objections of the compliance checker to files: path, check, messages."""
-    checker = shutil.which("compliance-checker", path=f"{sys.prefix}/bin") or tool("compliance-checker")
-    subprocess.run(
-        [checker, f"--test={convention}", "--format=json_new", f"--output={report}", *paths],
-        capture_output=True,
-        check=False,
-        timeout=120,
-    )
-    results = json.loads(report.read_text())
-    assert set(results) == set(map(str, paths))
-    return [
-        (path, check["name"], check["msgs"])
-        for path, result in results.items()
-        for priority in ("high_priorities", "medium_priorities", "low_priorities")
-        for check in result[convention][priority]
-        if check["msgs"]
-    ]
 
 
 def test_compliance_checker_accepts_epoch_series_and_reference(built, tmp_path):

@@ -10,11 +10,14 @@ import xml.etree.ElementTree as ET
 
 import numpy as np
 import pytest
+import rasterio
 from PIL import Image
+from support.programs import readers_python, run
 
 import station
 from station.products.area_tables import Span
-from station.products.export import TOPO4D, export
+from station.products.export import export
+from station.products.stac import PROJECTION, TOPO4D, _adjustment
 
 
 @pytest.mark.integration
@@ -55,41 +58,59 @@ def test_geotiff_is_a_valid_cog_and_read_by_gdal(site, tmp_path):
 
 @pytest.mark.integration
 def test_stac_catalogue_is_valid(site, tmp_path):
-    """The core schemas come with pystac; the requirements of topo4d v1.0.0 on items are repeated here."""
+    """The core schemas come with pystac; the requirements of the extensions on items are repeated here."""
     import pystac
     from pystac.validation import JsonSchemaSTACValidator, RegisteredValidator, set_validator
 
+    number, text, matrix = {"type": "number"}, {"type": "string"}, {"type": "array"}
+    requirements = {
+        TOPO4D: {
+            "required": ["datetime", "topo4d:data_type"],
+            "properties": {
+                "topo4d:data_type": text, "topo4d:tz": text, "topo4d:acquisition_mode": text,
+                "topo4d:duration": number, "topo4d:spatial_resolution": number,
+                "topo4d:positional_accuracy": number,
+                "topo4d:trafometa": {
+                    "type": "object", "required": ["reference_epoch"],
+                    "properties": {
+                        "reference_epoch": {"type": "object"}, "registration_error": number,
+                        "transformation": matrix,
+                    },
+                },
+                "topo4d:productmeta": {"type": "object", "properties": {"product_name": text}},
+            },
+            "propertyNames": {"not": {"pattern": "^topo4d:(native_crs|sensor|point_count)"}},
+        },
+        PROJECTION: {
+            "required": ["proj:code"],
+            "properties": {
+                "proj:code": {"pattern": "^[A-Z]+:[0-9]+$"},
+                "proj:shape": {"minItems": 2, "maxItems": 2, "items": {"type": "integer"}},
+                "proj:transform": {"items": number},
+                "proj:bbox": {"minItems": 4, "maxItems": 4, "items": number},
+            },
+            "propertyNames": {"not": {"pattern": "^proj:epsg"}},
+        },
+    }  # fmt: skip
+
     class Offline(JsonSchemaSTACValidator):
         def _get_schema(self, uri):
-            if uri != TOPO4D:
+            if uri not in requirements:
                 return super()._get_schema(uri)
-            number, text = {"type": "number"}, {"type": "string"}
             return {
                 "$schema": "http://json-schema.org/draft-07/schema#",
-                "$id": TOPO4D,
+                "$id": uri,
                 "if": {"properties": {"type": {"const": "Feature"}}},
-                "then": {
-                    "properties": {
-                        "properties": {
-                            "required": ["datetime", "topo4d:native_crs", "topo4d:data_type"],
-                            "properties": {
-                                "topo4d:native_crs": text, "topo4d:data_type": text, "topo4d:tz": text,
-                                "topo4d:sensor": text, "topo4d:acquisition_mode": text,
-                                "topo4d:duration": number, "topo4d:spatial_resolution": number,
-                                "topo4d:point_count": {"type": "integer"},
-                                "topo4d:productmeta": {"type": "object"},
-                            },
-                            "propertyNames": {"not": {"pattern": "^topo4d:(product_info|unknown)"}},
-                        }
-                    }
-                },
-            }  # fmt: skip
+                "then": {"properties": {"properties": requirements[uri]}},
+            }
 
-    paths = export(site, "stac", Span.parse("2025-11-21T03:30", None), tmp_path / "stac")
+    (path,) = export(site, "stac", Span.parse("2025-11-21T03:30", None), tmp_path / "stac")
     validator = RegisteredValidator.get_validator()
     set_validator(Offline())
     try:
-        collection = pystac.Collection.from_file(str(paths[0]))
+        catalog = pystac.Catalog.from_file(str(path))
+        catalog.validate()
+        (collection,) = catalog.get_children()
         collection.validate()
         items = list(collection.get_items())
         for item in items:
@@ -106,10 +127,48 @@ def test_stac_catalogue_is_valid(site, tmp_path):
             broken.validate()
     finally:
         set_validator(validator)
-    assert [item.datetime.hour for item in items] == [4, 5]
+    bounds = [(item.common_metadata.start_datetime, item.common_metadata.end_datetime) for item in items]
+    assert [start.hour for start, _ in bounds] == [4, 5]
+    assert [item.datetime for item in items] == [start + (end - start) / 2 for start, end in bounds]
+    assert collection.extent.temporal.intervals[0] == [bounds[0][0], bounds[1][1]]
+    with rasterio.open(items[0].assets["change"].get_absolute_href()) as raster:
+        assert [*raster.transform][:6] == items[0].properties["proj:transform"]
+        assert [*raster.shape] == items[0].properties["proj:shape"]
+        assert [*raster.bounds] == items[0].properties["proj:bbox"]
+        assert f"EPSG:{raster.crs.to_epsg()}" == items[0].properties["proj:code"]
+    reference_href = items[0].properties["topo4d:trafometa"]["reference_epoch"]["href"]
+    assert (path.parent / collection.id / items[0].id / reference_href).is_file()
     west, south, east, north = items[0].bbox  # corners of the grid computed with cs2cs of PROJ
     assert (west, east) == (pytest.approx(10.7298, abs=2e-3), pytest.approx(10.7378, abs=2e-3))
     assert 46.80 < south < north < 46.82
+
+
+OPEN_CATALOGUE = """
+import json, numpy, odc.stac, pystac_client
+items = pystac_client.Client.open(path).get_items(recursive=True)
+ds = odc.stac.load(items)
+change = ds.change.values
+print(json.dumps({
+    "shape": change.shape, "times": ds.time.astype("datetime64[s]").astype(str).values.tolist(),
+    "epsg": ds.odc.crs.epsg, "x": ds.x.values[:2].tolist(), "y": ds.y.values[:2].tolist(),
+    "sums": numpy.nansum(change.astype("f8"), axis=(1, 2)).tolist(),
+    "counts": numpy.isfinite(change).sum(axis=(1, 2)).tolist(),
+}))
+"""
+
+
+@pytest.mark.integration
+def test_odc_stac_and_pystac_client_open_the_catalogue_without_hints(site, tmp_path):
+    (path,) = export(site, "stac", Span.parse("2025-11-21T03:30", None), tmp_path / "stac")
+    program = f"path = {str(path)!r}\n{OPEN_CATALOGUE}"
+    actual = json.loads(run(readers_python(), "-W", "ignore", "-c", program).stdout)
+    with station.open(site.station.data) as ds:
+        change = ds.elevation_change[-2:]
+        assert actual["shape"] == [2, 45, 60]
+        assert actual["times"] == ds.time[-2:].values.astype("datetime64[s]").astype(str).tolist()
+        assert actual["sums"] == pytest.approx(change.astype("f8").sum(("y", "x")).values, rel=1e-9)
+        assert actual["counts"] == change.count(("y", "x")).values.tolist()
+    assert (actual["epsg"], actual["x"], actual["y"]) == (32632, [632005, 632015], [5185995, 5185985])
 
 
 def test_csv_of_scans(site, tmp_path, small):
@@ -119,3 +178,34 @@ def test_csv_of_scans(site, tmp_path, small):
     assert rows[3]["scan"] == small.EVIL
     assert float(rows[2]["platform_roll"]) == pytest.approx(0.12)
     assert len(areas.read_text().splitlines()) == 13
+
+
+def test_transformation_of_an_epoch_has_the_signs_of_the_adjustment(tmp_path):
+    """Points on a plane, turned and shifted by it, rise by minus the effect J x of the estimate."""
+    import h5py
+
+    from station.archive.netcdf_layout import Series
+    from station.science.uncertainty.jacobian import height_jacobian
+    from station.science.uncertainty.parameters import ParameterLayout
+
+    estimate = {
+        "tilt_east": 3e-6, "tilt_north": -5e-6, "heading": 8e-6, "translation_east": 0.02,
+        "translation_north": -0.01, "translation_up": 0.03,
+    }  # fmt: skip
+    scanner_m, gradient = np.array([632_000.0, 5_186_000.0, 2900.0]), np.array([0.2, -0.3])
+    series = Series(tmp_path, "hef", None, None)
+    with h5py.File(series.path, "w") as file:
+        names = np.array([name.encode() for name in estimate], "S64")
+        file["parameter_name"] = names.view("S1").reshape(len(names), 64)
+        file["shared_parameter"] = [list(estimate.values())]
+        for axis, value_m in zip(("east", "north", "height"), scanner_m, strict=True):
+            file[f"scanner_{axis}"] = [value_m]
+    offset_m = np.random.default_rng(1).uniform(-2000, 2000, (50, 3))
+    moved = np.c_[scanner_m + offset_m, np.ones(50)] @ _adjustment(series, 0).T
+    motion_m = moved[:, :3] - scanner_m - offset_m
+    rise_m = motion_m[:, 2] - motion_m[:, :2] @ gradient
+    layout = ParameterLayout(0.0, 360, full_circle=True)
+    jacobian = height_jacobian(layout, tuple(offset_m.T), *(np.full(50, slope) for slope in gradient))
+    expected_m = -np.array([*estimate.values()]) @ jacobian.pose[:6]
+    np.testing.assert_allclose(rise_m, expected_m, atol=2e-6)
+    assert np.ptp(expected_m) > 0.01

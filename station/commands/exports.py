@@ -1,0 +1,169 @@
+"""`station export`."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from enum import StrEnum
+from functools import cache
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from station.commands._options import FromOption, SiteArgument, ToOption, amount_bar, progress_bar
+
+if TYPE_CHECKING:
+    from station.config import Site
+    from station.products.area_tables import Span
+
+
+class ExportFormat(StrEnum):
+    """What `station export` writes."""
+
+    geotiff = "geotiff"
+    csv = "csv"
+    stac = "stac"
+    netcdf = "netcdf"
+    zarr = "zarr"
+    references = "references"
+    ncml = "ncml"
+    erddap = "erddap"
+
+
+OF_EPOCHS = {ExportFormat.geotiff, ExportFormat.csv, ExportFormat.stac}  # the others are of the series
+
+
+class ExportPeriod(StrEnum):
+    """The period of each file of an export."""
+
+    day = "1D"
+    month = "1M"
+
+
+@dataclass(frozen=True)
+class SeriesOptions:
+    """Options of the formats that contain or describe the series."""
+
+    every: str | None
+    area: str | None
+    variables: str | None
+    chunks: str | None
+    url: str | None
+
+
+def export(
+    site: SiteArgument,
+    kind: Annotated[
+        ExportFormat,
+        typer.Argument(
+            metavar="geotiff|csv|stac|netcdf|zarr|references|ncml|erddap",
+            help="The format.",
+            show_default=False,
+        ),
+    ],
+    out: Annotated[Path, typer.Argument(metavar="[OUT]", help="Folder or file to write.")] = Path(),
+    first: FromOption = None,
+    last: ToOption = None,
+    every: Annotated[
+        ExportPeriod | None,
+        typer.Option(help="NetCDF, Zarr: one file for each day or month.", show_default=False),
+    ] = None,
+    area: Annotated[
+        str | None,
+        typer.Option(
+            metavar="NAME|W,S,E,N", help="NetCDF, Zarr: only around an area or in a box.", show_default=False
+        ),
+    ] = None,
+    variables: Annotated[
+        str | None, typer.Option(metavar="A,B,…", help="NetCDF, Zarr: only these.", show_default=False)
+    ] = None,
+    chunks: Annotated[
+        str | None,
+        typer.Option(
+            metavar="TIME,Y,X", help="NetCDF, Zarr: size of a chunk; default 1,128,128.", show_default=False
+        ),
+    ] = None,
+    url: Annotated[
+        str | None,
+        typer.Option(
+            metavar="URL", help="References: address of the data folder; default here.", show_default=False
+        ),
+    ] = None,
+) -> None:
+    """Write files to pass on, or for tools that cannot read the series.
+
+    netcdf and zarr: the series itself, complete and compressed, with the same values. Files that exist and
+    whose epochs did not change are kept, so an interrupted export continues when it is repeated.
+    references, ncml and erddap describe it for the cloud and for data servers, without a copy.
+    geotiff, stac and csv: the newest epoch, or those of a span; change and its uncertainty as GeoTIFF with
+    QGIS styles, a STAC catalogue of these, or scans and areas as CSV.
+    """
+    from station.config import read_site
+    from station.products.area_tables import Span
+    from station.products.export import export as write_files
+
+    settings, span = read_site(site), Span.parse(first, last)
+    if kind not in OF_EPOCHS:
+        options = SeriesOptions(every and every.value, area, variables, chunks, url)
+        for path in _export_series(settings, kind.value, out, span, options):
+            print(path)
+        return
+    if given := [name for name, value in (
+        ("--every", every), ("--area", area), ("--variables", variables), ("--chunks", chunks), ("--url", url)
+    ) if value is not None]:  # fmt: skip
+        raise typer.BadParameter(f"{given[0]} is for the series, not for {kind.value}")
+    for path in write_files(
+        settings, kind.value, span if first or last else None, out, progress_bar("writing")
+    ):
+        print(path)
+
+
+def _export_series(
+    settings: Site,
+    kind: str,
+    out: Path,
+    span: Span,
+    options: SeriesOptions,
+) -> Iterator[Path]:
+    """Yield each file of the series when it is written; files that are up to date are kept."""
+    from station.processing.scan_tasks import series_for
+    from station.products.exports.formats import FORMATS
+    from station.products.exports.selection import parse_box, pending, select, split
+
+    file_format = FORMATS[kind]
+    areas = settings.areas.file if settings.areas else None
+    box_m = parse_box(options.area, areas, settings.map.crs) if options.area else None
+    selection = select(series_for(settings), span, box_m, options.variables, options.chunks)
+    if kind == "references":
+        selection = replace(selection, url=options.url or settings.station.data.resolve().as_uri())
+    parts = split(selection, out, file_format.suffix, options.every)
+    remaining = pending(selection, parts, file_format.read_fingerprint)
+    if kept := len(parts) - len(remaining):
+        print(f"{kept} of {len(parts)} files are up to date", file=sys.stderr)
+    with amount_bar("writing", sum(len(part.epochs) for part in remaining)) as advance:
+        yield from file_format.write(selection, remaining, _verifier(settings), advance)
+
+
+def _verifier(settings: Site) -> Callable[[Path], None]:
+    """Return a function that raises StoreError if a file of the store does not match its checksum.
+
+    A copied store without a journal has no checksums.
+    """
+    from station.errors import StoreError
+    from station.inbox.file_hash import sha256_file
+    from station.inbox.journal import Journal
+
+    folder, checksums = settings.station.data, dict[str, str]()
+    if (folder / "journal.sqlite").is_file():
+        with Journal(folder / "journal.sqlite", read_only=True) as journal:
+            checksums = journal.checksums()
+
+    @cache  # a month has one file and is read for each of its days
+    def verify(path: Path) -> None:
+        expected = checksums.get(str(path.relative_to(folder)))
+        if expected is not None and sha256_file(path) != expected:
+            raise StoreError(f"{path}: damaged: its checksum does not match (station check --store)")
+
+    return verify
