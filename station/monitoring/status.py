@@ -128,7 +128,7 @@ def _waiting_scan(entry: Entry) -> dict[str, str | None]:
     return {
         "scan": entry.name,
         "state": entry.state.value,
-        "for": entry.waiting_reason or "its turn",
+        "for": entry.waiting_reason or ("its turn" if not entry.ahead else "its turn, to be measured again"),
         "next_try": next_try,
     }
 

@@ -42,7 +42,7 @@ class ScanProcessor(Protocol):
     """What the loop needs of a worker; see `worker.Worker`."""
 
     def recover(self) -> None: ...  # noqa: D102
-    def process(self, scan: ScanFile) -> bool: ...  # noqa: D102
+    def process(self, scan: ScanFile, *, ahead: bool = False) -> bool: ...  # noqa: D102
     def precheck(self, scan: ScanFile) -> None: ...  # noqa: D102
     def start_compaction(self) -> None: ...  # noqa: D102
     def publish_compacted(self) -> None: ...  # noqa: D102
@@ -179,12 +179,12 @@ class Daemon:
             self._report_idle()
             return min(self._timing.period_s, state.next_s)
         self._systemd.status(f"measuring {state.first.name}, {state.queued - 1} more waiting")
-        self._process(worker, state.first)
+        self._process(worker, state.first, ahead=state.ahead)
         return 0.0
 
-    def _process(self, worker: ScanProcessor, scan: ScanFile) -> None:
+    def _process(self, worker: ScanProcessor, scan: ScanFile, *, ahead: bool) -> None:
         try:
-            worker.process(scan)
+            worker.process(scan, ahead=ahead)
         except StationError:
             self._is_reconciled = False  # it may have stopped between writing the file and the journal
             raise

@@ -111,20 +111,25 @@ class Worker:
         self._reported_faults: tuple[str, ...] = ()
         self._compaction = BackgroundCompaction(site, on_compacted)
 
-    def process(self, scan: ScanFile) -> bool:
+    def process(self, scan: ScanFile, *, ahead: bool = False) -> bool:
         """Measure and store a scan, record it in journal and log; return True if it is stored.
+
+        A live scan is measured `ahead` of a backlog, from the newest version of the reference, and goes on
+        waiting: it is part of no reference, and measured again in its turn, as if nothing had come before.
 
         Raises StoreError if the store cannot be written; the scan is then still waiting.
         """
-        is_stored = self._process(scan)
+        if ahead:
+            self._journal.mark_ahead(scan.name)
+        is_stored = self._process(scan, ahead=ahead)
         self._build_reference_if_due()  # also if the scan is not stored: the reference may have waited for it
         return is_stored
 
-    def _process(self, scan: ScanFile) -> bool:
+    def _process(self, scan: ScanFile, *, ahead: bool) -> bool:
         self._processed[scan.name] = scan
         entry = self._journal.entry(scan.name)
         history = ScanHistory(
-            reference=entry.reference if entry else None,
+            reference=entry.reference if entry and not entry.ahead else None,
             revision=(entry.revision if entry else None) or 0,
             last_content=_assessed_content(entry) if self._in_service else None,
             stored_scans=self._journal.others_stored(scan.name, scan.size),
@@ -146,7 +151,7 @@ class Worker:
         if isinstance(result, Duplicate):
             return self._record_duplicate(scan, result)
         uncompacted = self._with_repair(update_series)
-        record_result(self._journal, scan.name, result)
+        record_result(self._journal, scan.name, result, ahead=ahead)
         _log_result(scan.name, result)
         self.publish(scan.name, result)
         if self._in_service and uncompacted > MAX_UNCOMPACTED:
@@ -503,7 +508,7 @@ def record_failure(journal: Journal, site: Site, name: str, reason: str) -> bool
     return False
 
 
-def record_result(journal: Journal, name: str, result: StoredResult) -> None:
+def record_result(journal: Journal, name: str, result: StoredResult, *, ahead: bool = False) -> None:
     """Record the result of a scan in the journal."""
     journal.record_stored(
         name,
@@ -517,6 +522,7 @@ def record_result(journal: Journal, name: str, result: StoredResult) -> None:
         metrics=result.metrics,
         log_sha256=result.log_sha256,
         epoch_sha256=result.epoch_sha256,
+        ahead=ahead,
     )
 
 

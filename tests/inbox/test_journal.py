@@ -15,7 +15,7 @@ from dataclasses import replace
 import pytest
 
 from station.errors import NotReadyError, StoreError
-from station.inbox.journal import Journal, State
+from station.inbox.journal import MAX_FAILURES, Journal, State
 from station.inbox.lock import exclusive_lock, is_locked
 
 NAME = "261121_030512.laz"
@@ -134,15 +134,17 @@ def test_scans_set_aside_whatever_the_settings_are_not_judged_again(journal):
 def test_settled_scans_delay_no_other(tmp_path):
     now_s = [1000.0]
     with Journal(tmp_path / "journal.sqlite", now_s=lambda: now_s[0]) as journal:
-        journal.record_seen([(name, 10, 20, "") for name in ("open.laz", "stored.laz", "later.laz")])
+        journal.record_seen([(name, 10, 20, "") for name in ("queued.laz", "stored.laz", "later.laz")])
+        journal.record_seen([("open.laz", 10, 20, "another process to close it")])
         store(journal, "stored.laz")
         journal.defer("later.laz", "permission denied")
-        assert journal.unsettled() == {"later.laz": None, "open.laz": None}
-        for _ in range(5):
+        assert journal.unsettled() == {"later.laz": None, "open.laz": None, "queued.laz": None}
+        for _ in range(MAX_FAILURES - 1):
             journal.defer("later.laz", "permission denied")
-        assert list(journal.unsettled()) == ["open.laz"]
+        assert list(journal.unsettled()) == ["open.laz", "queued.laz"]
         now_s[0] += 7 * 3600
-        assert journal.unsettled() == {}
+        assert list(journal.unsettled()) == ["queued.laz"]  # its turn comes
+        store(journal, "queued.laz")
         journal.record_seen([("stored.laz", 10, 21, "")])
         assert journal.unsettled() == {"stored.laz": 5.0}
 
