@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 FIRST_RETRY_S = 30.0  # until a deferred scan is tried again; doubled after each attempt
 MAX_RETRY_S = 3600.0
-MAX_FAILURES = 12  # inconclusive attempts until a scan is set aside for now: 17 h, the last pause 8.5 h
+MAX_FAILURES = 12  # attempts until a scan is no longer waited for: 17 h, the last pause 8.5 h
 REJECTED_FOR_NOW = "rejected for now"
 RETRY_REJECTED_S = 7 * 86_400.0  # the machine may have recovered: one attempt, which costs little
 LONGEST_RETRY_S = FIRST_RETRY_S * 2.0 ** (MAX_FAILURES - 2)
@@ -275,18 +275,24 @@ class Journal:
     def record_failure(self, name: str, reason: str, judged_under: str) -> float | None:
         """Defer a scan whose attempt failed for a reason that may not be its own; return the delay [s].
 
-        Return None if it was set aside for now, after MAX_FAILURES attempts under the same conditions.
+        Return None if it was set aside for now: after MAX_FAILURES attempts under the same conditions, if
+        another scan was stored since the last of them. If none was, the machine may be the cause.
         """
         entry = self.entry(name)
         failures = 1 + (entry.attempts if entry and entry.judged_under == judged_under else 0)
-        if failures >= MAX_FAILURES:
+        if entry and failures >= MAX_FAILURES and self._stored_since(entry.changed_utc_s):
             self.set_aside(
                 name, f"{REJECTED_FOR_NOW}, after {failures} attempts: {reason}", judged_under=judged_under
             )
             return None
-        delay_s = FIRST_RETRY_S * 2.0 ** (failures - 1)
+        delay_s = min(FIRST_RETRY_S * 2.0 ** (failures - 1), LONGEST_RETRY_S)
         self._retry_in(delay_s, name, reason, failures, judged_under)
         return delay_s
+
+    def _stored_since(self, utc_s: float) -> bool:
+        query = "SELECT 1 FROM scan WHERE state = 'stored' AND changed_utc_s >= ?"
+        with self._store_errors():
+            return self._connection.execute(query, (utc_s,)).fetchone() is not None
 
     def rejected_for_now(self) -> list[str]:
         """Return the names of scans that were rejected for now more than `RETRY_REJECTED_S` ago; sorted."""
@@ -436,15 +442,18 @@ class Journal:
         with self._store_errors():
             return [name for (name,) in self._connection.execute(query, (conditions,))]
 
-    def unsettled(self) -> dict[str, float | None]:
-        """Return the starts [s], if known, of scans that will be judged soon, for which others may wait."""
+    def unsettled(self, *, however_often_failed: bool = False) -> dict[str, float | None]:
+        """Return the starts [s], if known, of scans that will be judged soon, for which others may wait.
+
+        `however_often_failed`: include those that may fail because of the machine until they are rejected.
+        """
         query = (
             "SELECT name, start_utc_s FROM scan"
             " WHERE (state = 'waiting' AND (waiting_reason = '' OR abs(changed_utc_s - ?) < ?))"
-            " OR (state = 'later' AND attempts < ?) ORDER BY name"
+            " OR (state = 'later' AND (attempts < ? OR (? AND judged_under IS NOT ''))) ORDER BY name"
         )
         with self._store_errors():
-            parameters = self._now_s(), SETTLING_S, MAX_FAILURES
+            parameters = self._now_s(), SETTLING_S, MAX_FAILURES, however_often_failed
             return dict(self._connection.execute(query, parameters).fetchall())
 
     def starting_at(self, start_utc_s: float) -> list[str]:

@@ -406,7 +406,7 @@ class Worker:
         if isinstance(setting, Path) or not chosen or len(usable) < needed:
             return
         last_s = self._start_s(usable[needed - 1])
-        if self._unsettled_before(last_s):  # it may belong to the reference
+        if self._unsettled_before(last_s, however_often_failed=True):  # it may belong to the reference
             return
         scans = [self._find_scan(name) for name in chosen]
         available = [scan for scan in scans if scan is not None]
@@ -443,9 +443,10 @@ class Worker:
         )
         self._journal.requeue(outdated, keep_reference=False)
 
-    def _unsettled_before(self, start_utc_s: float) -> str:
+    def _unsettled_before(self, start_utc_s: float, *, however_often_failed: bool = False) -> str:
         """Return the name of an earlier scan that will be judged soon, '' if there is none."""
-        for name, known_s in self._journal.unsettled().items():
+        unsettled = self._journal.unsettled(however_often_failed=however_often_failed)
+        for name, known_s in unsettled.items():
             if (known_s or start_from_name(name, self._site.scans.name).timestamp()) < start_utc_s:
                 return name
         return ""

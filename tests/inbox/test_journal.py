@@ -120,8 +120,24 @@ def test_failures_count_only_under_the_same_conditions(journal):
     assert journal.judged_otherwise("0.1 a") == []
     assert journal.judged_otherwise("0.2 a") == [NAME]
     assert journal.record_failure(NAME, "killed", "0.2 a") == 30
-    assert [journal.record_failure(NAME, "killed", "0.2 a") for _ in range(11)][-2:] == [30 * 2**10, None]
+    assert [journal.record_failure(NAME, "killed", "0.2 a") for _ in range(10)][-1] == 30 * 2**10
+    store(journal, "other.laz")
+    assert journal.record_failure(NAME, "killed", "0.2 a") is None
     assert journal.entry(NAME).state is State.SET_ASIDE
+
+
+def test_scan_is_not_rejected_while_no_other_is_stored(tmp_path):
+    """Then the machine is the cause: it is tried as rarely as before, and references wait for it."""
+    now_s = [1000.0]
+    with Journal(tmp_path / "journal.sqlite", now_s=lambda: now_s[0]) as journal:
+        store(journal, "other.laz")
+        for failure in range(1, 20):
+            now_s[0] += 3600
+            assert journal.record_failure(NAME, "no memory", "0.1 a") == 30 * 2 ** min(failure - 1, 10)
+        assert journal.unsettled() == {}
+        assert journal.unsettled(however_often_failed=True) == {NAME: None}
+        store(journal, "other.laz")
+        assert journal.record_failure(NAME, "no memory", "0.1 a") is None
 
 
 def test_scans_set_aside_whatever_the_settings_are_not_judged_again(journal):
