@@ -21,7 +21,7 @@ from station.errors import (
     StoreError,
 )
 from station.inbox.inbox import ScanFile, start_from_name
-from station.inbox.journal import SETTLING_S, Entry, Journal, State
+from station.inbox.journal import Entry, Journal, State
 from station.inbox.scan_files import find_scan
 from station.logs import logfmt
 from station.monitoring.daily_digest import write_digest, yesterday
@@ -164,6 +164,7 @@ class Worker:
             self.run(check_header, scan)
         except ScanError as error:
             self._set_aside(scan, str(error))
+            self._build_reference_if_due()  # it may have waited for this scan
         except NotReadyError:
             return
 
@@ -240,9 +241,9 @@ class Worker:
             log.warning("%s", logfmt(digest="failed", reason=error))
 
     def run_maintenance(self) -> None:
-        """Rebuild damaged files, delete expired ones, requeue scans with late inputs, report outdated epochs.
+        """Rebuild damaged files, delete expired ones, requeue scans with late inputs, build a due reference.
 
-        Then apply retention.
+        Then report outdated epochs and apply retention.
         """
         if holds_epochs(self._series):
             self._with_repair(update_series)
@@ -253,6 +254,7 @@ class Worker:
             log.info("%s", logfmt(scan=name, reason="its log or weather arrived late: reprocessing"))
         self._journal.requeue(names)
         self._judge_again()
+        self._build_reference_if_due()  # what it waits for may have taken too long, and no scan come since
         self._report_outdated()
         self._apply_retention()
 
@@ -432,14 +434,14 @@ class Worker:
         """Requeue epochs that were not measured from a version of the reference, but should have been.
 
         These are all epochs of a first version; of an update, to the scans before `update_s`, those of later
-        scans that were processed while the update waited for an earlier one.
+        scans that were processed while the update waited for an earlier one, if they are still in the inbox.
         """
         outdated = (
             row.name
             for row in self._journal.rows()
             if row.epoch and row.outcome is not State.SET_ASIDE and row.reference != version
             if update_s is None
-            or ((row.start_utc_s or 0.0) > update_s and row.changed_utc_s > time.time() - SETTLING_S)
+            or ((row.start_utc_s or 0.0) > update_s and (self._site.scans.inbox / row.name).is_file())
         )
         self._journal.requeue(outdated, keep_reference=False)
 
