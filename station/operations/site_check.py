@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
+from station.archive.reference_files import valid_versions
 from station.config import Site, read_site
 from station.errors import NotReadyError, ScanError, StationError
 from station.inbox.inbox import start_from_name
@@ -285,6 +286,8 @@ def _newest_scan(site: Site) -> Iterator[Finding]:
         return
     text = " ".join(f"{key}={value}" for key, value in metrics.items())
     message = f"{scan.name}: {verdict}{f' ({reason})' if reason else ''} {text}"
+    if not valid_versions(series_for(site)) and not isinstance(site.reference.scans, Path):
+        message += " (no reference yet: once there is one, sigma is smaller)"
     yield _finding("ok" if verdict == "good" else "warning", "scan", message)
     if NO_BRIGHTNESS in reason:
         yield _finding(
