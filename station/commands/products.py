@@ -127,8 +127,8 @@ def serve(
     """Serve the station's page on this machine, read-only."""
     from station.config import read_site
     from station.processing.previews import page_folder
-    from station.products.serve import serve as serve_folder
+    from station.products.serve import server_for
 
-    folder = page_folder(read_site(site))
+    serve_page = server_for(page_folder(read_site(site)), port)
     print(f"http://127.0.0.1:{port}/ (Ctrl-C ends it)", file=sys.stderr)
-    serve_folder(folder, port)
+    serve_page()

@@ -18,11 +18,12 @@ import stat
 import time
 from dataclasses import dataclass
 from datetime import UTC, datetime
+from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from station.errors import NotReadyError
-from station.inbox.journal import LONGEST_RETRY_S, State
+from station.inbox.journal import LONGEST_RETRY_S, UNFINISHED, State
 from station.logs import logfmt
 
 if TYPE_CHECKING:
@@ -38,6 +39,8 @@ _SAFE_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._,+=@~()-]{0,99}")
 MAX_REJECTED = 1000  # per poll, so that thousands of odd files delay no scan and no sign of life
 MAX_LOGGED = 10  # of them, one line each
 WAITING_FOR_LOG = "its inclination log"
+WAITING_TO_BE_CLOSED = "another process to close it"
+MAX_LIVE_INTERVALS = 2.0  # of the expected interval: a scan that began earlier is not live
 _RECHECK_S = 5.0  # of a file that another process has open: its closing raises no event
 _FILE_TYPES = {
     stat.S_IFLNK: "a link",
@@ -64,13 +67,14 @@ class ScanFile:
 class InboxState:
     """Result of one poll of the inbox."""
 
-    first: ScanFile | None  # earliest scan that can be processed now
+    first: ScanFile | None  # scan to process now: the earliest, or a live one ahead of a backlog
     to_precheck: (
         ScanFile | None
     )  # else one that waits for its log, once per scan: its header is checked early
     queued: int  # number of scans ready for processing, including `first`
     new: int  # number of names that are not in the journal
     next_s: float  # until another scan may be ready; inf if none waits
+    ahead: bool = False  # if `first` is to be measured ahead of earlier scans, and again in its turn
 
 
 @dataclass(frozen=True)
@@ -96,6 +100,7 @@ class Inbox:
         self._folder = site.scans.inbox
         self._pattern = site.scans.name
         self._settle_s = site.scans.settle_s
+        self._max_live_s = MAX_LIVE_INTERVALS * site.scans.expected_every_s
         self._inclination = site.inclination
         self._journal = journal
         self._suffixes = tuple(suffixes)
@@ -103,6 +108,7 @@ class Inbox:
         self._now_s = now_s
         self._file_states: dict[str, _FileState] = {}
         self._prechecked: set[tuple[int, ...]] = set()
+        self._last_was_ahead = False
 
     def poll(self) -> InboxState:
         """Return the state of the inbox; record new, changed and removed scans in the journal.
@@ -115,7 +121,7 @@ class Inbox:
         new = len({safe_name(name) for name in scans} - summaries.keys())
         stable: list[ScanFile] = []
         to_precheck: ScanFile | None = None
-        waiting: list[tuple[str, int, int, str]] = []
+        waiting: dict[str, tuple[str, int, int, str]] = {}
         rejected: list[tuple[str, int, int, str]] = []
         next_s = math.inf
         for name, status in scans.items():
@@ -128,26 +134,55 @@ class Inbox:
                 rejected.append((safe_name(name), status.st_size, status.st_mtime_ns, reason))
                 continue
             scan, waiting_reason, wait_s = self._assess(name, status, files, summaries.get(name))
-            waiting.append((name, status.st_size, status.st_mtime_ns, waiting_reason))
+            waiting[name] = name, status.st_size, status.st_mtime_ns, waiting_reason
             next_s = min(next_s, wait_s)
             if not waiting_reason:
                 stable.append(scan)
             elif waiting_reason.startswith(WAITING_FOR_LOG) and _identity(status) not in self._prechecked:
                 to_precheck = to_precheck or scan
-        self._journal.record_seen(waiting)
+        stable.sort(key=lambda scan: (start_from_name(scan.name, self._pattern), scan.name))
+        while stable and _is_open_for_writing(stable[0]):
+            scan = stable.pop(0)
+            waiting[scan.name] = scan.name, scan.size, scan.mtime_ns, WAITING_TO_BE_CLOSED
+            next_s = min(next_s, _RECHECK_S)
+        self._journal.record_seen(waiting.values())
         self._reject(rejected[:MAX_REJECTED])
         if len(rejected) > MAX_REJECTED:
             next_s = 0.0
         self._drop_removed(summaries, scans)
-        stable.sort(key=lambda scan: (start_from_name(scan.name, self._pattern), scan.name))
-        first = next((scan for scan in stable if not _is_open_for_writing(scan)), None)
-        if stable and first is None:
-            next_s = min(next_s, _RECHECK_S)
+        live = self._live_scan(stable, waiting, summaries)
+        self._last_was_ahead = live is not None
+        first = live or next(iter(stable), None)
         if first is not None:
             to_precheck = None
         if to_precheck is not None:
             self._prechecked.add(_identity(scans[to_precheck.name]))
-        return InboxState(first, to_precheck, len(stable), new, next_s)
+        return InboxState(first, to_precheck, len(stable), new, next_s, ahead=live is not None)
+
+    def _live_scan(
+        self,
+        ready: list[ScanFile],
+        waiting: Mapping[str, tuple[str, int, int, str]],
+        summaries: Mapping[str, EntrySummary],
+    ) -> ScanFile | None:
+        """Return the newest of the scans that are ready if it is live and would be more than one scan late.
+
+        It began recently and has no epoch. One with the size or the start of another that waits takes its
+        turn: of two copies the earlier counts. Between two live scans one of the backlog is processed.
+        """
+        if len(ready) <= 2 or self._last_was_ahead:
+            return None
+        scan = ready[-1]
+        start, summary = start_from_name(scan.name, self._pattern), summaries.get(scan.name)
+        is_live = abs(self._now_s() - start.timestamp()) < self._max_live_s
+        if not is_live or (summary is not None and summary.has_epoch) or _is_open_for_writing(scan):
+            return None
+        may_be_copy = any(
+            size == scan.size or start_from_name(name, self._pattern) == start
+            for name, size, _, _ in waiting.values()
+            if name != scan.name
+        )
+        return None if may_be_copy else scan
 
     def _assess(
         self,
@@ -204,9 +239,7 @@ class Inbox:
 
     def _drop_removed(self, summaries: Mapping[str, EntrySummary], scans: Iterable[str]) -> None:
         """Drop scans that were removed from the inbox before they were processed."""
-        unfinished = {
-            name for name, summary in summaries.items() if summary.state in {State.WAITING, State.LATER}
-        }
+        unfinished = {name for name, summary in summaries.items() if summary.state in UNFINISHED}
         removed = sorted(unfinished - set(scans))
         if removed:
             self._journal.record_removed(removed)
@@ -272,6 +305,7 @@ def _identity(status: os.stat_result) -> tuple[int, ...]:
     return status.st_ino, status.st_size, status.st_mtime_ns
 
 
+@lru_cache(maxsize=1 << 16)
 def start_from_name(name: str, pattern: str) -> datetime:
     """Return the start of a scan according to its name; datetime.max (sorted last) if the name has none."""
     try:

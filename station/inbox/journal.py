@@ -24,12 +24,11 @@ if TYPE_CHECKING:
 
 FIRST_RETRY_S = 30.0  # until a deferred scan is tried again; doubled after each attempt
 MAX_RETRY_S = 3600.0
-MAX_FAILURES = 12  # inconclusive attempts until a scan is set aside for now: 17 h, the last pause 8.5 h
+MAX_FAILURES = 12  # attempts until a scan is no longer waited for: 17 h, the last pause 8.5 h
 REJECTED_FOR_NOW = "rejected for now"
 RETRY_REJECTED_S = 7 * 86_400.0  # the machine may have recovered: one attempt, which costs little
 LONGEST_RETRY_S = FIRST_RETRY_S * 2.0 ** (MAX_FAILURES - 2)
-SETTLING_ATTEMPTS = 6  # a scan that failed as often, after a quarter of an hour, no longer delays others
-SETTLING_S = 6 * 3600.0  # nor does one that has waited unchanged for so long, as one that stays open
+SETTLING_S = 6 * 3600.0  # a scan that is not ready for so long, as one that stays open, delays no others
 
 _EPOCH_COLUMNS = (
     "sha256",
@@ -52,6 +51,9 @@ class State(StrEnum):
     LATER = "later"
 
 
+UNFINISHED = {State.WAITING, State.LATER}
+
+
 @dataclass(frozen=True)
 class Entry:
     """One row of the journal.
@@ -60,7 +62,9 @@ class Entry:
     `reason` describe the content last assessed. `epoch` (relative to the data folder), `start_utc_s`,
     `revision`, `reference` and `metrics` describe the content last stored: they are kept if an unusable file
     arrives under the same name. `judged_under` are the conditions (`Site.judging_conditions`) under which it
-    was set aside or failed: '' if they do not matter, None if an older version did not record them.
+    was set aside or failed: '' if they do not matter, None if an older version did not record them. `ahead`
+    is True from when a scan is measured ahead of earlier ones until it is measured again in its turn, then
+    from the version of the reference that is the newest at that time.
     """
 
     name: str
@@ -83,6 +87,7 @@ class Entry:
     first_seen_utc_s: float
     changed_utc_s: float
     judged_under: str | None = None
+    ahead: bool = False
 
 
 class EntrySummary(NamedTuple):
@@ -92,6 +97,7 @@ class EntrySummary(NamedTuple):
     mtime_ns: int
     state: State
     next_try_utc_s: float | None
+    has_epoch: bool = False
 
 
 _COLUMNS = ", ".join(field.name for field in fields(Entry))
@@ -173,7 +179,7 @@ class Journal:
         parameters = [(name,) for name in names]
         with self._transaction():
             self._connection.executemany(
-                """UPDATE scan SET state = 'stored', waiting_reason = '',
+                """UPDATE scan SET state = 'stored', waiting_reason = '', ahead = 0,
                    reason = 'removed before it was reprocessed'
                    WHERE name = ? AND state IN ('waiting', 'later') AND epoch IS NOT NULL""",
                 parameters,
@@ -198,18 +204,21 @@ class Journal:
         metrics: Mapping[str, float | str] | None = None,
         log_sha256: str = "",
         epoch_sha256: str = "",
+        ahead: bool = False,
     ) -> None:
         """Record that a scan is stored, and the checksum of its epoch.
 
-        `metrics` are the metrics that `station status` shows for it.
+        `metrics` are the metrics that `station status` shows for it. A scan measured `ahead` of earlier ones
+        goes on waiting for its turn.
         """
         with self._transaction():
             if epoch_sha256:
                 self._add_checksum(epoch, epoch_sha256)
             self._update(
                 name,
-                state=State.STORED,
-                outcome=State.STORED,
+                state=State.WAITING if ahead else State.STORED,
+                outcome=None if ahead else State.STORED,
+                ahead=ahead,
                 sha256=sha256,
                 log_sha256=log_sha256,
                 verdict=verdict,
@@ -245,6 +254,7 @@ class Journal:
                 name,
                 state=State.SET_ASIDE,
                 outcome=State.SET_ASIDE,
+                ahead=False,
                 sha256=sha256,
                 log_sha256=log_sha256,
                 waiting_reason="",
@@ -265,18 +275,24 @@ class Journal:
     def record_failure(self, name: str, reason: str, judged_under: str) -> float | None:
         """Defer a scan whose attempt failed for a reason that may not be its own; return the delay [s].
 
-        Return None if it was set aside for now, after MAX_FAILURES attempts under the same conditions.
+        Return None if it was set aside for now: after MAX_FAILURES attempts under the same conditions, if
+        another scan was stored since the last of them. If none was, the machine may be the cause.
         """
         entry = self.entry(name)
         failures = 1 + (entry.attempts if entry and entry.judged_under == judged_under else 0)
-        if failures >= MAX_FAILURES:
+        if entry and failures >= MAX_FAILURES and self._stored_since(entry.changed_utc_s):
             self.set_aside(
                 name, f"{REJECTED_FOR_NOW}, after {failures} attempts: {reason}", judged_under=judged_under
             )
             return None
-        delay_s = FIRST_RETRY_S * 2.0 ** (failures - 1)
+        delay_s = min(FIRST_RETRY_S * 2.0 ** (failures - 1), LONGEST_RETRY_S)
         self._retry_in(delay_s, name, reason, failures, judged_under)
         return delay_s
+
+    def _stored_since(self, utc_s: float) -> bool:
+        query = "SELECT 1 FROM scan WHERE state = 'stored' AND changed_utc_s >= ?"
+        with self._store_errors():
+            return self._connection.execute(query, (utc_s,)).fetchone() is not None
 
     def rejected_for_now(self) -> list[str]:
         """Return the names of scans that were rejected for now more than `RETRY_REJECTED_S` ago; sorted."""
@@ -311,6 +327,11 @@ class Journal:
         with self._transaction():
             self._update(name, state=entry.outcome, waiting_reason="", attempts=0, next_try_utc_s=None)
         return True
+
+    def mark_ahead(self, name: str) -> None:
+        """Record, before a scan is measured ahead of earlier ones, that its turn is still to come."""
+        with self._transaction():
+            self._update(name, ahead=True)
 
     def requeue(
         self, names: Iterable[str], reason: str = "reprocessing", *, keep_reference: bool = True
@@ -381,11 +402,11 @@ class Journal:
         """Return a summary of every row by name; 0.1 s for years of hourly scans."""
         with self._store_errors():
             rows = self._connection.execute(
-                "SELECT name, size, mtime_ns, state, next_try_utc_s FROM scan"
+                "SELECT name, size, mtime_ns, state, next_try_utc_s, epoch IS NOT NULL FROM scan"
             ).fetchall()
         return {
-            name: EntrySummary(size, mtime_ns, State(state), next_s)
-            for name, size, mtime_ns, state, next_s in rows
+            name: EntrySummary(size, mtime_ns, State(state), next_s, bool(has_epoch))
+            for name, size, mtime_ns, state, next_s, has_epoch in rows
         }
 
     def unrecorded(self, names: Iterable[str]) -> list[str]:
@@ -421,14 +442,18 @@ class Journal:
         with self._store_errors():
             return [name for (name,) in self._connection.execute(query, (conditions,))]
 
-    def unsettled(self) -> dict[str, float | None]:
-        """Return the starts [s], if known, of scans that will be judged soon, for which others may wait."""
+    def unsettled(self, *, however_often_failed: bool = False) -> dict[str, float | None]:
+        """Return the starts [s], if known, of scans that will be judged soon, for which others may wait.
+
+        `however_often_failed`: include those that may fail because of the machine until they are rejected.
+        """
         query = (
-            "SELECT name, start_utc_s FROM scan WHERE (state = 'waiting' AND abs(changed_utc_s - ?) < ?)"
-            " OR (state = 'later' AND attempts < ?) ORDER BY name"
+            "SELECT name, start_utc_s FROM scan"
+            " WHERE (state = 'waiting' AND (waiting_reason = '' OR abs(changed_utc_s - ?) < ?))"
+            " OR (state = 'later' AND (attempts < ? OR (? AND judged_under IS NOT ''))) ORDER BY name"
         )
         with self._store_errors():
-            parameters = self._now_s(), SETTLING_S, SETTLING_ATTEMPTS
+            parameters = self._now_s(), SETTLING_S, MAX_FAILURES, however_often_failed
             return dict(self._connection.execute(query, parameters).fetchall())
 
     def starting_at(self, start_utc_s: float) -> list[str]:
@@ -542,4 +567,5 @@ def _entry_from_row(row: tuple[object, ...]) -> Entry:
     values["state"] = State(str(values["state"]))
     values["outcome"] = State(str(values["outcome"])) if values["outcome"] else None
     values["metrics"] = json.loads(str(values["metrics"]))
+    values["ahead"] = bool(values["ahead"])
     return Entry(**values)  # type: ignore[arg-type] # the schema is STRICT: each column has its type

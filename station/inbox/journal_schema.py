@@ -26,7 +26,8 @@ CREATE TABLE IF NOT EXISTS scan (
     next_try_utc_s REAL,
     first_seen_utc_s REAL NOT NULL,
     changed_utc_s REAL NOT NULL,
-    judged_under TEXT
+    judged_under TEXT,
+    ahead INTEGER NOT NULL DEFAULT 0 CHECK (ahead IN (0, 1))
 ) STRICT;
 CREATE INDEX IF NOT EXISTS scan_by_size ON scan (size);
 CREATE TABLE IF NOT EXISTS file (
@@ -37,6 +38,7 @@ CREATE TABLE IF NOT EXISTS file (
 _ADDED_COLUMNS = {  # missing in older journals
     "log_sha256": "TEXT NOT NULL DEFAULT ''",
     "judged_under": "TEXT",
+    "ahead": "INTEGER NOT NULL DEFAULT 0 CHECK (ahead IN (0, 1))",
 }
 
 

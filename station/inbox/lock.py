@@ -21,6 +21,7 @@ if TYPE_CHECKING:
 
 LOCK = "service.lock"
 IDENTITY = ".store_id"
+HOLDER_BYTES = 4096  # of the lock file: one block of a disk, which is there when the disk is full
 
 
 class LockedFolder:
@@ -50,8 +51,16 @@ class LockedFolder:
             if not _try_lock(new_fd, fcntl.LOCK_EX):
                 raise StoreError(f"{self._data}: its lock was deleted, and another process uses it now")
             os.dup2(new_fd, self._lock_fd, inheritable=False)
+            _write_holder(self._lock_fd, "")
         finally:
             os.close(new_fd)
+
+    def record_pause(self, reason: str) -> None:
+        """Write into the lock file, for `status`, why the service pauses; '' if it works.
+
+        The file keeps its size, so that this is possible on a full disk too.
+        """
+        _write_holder(self._lock_fd, reason)
 
     def is_remounted(self) -> bool:
         """Return True if the path leads to the same store through another mount than when it was locked."""
@@ -129,15 +138,13 @@ def exclusive_lock(data: Path, *, timeout_s: float = 2.0) -> Iterator[LockedFold
         until_s = time.monotonic() + timeout_s
         while not _try_lock(lock_fd, fcntl.LOCK_EX):
             if time.monotonic() > until_s:
-                pid = os.pread(lock_fd, 20, 0).decode("ascii", "replace").strip() or "unknown"
+                pid = _read_holder(lock_fd)[0] or "unknown"
                 raise NotReadyError(
                     f"{data} is in use by another station process (pid {pid}): stop that process first,"
                     " or give each site its own station.data"
                 )
             time.sleep(0.05)
-        with suppress(OSError):  # the disk is full: the lock is valid, only the pid is missing
-            os.ftruncate(lock_fd, 0)
-            os.pwrite(lock_fd, b"%d\n" % os.getpid(), 0)
+        _write_holder(lock_fd, "")
         yield LockedFolder(data, lock_fd)
     finally:
         os.close(lock_fd)
@@ -153,6 +160,37 @@ def is_locked(data: Path) -> bool:
         return not _try_lock(lock_fd, fcntl.LOCK_SH)
     finally:
         os.close(lock_fd)
+
+
+def pause_reason(data: Path) -> str:
+    """Return why the process that has locked a data folder pauses; '' if it works, or no process has."""
+    if not is_locked(data):
+        return ""
+    try:
+        lock_fd = os.open(data / LOCK, os.O_RDONLY | os.O_CLOEXEC)
+    except OSError:
+        return ""
+    try:
+        return _read_holder(lock_fd)[1]
+    finally:
+        os.close(lock_fd)
+
+
+def _write_holder(lock_fd: int, pause: str) -> None:
+    """Write process id and reason of a pause into the lock file."""
+    content = f"{os.getpid()}\n{' '.join(pause.split())}\n".encode()[: HOLDER_BYTES - 1]
+    with suppress(OSError):  # the disk is full or gone: the lock is valid, only the text is missing
+        os.pwrite(lock_fd, content.ljust(HOLDER_BYTES, b"\n"), 0)
+
+
+def _read_holder(lock_fd: int) -> tuple[str, str]:
+    """Return process id and reason of a pause from the lock file, as far as they are there."""
+    try:
+        text = os.pread(lock_fd, HOLDER_BYTES, 0).decode("utf-8", "replace")
+    except OSError:
+        text = ""
+    pid, _, rest = text.partition("\n")
+    return pid.strip(), rest.strip()
 
 
 def _try_lock(descriptor: int, kind: int) -> bool:

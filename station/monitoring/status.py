@@ -10,12 +10,14 @@ from typing import TYPE_CHECKING, Any
 from station.errors import NotReadyError, StationError, StoreError
 from station.inbox.inbox import is_scan, list_folder, safe_name
 from station.inbox.journal import Entry, Journal, State
-from station.inbox.lock import is_locked
+from station.inbox.lock import is_locked, pause_reason
 from station.monitoring.alarm_state import active
 from station.monitoring.preconditions import clock_problem, format_utc, require_disk_space
 from station.readers.scan import suffixes
 
 if TYPE_CHECKING:
+    from pathlib import Path
+
     from station.config import Site
 
 MAX_LISTED = 50  # scans of a kind, in the text
@@ -38,7 +40,7 @@ def status(site: Site) -> Status:
     return {
         "station": site.station.id,
         "name": site.station.name,
-        "service": "running" if is_locked(data) else "not running",
+        "service": _service_state(data),
         "counts": counts,
         "waiting": queue["waiting"],
         "set_aside": queue["set_aside"],
@@ -86,8 +88,19 @@ def _queue_status(site: Site, journal: Journal) -> Status:
         clock_problem(site.station.data, time.time()),
         *site.input_faults,
         weather_fault(site),
+        pause_reason(site.station.data),
     )
-    return {"waiting": waiting, "set_aside": set_aside, "faults": [fault for fault in faults if fault]}
+    return {
+        "waiting": waiting,
+        "set_aside": set_aside,
+        "faults": [*dict.fromkeys(fault for fault in faults if fault)],
+    }
+
+
+def _service_state(data: Path) -> str:
+    if not is_locked(data):
+        return "not running"
+    return "paused" if pause_reason(data) else "running"
 
 
 def format_status(report: Status) -> str:
@@ -128,7 +141,7 @@ def _waiting_scan(entry: Entry) -> dict[str, str | None]:
     return {
         "scan": entry.name,
         "state": entry.state.value,
-        "for": entry.waiting_reason or "its turn",
+        "for": entry.waiting_reason or ("its turn" if not entry.ahead else "its turn, to be measured again"),
         "next_try": next_try,
     }
 

@@ -9,8 +9,12 @@ import time
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 
+import numpy as np
+
+from station.archive.reference_files import valid_versions
 from station.config import Site, read_site
 from station.errors import NotReadyError, ScanError, StationError
+from station.inbox.inbox import start_from_name
 from station.inbox.journal import Journal
 from station.inbox.lock import is_locked
 from station.inbox.scan_files import scan_file
@@ -22,6 +26,7 @@ from station.operations.site_plausibility import (
     position_findings,
     rights_findings,
     setting_findings,
+    tilt_findings,
     weather_time_findings,
 )
 from station.processing import isolation
@@ -29,9 +34,12 @@ from station.processing.integrity import check_store
 from station.processing.scan_inputs import map_position, pressure_fault, scanner_height_m, scanner_to_map
 from station.processing.scan_tasks import dry_run, load_areas, polygon_cells, series_for
 from station.readers.flags import read_flags
+from station.readers.inclination import read_inclination
 from station.readers.scan import suffixes
+from station.readers.sop import valid_sop
 from station.readers.weather import interpolate_air, read_weather
 from station.science.analysis.verdict import NO_BRIGHTNESS
+from station.science.geometry import inclination
 
 Finding = dict[str, str]  # level (ok, warning, fault), what, message
 EPOCH_BYTES_PER_CELL = 16  # typical, uncompressed
@@ -50,6 +58,7 @@ def site_findings(site_path: Path) -> list[Finding]:
         *_flags(site),
         *_clock(),
         *_weather(site),
+        *_inclination(site),
         *_newest_scan(site),
     ]
 
@@ -217,6 +226,30 @@ def _weather(site: Site) -> Iterator[Finding]:
     yield _finding("warning" if fault else "ok", "weather", f"{message}; {fault}" if fault else message)
 
 
+def _inclination(site: Site) -> Iterator[Finding]:
+    """Yield a comparison of the newest inclination log with the tilt that the SOP contains.
+
+    A log that cannot be read, or shows the limit of the sensor's range, is a finding on its scan.
+    """
+    scans = _scans(site)
+    if site.inclination is None or site.inclination.mode == "absolute" or not scans or not site.sop:
+        return
+    try:
+        sop = valid_sop(site.sop, start_from_name(scans[-1].name, site.scans.name))
+        rotation = scanner_to_map(site, sop).to_local[:3, :3]
+        log_path = scans[-1].with_name(scans[-1].stem + site.inclination.suffix)
+        log, _ = inclination.clean(read_inclination(log_path), site.instrument.inclination_range_rad)
+    except StationError:
+        return
+    if not len(log.time_s):
+        return
+    expected_deg = np.degrees(inclination.mount_inclination(rotation))
+    log_deg = math.degrees(log.roll_rad.mean()), math.degrees(log.pitch_rad.mean())
+    expected = float(expected_deg[0]), float(expected_deg[1])
+    if math.degrees(site.instrument.inclination_range_rad) > max(map(abs, expected)):
+        yield from _named("inclination", [tilt_findings(sop.file.name, expected, log_deg)])
+
+
 def _newest_height_m(site: Site) -> float | None:
     """Return the height of the scanner under the newest SOP [m]; None if it is unknown."""
     try:
@@ -253,6 +286,8 @@ def _newest_scan(site: Site) -> Iterator[Finding]:
         return
     text = " ".join(f"{key}={value}" for key, value in metrics.items())
     message = f"{scan.name}: {verdict}{f' ({reason})' if reason else ''} {text}"
+    if not valid_versions(series_for(site)) and not isinstance(site.reference.scans, Path):
+        message += " (no reference yet: once there is one, sigma is smaller)"
     yield _finding("ok" if verdict == "good" else "warning", "scan", message)
     if NO_BRIGHTNESS in reason:
         yield _finding(

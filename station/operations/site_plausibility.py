@@ -23,6 +23,7 @@ MAX_SCANNER_OFFSET_M = 500.0  # from map.origin; a larger project frame is unusu
 MAX_OVERRIDE_RATIO = 5.0  # of a value of the scanner and its data sheet
 MAX_STABLE_SHARE = 0.1  # of the cells of an area
 MAX_WEATHER_AHEAD_S = 600.0
+MAX_TILT_DEVIATION_DEG = 0.5  # of log and SOP: far more than a sensor's error, less than a wrong SOP
 
 LevelAndMessage = tuple[str, str]  # level (warning, fault), message
 
@@ -82,6 +83,19 @@ def setting_findings(site: Site) -> Iterator[LevelAndMessage]:
         is_number = isinstance(typical, (int, float)) and isinstance(value, (int, float)) and typical > 0
         if is_number and not typical / MAX_OVERRIDE_RATIO <= value <= typical * MAX_OVERRIDE_RATIO:
             yield "warning", f"scanner.{key} = {value:g}, but a {site.scanner.model} has {typical:g}"
+
+
+def tilt_findings(
+    sop: str, expected_deg: tuple[float, float], log_deg: tuple[float, float]
+) -> LevelAndMessage:
+    """Return a comparison of roll and pitch in an SOP and in the log of a scan under it."""
+    message = (
+        f"roll {log_deg[0]:.2f}°, pitch {log_deg[1]:.2f}° in the newest log, {expected_deg[0]:.2f}°,"
+        f" {expected_deg[1]:.2f}° in {sop}"
+    )
+    if math.dist(expected_deg, log_deg) <= MAX_TILT_DEVIATION_DEG:
+        return "ok", message
+    return "warning", f"{message}: another SOP, a moved mount, or a wrong log?"
 
 
 def weather_time_findings(last_utc_s: float) -> Iterator[LevelAndMessage]:

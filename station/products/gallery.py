@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import hashlib
 import json
+import os
+import struct
 import time
 import zipfile
 import zlib
@@ -107,7 +109,7 @@ def update_gallery(
         epoch = item.epoch
         name = f"{Path(epoch.epoch_file).stem}_{tag}.webp"
         is_last = item is measured[-1]
-        if not all((maps_folder / file).is_file() for file in _file_names(name, is_last=is_last)):
+        if not all(_is_whole(maps_folder / file) for file in _file_names(name, is_last=is_last)):
             if drawn_count == MAX_DRAWN:
                 continue
             caption = Caption(style.station, f"{epoch.start:%Y-%m-%d %H:%M} UTC", item.verdict)
@@ -122,6 +124,16 @@ def update_gallery(
     _, sigma, points = _file_names(Path(images[-1].file).name, is_last=True)
     _delete_old(maps_folder, {Path(item.file).name for item in images} | {sigma, points})
     return Gallery(images, f"maps/{sigma}", f"maps/{points}", limit_m, _size(folder / images[-1].file))
+
+
+def _is_whole(path: Path) -> bool:
+    """Return True if a map is there and as long as its header states."""
+    try:
+        with path.open("rb") as file:
+            riff, size, webp = struct.unpack("<4sI4s", file.read(12))
+            return (riff, size + 8, webp) == (b"RIFF", os.fstat(file.fileno()).st_size, b"WEBP")
+    except (OSError, struct.error):
+        return False
 
 
 def _size(path: Path) -> tuple[int, int]:

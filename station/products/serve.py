@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -12,6 +14,7 @@ if TYPE_CHECKING:
     from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 LOOPBACK = "127.0.0.1"
+MISSING_LIBRARIES = "serving needs two libraries: pip install 'tls-station[serve]'"
 HEADERS = {
     "content-security-policy": "default-src 'none'; img-src 'self'; script-src 'self'; style-src 'self';"
     " base-uri 'none'; form-action 'none'; frame-ancestors 'none'",
@@ -51,7 +54,7 @@ def app_for(folder: Path) -> Starlette:
         from starlette.routing import Mount  # noqa: PLC0415
         from starlette.staticfiles import StaticFiles  # noqa: PLC0415
     except ImportError as error:
-        raise StationError("serving needs two libraries: pip install 'tls-station[serve]'") from error
+        raise StationError(MISSING_LIBRARIES) from error
 
     class Shown(StaticFiles):
         """Files whose names do not begin with a dot; links that leave the folder are not followed."""
@@ -72,11 +75,16 @@ def app_for(folder: Path) -> Starlette:
     )
 
 
-def serve(folder: Path, port: int) -> None:
-    """Serve until interrupted; raise StationError if there is no page yet."""
+def server_for(folder: Path, port: int) -> Callable[[], None]:
+    """Return a function that serves until interrupted.
+
+    Raises StationError if there is no page yet, or a library is missing.
+    """
     if not (folder / "index.html").is_file():
         raise StationError(f"{folder}: no page yet; it is written with the first scan (products.page = true)")
     app = app_for(folder)
-    import uvicorn  # noqa: PLC0415 - an extra
-
-    uvicorn.run(app, host=LOOPBACK, port=port, log_level="warning", server_header=False)
+    try:
+        import uvicorn  # noqa: PLC0415 - an extra
+    except ImportError as error:
+        raise StationError(MISSING_LIBRARIES) from error
+    return partial(uvicorn.run, app, host=LOOPBACK, port=port, log_level="warning", server_header=False)

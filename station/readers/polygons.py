@@ -22,10 +22,10 @@ KINDS = ("Polygon", "MultiPolygon")
 def read_polygons(path: Path, crs: str | None) -> dict[str, shapely.Geometry]:
     """Read the polygons of a GeoJSON file by name, in file order, in map coordinates.
 
-    A polygon's name is its property `name`, else `id`, else `area_1` by its position in the file. A file that
-    declares no CRS is taken to be in map coordinates. Raises ConfigError, with file and feature, if the CRS
-    is not that of the map, the coordinates are degrees, something is damaged, a polygon intersects itself,
-    two have the same name, or there is none.
+    A polygon's name is its property `name`, else `id`, in any case of letters, else `area_1` by its position
+    in the file. A file that declares no CRS is taken to be in map coordinates. Raises ConfigError, with file
+    and feature, if the CRS is not that of the map, the coordinates are degrees, something is damaged, a
+    polygon intersects itself, two have the same name, or there is none.
     """
     document = _read_json(path)
     projected = crs is not None and horizontal_crs(crs).is_projected
@@ -133,8 +133,9 @@ def _features(path: Path, document: dict[str, Any]) -> list[dict[str, Any]]:
 
 
 def _name(feature: dict[str, Any], number: int) -> str:
-    properties = feature.get("properties") or {}
-    candidates = [properties.get("name"), properties.get("id")] if isinstance(properties, dict) else []
+    properties = feature.get("properties")
+    by_key = {key.lower(): value for key, value in properties.items()} if isinstance(properties, dict) else {}
+    candidates = by_key.get("name"), by_key.get("id")
     names = [str(value).strip() for value in (*candidates, feature.get("id")) if value is not None]
     return next((name for name in names if name), f"area_{number}")
 

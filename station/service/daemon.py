@@ -42,7 +42,7 @@ class ScanProcessor(Protocol):
     """What the loop needs of a worker; see `worker.Worker`."""
 
     def recover(self) -> None: ...  # noqa: D102
-    def process(self, scan: ScanFile) -> bool: ...  # noqa: D102
+    def process(self, scan: ScanFile, *, ahead: bool = False) -> bool: ...  # noqa: D102
     def precheck(self, scan: ScanFile) -> None: ...  # noqa: D102
     def start_compaction(self) -> None: ...  # noqa: D102
     def publish_compacted(self) -> None: ...  # noqa: D102
@@ -132,9 +132,9 @@ class Daemon:
         """Run the loop until `stop` is called; raise NotReadyError if only a restart helps."""
         self._wait_for_clock()
         data = self._site.station.data
-        if state_folder := os.environ.get("STATE_DIRECTORY", "").partition(":")[0]:
-            require_known(data, Path(state_folder))
+        self._require_known_folder()
         with exclusive_lock(data) as self._folder, self._metrics.serving(), self._exit_stack:
+            self._require_known_folder()  # remembers the one that the lock has just created
             self._exit_stack.callback(self._close_components)
             while not self._is_stopping():
                 try:
@@ -146,6 +146,10 @@ class Daemon:
                 self._require_no_restart()
                 self._wait(wait_s)
             log.info(logfmt(service="stopped"))
+
+    def _require_known_folder(self) -> None:
+        if state_folder := os.environ.get("STATE_DIRECTORY", "").partition(":")[0]:
+            require_known(self._site.station.data, Path(state_folder))
 
     # ---- one iteration
 
@@ -179,12 +183,12 @@ class Daemon:
             self._report_idle()
             return min(self._timing.period_s, state.next_s)
         self._systemd.status(f"measuring {state.first.name}, {state.queued - 1} more waiting")
-        self._process(worker, state.first)
+        self._process(worker, state.first, ahead=state.ahead)
         return 0.0
 
-    def _process(self, worker: ScanProcessor, scan: ScanFile) -> None:
+    def _process(self, worker: ScanProcessor, scan: ScanFile, *, ahead: bool) -> None:
         try:
-            worker.process(scan)
+            worker.process(scan, ahead=ahead)
         except StationError:
             self._is_reconciled = False  # it may have stopped between writing the file and the journal
             raise
@@ -295,6 +299,7 @@ class Daemon:
         """Log the first of consecutive faults; return the pause before the next attempt [s]."""
         pause_s = min(self._timing.first_pause_s * 2.0**self._consecutive_faults, self._timing.period_s)
         self._systemd.status(f"paused: {error}")
+        self._folder.record_pause(str(error))
         if self._consecutive_faults == 0 and not self._is_stopping():
             log.error(logfmt(service="paused", reason=error))
         self._consecutive_faults = min(self._consecutive_faults + 1, 20)
@@ -303,6 +308,7 @@ class Daemon:
     def _resume(self) -> None:
         if self._consecutive_faults:
             self._consecutive_faults = 0
+            self._folder.record_pause("")
             log.info(logfmt(service="resumed"))
 
     def _wait(self, wait_s: float) -> None:

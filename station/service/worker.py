@@ -21,7 +21,7 @@ from station.errors import (
     StoreError,
 )
 from station.inbox.inbox import ScanFile, start_from_name
-from station.inbox.journal import SETTLING_S, Entry, Journal, State
+from station.inbox.journal import Entry, Journal, State
 from station.inbox.scan_files import find_scan
 from station.logs import logfmt
 from station.monitoring.daily_digest import write_digest, yesterday
@@ -111,20 +111,25 @@ class Worker:
         self._reported_faults: tuple[str, ...] = ()
         self._compaction = BackgroundCompaction(site, on_compacted)
 
-    def process(self, scan: ScanFile) -> bool:
+    def process(self, scan: ScanFile, *, ahead: bool = False) -> bool:
         """Measure and store a scan, record it in journal and log; return True if it is stored.
+
+        A live scan is measured `ahead` of a backlog, from the newest version of the reference, and goes on
+        waiting: it is part of no reference, and measured again in its turn, as if nothing had come before.
 
         Raises StoreError if the store cannot be written; the scan is then still waiting.
         """
-        is_stored = self._process(scan)
+        if ahead:
+            self._journal.mark_ahead(scan.name)
+        is_stored = self._process(scan, ahead=ahead)
         self._build_reference_if_due()  # also if the scan is not stored: the reference may have waited for it
         return is_stored
 
-    def _process(self, scan: ScanFile) -> bool:
+    def _process(self, scan: ScanFile, *, ahead: bool) -> bool:
         self._processed[scan.name] = scan
         entry = self._journal.entry(scan.name)
         history = ScanHistory(
-            reference=entry.reference if entry else None,
+            reference=entry.reference if entry and not entry.ahead else None,
             revision=(entry.revision if entry else None) or 0,
             last_content=_assessed_content(entry) if self._in_service else None,
             stored_scans=self._journal.others_stored(scan.name, scan.size),
@@ -146,7 +151,7 @@ class Worker:
         if isinstance(result, Duplicate):
             return self._record_duplicate(scan, result)
         uncompacted = self._with_repair(update_series)
-        record_result(self._journal, scan.name, result)
+        record_result(self._journal, scan.name, result, ahead=ahead)
         _log_result(scan.name, result)
         self.publish(scan.name, result)
         if self._in_service and uncompacted > MAX_UNCOMPACTED:
@@ -159,6 +164,7 @@ class Worker:
             self.run(check_header, scan)
         except ScanError as error:
             self._set_aside(scan, str(error))
+            self._build_reference_if_due()  # it may have waited for this scan
         except NotReadyError:
             return
 
@@ -235,9 +241,9 @@ class Worker:
             log.warning("%s", logfmt(digest="failed", reason=error))
 
     def run_maintenance(self) -> None:
-        """Rebuild damaged files, delete expired ones, requeue scans with late inputs, report outdated epochs.
+        """Rebuild damaged files, delete expired ones, requeue scans with late inputs, build a due reference.
 
-        Then apply retention.
+        Then report outdated epochs and apply retention.
         """
         if holds_epochs(self._series):
             self._with_repair(update_series)
@@ -248,6 +254,7 @@ class Worker:
             log.info("%s", logfmt(scan=name, reason="its log or weather arrived late: reprocessing"))
         self._journal.requeue(names)
         self._judge_again()
+        self._build_reference_if_due()  # what it waits for may have taken too long, and no scan come since
         self._report_outdated()
         self._apply_retention()
 
@@ -401,7 +408,7 @@ class Worker:
         if isinstance(setting, Path) or not chosen or len(usable) < needed:
             return
         last_s = self._start_s(usable[needed - 1])
-        if self._unsettled_before(last_s):  # it may belong to the reference
+        if self._unsettled_before(last_s, however_often_failed=True):  # it may belong to the reference
             return
         scans = [self._find_scan(name) for name in chosen]
         available = [scan for scan in scans if scan is not None]
@@ -427,20 +434,21 @@ class Worker:
         """Requeue epochs that were not measured from a version of the reference, but should have been.
 
         These are all epochs of a first version; of an update, to the scans before `update_s`, those of later
-        scans that were processed while the update waited for an earlier one.
+        scans that were processed while the update waited for an earlier one, if they are still in the inbox.
         """
         outdated = (
             row.name
             for row in self._journal.rows()
             if row.epoch and row.outcome is not State.SET_ASIDE and row.reference != version
             if update_s is None
-            or ((row.start_utc_s or 0.0) > update_s and row.changed_utc_s > time.time() - SETTLING_S)
+            or ((row.start_utc_s or 0.0) > update_s and (self._site.scans.inbox / row.name).is_file())
         )
         self._journal.requeue(outdated, keep_reference=False)
 
-    def _unsettled_before(self, start_utc_s: float) -> str:
+    def _unsettled_before(self, start_utc_s: float, *, however_often_failed: bool = False) -> str:
         """Return the name of an earlier scan that will be judged soon, '' if there is none."""
-        for name, known_s in self._journal.unsettled().items():
+        unsettled = self._journal.unsettled(however_often_failed=however_often_failed)
+        for name, known_s in unsettled.items():
             if (known_s or start_from_name(name, self._site.scans.name).timestamp()) < start_utc_s:
                 return name
         return ""
@@ -503,7 +511,7 @@ def record_failure(journal: Journal, site: Site, name: str, reason: str) -> bool
     return False
 
 
-def record_result(journal: Journal, name: str, result: StoredResult) -> None:
+def record_result(journal: Journal, name: str, result: StoredResult, *, ahead: bool = False) -> None:
     """Record the result of a scan in the journal."""
     journal.record_stored(
         name,
@@ -517,6 +525,7 @@ def record_result(journal: Journal, name: str, result: StoredResult) -> None:
         metrics=result.metrics,
         log_sha256=result.log_sha256,
         epoch_sha256=result.epoch_sha256,
+        ahead=ahead,
     )
 
 

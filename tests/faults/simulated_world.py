@@ -3,8 +3,9 @@
 Everything is the production code but for what a `World` stands for: the clock (nobody waits for it), the
 process of a task (it runs here, and may die or never start), the disk (any change of a file in the data
 folder may fail, or be the last of the service), the network folder with the inbox, and the events of file
-watcher and scheduler. A year has a scan every ten days and two faults around each; what happens follows from
-the seed. Deaths here run `finally` blocks; `test_kills.py` kills real processes.
+watcher and scheduler. A year has nine bursts of four hourly scans, a change of the SOP, and two faults around
+each scan; what happens follows from the seed. Deaths here run `finally` blocks, and nothing is synced to any
+disk; `test_kills.py` kills real processes.
 
     python tests/faults/simulated_world.py --seed 0 --years 100
 """
@@ -46,9 +47,12 @@ from station.service.scheduler import LoopEvent
 START_S = datetime(2035, 7, 15, tzinfo=UTC).timestamp()  # later than the real clock, which stamps the files
 BASE_SCANS = 12  # simulated ones, of which all others are copies with bytes of their own
 DAY_S, HOUR_S = 86_400.0, 3600.0
-SCAN_INTERVAL_S = 10 * DAY_S
+BURST_INTERVAL_S = 40 * DAY_S
+SCANS_PER_BURST = 4
 SCANS_PER_YEAR = 36
-HOUSEKEEPING_S = 5 * DAY_S
+HOUSEKEEPING_S = 20 * DAY_S
+REFERENCES_DUE_S = 2.5 * BURST_INTERVAL_S  # the first after 3 scans, its update after 12
+SOP_CHANGE_S = 4.5 * BURST_INTERVAL_S
 MAX_RECOVERY_S = 40 * DAY_S  # after the last fault; the longest pause of a scan is hours
 TIMING = LoopTiming(period_s=6 * HOUR_S, first_pause_s=5.0)
 
@@ -60,7 +64,7 @@ class _DiedError(BaseException):
 class World:
     """A station's folder and all that happens to it."""
 
-    def __init__(self, folder: Path, seed: int, years: int = 1) -> None:
+    def __init__(self, folder: Path, seed: int, scans: int = SCANS_PER_YEAR) -> None:
         self.folder, self.seed = folder, seed
         self.rng = random.Random(seed)  # noqa: S311 - no secret
         self.elapsed_s = self.clock_error_s = 0.0
@@ -72,12 +76,13 @@ class World:
         self.countdown: dict[str, int] = {}  # boundaries until the death of "child" or "service"
         self.is_disk_full = self.is_out_of_space = False
         self.child_fault: Exception | None = None
+        self.version = "1.0"
         self.log: list[str] = []
         self.data, self.inbox = folder / "data", folder / "inbox"
         self.last_fault_s = 0.0
-        for number in range(years * SCANS_PER_YEAR):
+        for number in range(scans):
             self._plan_scan(number)
-        for number in range(1, int(years * 365 * DAY_S / HOUSEKEEPING_S)):
+        for number in range(1, int(_start_s(scans) / HOUSEKEEPING_S) + 1):
             self.at(number * HOUSEKEEPING_S, self._housekeeping)
 
     # ---- what will happen
@@ -87,12 +92,14 @@ class World:
         self.timeline.append((elapsed_s, len(self.timeline), action))
         self.timeline.sort(key=lambda planned: planned[:2], reverse=True)
 
-    def plan_faults(self) -> None:
-        """Plan two faults around each scan."""
-        kinds = [name for name in dir(self) if name.startswith("fault_")]
+    def plan_faults(self, *kinds: str) -> None:
+        """Plan two faults, of any kind or one of these, around each scan."""
+        kinds = [f"fault_{kind}" for kind in kinds] or [
+            name for name in dir(self) if name.startswith("fault_")
+        ]
         for number in range(1, len(self.names)):
             for _ in range(2):
-                begin_s = number * SCAN_INTERVAL_S + self.rng.uniform(-2, 0.2) * HOUR_S
+                begin_s = _start_s(number) + self.rng.uniform(-2, 0.2) * HOUR_S
                 end_s = begin_s + self.rng.choice([0.1, 1.0, 5.0, 20.0]) * HOUR_S
                 fault = getattr(self, self.rng.choice(kinds))
                 self.at(begin_s, lambda fault=fault, end_s=end_s: self._begin(fault, end_s))
@@ -105,10 +112,10 @@ class World:
             self.at(max(end_s, self.elapsed_s), undo)
 
     def _plan_scan(self, number: int) -> None:
-        start_s = START_S + number * SCAN_INTERVAL_S
+        start_s = START_S + _start_s(number)
         name = datetime.fromtimestamp(start_s, UTC).strftime("%y%m%d_%H%M%S")
         self.names.append(f"{name}.laz")
-        self.at(number * SCAN_INTERVAL_S + 120, lambda: self._deliver(number % BASE_SCANS, name))
+        self.at(_start_s(number) + 120, lambda: self._deliver(number % BASE_SCANS, name))
 
     def _deliver(self, base: int, name: str) -> None:
         """Put a scan, its log and the weather of its time into their folders."""
@@ -201,6 +208,9 @@ class World:
         return self._break(self.folder / "areas.geojson")
 
     def fault_weather_broken(self) -> object:
+        """A scan without weather is part of no reference: not while one falls due."""
+        if self.elapsed_s < REFERENCES_DUE_S:
+            return None
         return self._break(self.folder / "weather.dat")
 
     def _break(self, path: Path) -> object:
@@ -229,20 +239,37 @@ class World:
             and path.relative_to(self.data).parts[0] not in {"epochs", "reference", "set_aside"}
         ]  # fmt: skip
         if files:
-            path = self.rng.choice(sorted(files))
-            content = bytearray(path.read_bytes())
-            if self.rng.random() < 0.3:
-                del content[len(content) // 2 :]
-            elif content:
-                content[self.rng.randrange(len(content))] ^= 0x55
-            with path.open("r+b") as file:
-                file.truncate(0)
-                file.write(content)
+            self._damage(self.rng.choice(sorted(files)))
+
+    def fault_series_damaged(self) -> None:
+        if (self.data / "series.nc").exists():
+            self._damage(self.data / "series.nc")
+
+    def fault_tilt_offset_damaged(self) -> None:
+        for path in sorted(self.data.glob("sop_tilt_offset/*")):
+            self._damage(path)
+
+    def _damage(self, path: Path) -> None:
+        """Halve a file, or flip some bits of a byte."""
+        content = bytearray(path.read_bytes())
+        if self.rng.random() < 0.3:
+            del content[len(content) // 2 :]
+        elif content:
+            content[self.rng.randrange(len(content))] ^= 0x55
+        with path.open("r+b") as file:
+            file.truncate(0)
+            file.write(content)
 
     def fault_scan_touched(self) -> None:
+        """Touch a scan for two hours, as a mirror does: it is settling while others are processed."""
         path = self._some_scan()
         if path is not None:
-            os.utime(path, (self.now_s(), self.now_s()))
+            for delay_s in range(0, 7200, 50):
+                self.at(self.elapsed_s + delay_s, lambda: self._touch(path.name))
+
+    def _touch(self, name: str) -> None:
+        os.utime(self.inbox / name, (self.now_s(), self.now_s()))
+        self._post(LoopEvent.INBOX_CHANGED)
 
     def fault_scan_copied(self) -> None:
         path = self._some_scan()
@@ -252,6 +279,14 @@ class World:
             log = self.inbox / f"{path.stem}-incl.txt"
             self._put(log.read_bytes() if log.exists() else b"", f"{name}-incl.txt")
             self._put(path.read_bytes(), f"{name}.laz")
+
+    def fault_other_scan_of_a_start(self) -> None:
+        path = self._some_scan()
+        if path is not None:
+            content = bytearray(
+                (self.folder / PENDING / f"{scan_name(self.rng.randrange(BASE_SCANS))}.laz").read_bytes()
+            )
+            self._put(bytes(content), f"{path.stem}.LAZ")
 
     def fault_hostile_scan(self) -> None:
         path = self._some_scan()
@@ -269,6 +304,18 @@ class World:
         text = site.read_text().partition("[service]")[0]
         site.write_text(f"{text}[service]\nmemory_gb = {self.rng.choice([2.0, 3.0, 4.0])}\n")
         self._post(LoopEvent.RELOAD)
+
+    def fault_upgrade(self) -> None:
+        """Stop the service as a package manager does, and start another version."""
+        self.version = f"{self.rng.randrange(1000)}.0"
+        if self.daemon is not None:
+            self.daemon.stop()
+
+    def fault_epoch_cut(self) -> None:
+        """Cut an epoch off, as a disk without a journal does when power fails."""
+        files = sorted(self.data.rglob("epochs/**/*.nc"))
+        if files:
+            os.truncate(self.rng.choice(files), 1000)
 
     def _some_scan(self) -> Path | None:
         """Return a scan that is stored, at random."""
@@ -363,7 +410,7 @@ class World:
                 )
             replace(os, "statvfs", self.statvfs)
             replace(boundaries, "_cross", self.cross)
-            for name in ("fsync", "replace", "rename", "link", "unlink", "mkdir"):
+            for name in ("replace", "rename", "link", "unlink", "mkdir"):
                 replace(os, name, boundaries._watched(name, getattr(os, name)))
             connect = sqlite3.connect
             replace(
@@ -371,6 +418,7 @@ class World:
                 "connect",
                 lambda *args, **kw: connect(*args, **{"factory": boundaries._Connection} | kw),
             )
+            replace(os, "fsync", boundaries._watched("fsync", lambda _: None))
             replace(isolation, "_run_once", self.run_once)
             replace(worker, "BackgroundCompaction", _Compaction)
             stack.enter_context(mock.patch.dict(os.environ, {"STATE_DIRECTORY": str(self.folder / "state")}))
@@ -388,12 +436,14 @@ class World:
                 self.starts += 1
                 self.daemon = None
                 try:
-                    self.daemon = _Daemon(self)
-                    self.daemon.serve()
+                    with mock.patch("station.config.__version__", self.version):
+                        self.daemon = _Daemon(self)
+                        self.daemon.serve()
                 except _DiedError:
                     self.deaths += 1
                 except StationError as error:
                     self.log.append(f"service ended: {error}")
+                    self.advance(600.0)  # many starts in vain would only take time
                 self.in_child = False
                 self.advance(10.0)
 
@@ -401,7 +451,7 @@ class World:
         """Return True if nothing is planned any more and no scan waits, or time is up."""
         if self.timeline or self.elapsed_s < self.last_fault_s + 2 * HOUSEKEEPING_S:
             return False
-        if self.elapsed_s > max(self.last_fault_s, len(self.names) * SCAN_INTERVAL_S) + MAX_RECOVERY_S:
+        if self.elapsed_s > max(self.last_fault_s, _start_s(len(self.names))) + MAX_RECOVERY_S:
             return True
         rows = self.rows()
         return set(self.names) <= rows.keys() and all(
@@ -453,6 +503,12 @@ def _where(actual: np.ndarray, expected: np.ndarray) -> str:
     is_float = actual.dtype.kind == "f"
     same = np.isclose(actual, expected, rtol=0, atol=0, equal_nan=True) if is_float else actual == expected
     return f" in {np.flatnonzero(~np.all(same, axis=axis)).tolist()}"
+
+
+def _start_s(number: int) -> float:
+    """Return when a scan begins [s since the start]."""
+    burst, hour = divmod(number, SCANS_PER_BURST)
+    return burst * BURST_INTERVAL_S + hour * HOUR_S
 
 
 class _Compaction:
@@ -524,21 +580,28 @@ class _Daemon(Daemon):
             self.stop()
 
 
-def make_world(folder: Path, template: Path, seed: int, years: int = 1) -> World:
+def make_world(folder: Path, template: Path, seed: int, scans: int = SCANS_PER_YEAR) -> World:
     """Return a world in a new folder; `template` is a station made by `make_template`."""
     shutil.copytree(template, folder)
-    return World(folder, seed, years)
+    return World(folder, seed, scans)
 
 
 def make_template(folder: Path) -> Path:
     """Simulate the scans of which all worlds have copies."""
-    build(folder, hours=BASE_SCANS)
+    build(folder, hours=BASE_SCANS, method="joint")
+    shutil.copy(folder / "sop.dat", folder / "next_sop.dat")
+    change = datetime.fromtimestamp(START_S + SOP_CHANGE_S, UTC)
     site = folder / "site.toml"
-    text = site.read_text().replace("settle_s = 0.05", "settle_s = 60")
-    text = text.replace("250715_000000", "350715_000000")
-    text = text.replace("scans = 2  ", "scans = 3  ").replace(
-        "expected_every_s = 3600", "expected_every_s = 432000"
-    )
+    text = site.read_text()
+    for old, new in (
+        ("settle_s = 0.05", "settle_s = 60"),
+        ("scans = 2  ", "scans = 3  "),
+        ("expected_every_s = 3600", "expected_every_s = 7200"),
+        ('scan = "250715_000000"', "# the first scan defines the tilt offset"),
+        ("[map]", f'[[sop]]\nfrom = {change:%Y-%m-%dT%H:%M:%SZ}\nfile = "next_sop.dat"\n[map]'),
+    ):
+        assert old in text
+        text = text.replace(old, new)
     site.write_text(f"{text}[products]\npage = false\n")
     return folder
 

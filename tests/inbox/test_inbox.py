@@ -8,6 +8,8 @@ import math
 import os
 import shutil
 import socket
+import time
+from datetime import UTC, datetime, timedelta
 
 import pytest
 
@@ -132,6 +134,81 @@ def test_scans_are_ordered_by_the_time_in_their_names(make_inbox, drop, journal,
     clock.advance(1)
     last = inbox.poll()
     assert (last.first, last.queued, last.next_s) == (None, 0, math.inf)
+
+
+LIVE = "270115_073000.laz"  # half an hour before the clock of these tests
+
+
+def backlog(drop, count=3):
+    for number in range(count):
+        drop(f"2611{1 + number // 24:02d}_{number % 24:02d}0000.laz", "x" * (10 + number))
+
+
+def test_live_scan_is_measured_ahead_of_a_backlog_once(make_inbox, drop, journal):
+    inbox = make_inbox(settle_s=0)
+    backlog(drop)
+    assert (inbox.poll().first.name, inbox.poll().ahead) == ("261101_000000.laz", False)
+    drop(LIVE)
+    state = inbox.poll()
+    assert (state.first.name, state.ahead, state.queued) == (LIVE, True, 4)
+    assert inbox.poll().first.name == "261101_000000.laz"  # one of the backlog in between
+    journal.mark_ahead(LIVE)
+    journal.record_stored(
+        LIVE, sha256="0", verdict="good", epoch="e", start_utc_s=1e9, revision=1, reference="1", ahead=True
+    )
+    row = journal.entry(LIVE)
+    assert (row.state, row.outcome, row.epoch, row.ahead) == (State.WAITING, None, "e", True)
+    assert journal.usable() == []  # it is part of no reference
+    order = []
+    for _ in range(4):
+        state = inbox.poll()
+        order.append((state.first.name, state.ahead))
+        store(journal, state.first.name)
+    assert order[0] == ("261101_000000.laz", False)
+    assert order[3] == (LIVE, False)
+    assert not journal.entry(LIVE).ahead
+
+
+@pytest.mark.parametrize("case", ["old", "of a copy", "of one start", "second in the queue", "still open"])
+def test_scan_takes_its_turn_if_it_is(make_inbox, drop, clock, monkeypatch, case):
+    inbox = make_inbox(settle_s=0)
+    backlog(drop, 1 if case == "second in the queue" else 3)
+    drop(LIVE, "x" * 11 if case == "of a copy" else "scan")
+    clock.now_s += 8000 if case == "old" else 0
+    if case == "of one start":
+        drop(LIVE.replace(".laz", ".las"), "longer")
+    if case == "still open":
+        monkeypatch.setattr(inbox_module, "_is_open_for_writing", lambda scan: scan.name == LIVE)
+    assert (inbox.poll().first.name, inbox.poll().ahead) == ("261101_000000.laz", False)
+
+
+def test_backlog_of_ten_thousand_scans_is_polled_in_a_second(make_inbox, drop, tmp_path, journal):
+    """So long the live scan waits, besides the one that is being processed when it arrives."""
+    inbox = make_inbox(settle_s=0)
+    for number in range(10_000):
+        at = datetime(2025, 1, 1, tzinfo=UTC) + timedelta(hours=number)
+        (tmp_path / "inbox" / f"{at:%y%m%d_%H%M%S}.laz").write_bytes(bytes(number))
+    inbox.poll()
+    drop(LIVE, "x" * 20_000)
+    began_s = time.process_time()
+    state = inbox.poll()
+    assert time.process_time() - began_s < 1.0
+    assert (state.first.name, state.ahead, state.queued) == (LIVE, True, 10_001)
+    assert len(journal.unsettled()) == 10_001
+
+
+def test_reference_waits_for_scans_in_the_queue_but_not_for_one_that_stays_open(
+    make_inbox, drop, clock, journal, monkeypatch
+):
+    monkeypatch.setattr(inbox_module, "_is_open_for_writing", lambda scan: scan.name == FIRST)
+    inbox = make_inbox(settle_s=0)
+    drop(FIRST)
+    drop(SECOND)
+    for _ in range(8):
+        assert inbox.poll().first.name == SECOND
+        clock.advance(3600)
+    assert journal.entry(FIRST).waiting_reason == "another process to close it"
+    assert journal.unsettled() == {SECOND: None}
 
 
 def test_finished_scan_is_ready_again_only_after_a_change(make_inbox, drop, journal):

@@ -15,7 +15,7 @@ from dataclasses import replace
 import pytest
 
 from station.errors import NotReadyError, StoreError
-from station.inbox.journal import Journal, State
+from station.inbox.journal import MAX_FAILURES, Journal, State
 from station.inbox.lock import exclusive_lock, is_locked
 
 NAME = "261121_030512.laz"
@@ -120,8 +120,24 @@ def test_failures_count_only_under_the_same_conditions(journal):
     assert journal.judged_otherwise("0.1 a") == []
     assert journal.judged_otherwise("0.2 a") == [NAME]
     assert journal.record_failure(NAME, "killed", "0.2 a") == 30
-    assert [journal.record_failure(NAME, "killed", "0.2 a") for _ in range(11)][-2:] == [30 * 2**10, None]
+    assert [journal.record_failure(NAME, "killed", "0.2 a") for _ in range(10)][-1] == 30 * 2**10
+    store(journal, "other.laz")
+    assert journal.record_failure(NAME, "killed", "0.2 a") is None
     assert journal.entry(NAME).state is State.SET_ASIDE
+
+
+def test_scan_is_not_rejected_while_no_other_is_stored(tmp_path):
+    """Then the machine is the cause: it is tried as rarely as before, and references wait for it."""
+    now_s = [1000.0]
+    with Journal(tmp_path / "journal.sqlite", now_s=lambda: now_s[0]) as journal:
+        store(journal, "other.laz")
+        for failure in range(1, 20):
+            now_s[0] += 3600
+            assert journal.record_failure(NAME, "no memory", "0.1 a") == 30 * 2 ** min(failure - 1, 10)
+        assert journal.unsettled() == {}
+        assert journal.unsettled(however_often_failed=True) == {NAME: None}
+        store(journal, "other.laz")
+        assert journal.record_failure(NAME, "no memory", "0.1 a") is None
 
 
 def test_scans_set_aside_whatever_the_settings_are_not_judged_again(journal):
@@ -134,15 +150,17 @@ def test_scans_set_aside_whatever_the_settings_are_not_judged_again(journal):
 def test_settled_scans_delay_no_other(tmp_path):
     now_s = [1000.0]
     with Journal(tmp_path / "journal.sqlite", now_s=lambda: now_s[0]) as journal:
-        journal.record_seen([(name, 10, 20, "") for name in ("open.laz", "stored.laz", "later.laz")])
+        journal.record_seen([(name, 10, 20, "") for name in ("queued.laz", "stored.laz", "later.laz")])
+        journal.record_seen([("open.laz", 10, 20, "another process to close it")])
         store(journal, "stored.laz")
         journal.defer("later.laz", "permission denied")
-        assert journal.unsettled() == {"later.laz": None, "open.laz": None}
-        for _ in range(5):
+        assert journal.unsettled() == {"later.laz": None, "open.laz": None, "queued.laz": None}
+        for _ in range(MAX_FAILURES - 1):
             journal.defer("later.laz", "permission denied")
-        assert list(journal.unsettled()) == ["open.laz"]
+        assert list(journal.unsettled()) == ["open.laz", "queued.laz"]
         now_s[0] += 7 * 3600
-        assert journal.unsettled() == {}
+        assert list(journal.unsettled()) == ["queued.laz"]  # its turn comes
+        store(journal, "queued.laz")
         journal.record_seen([("stored.laz", 10, 21, "")])
         assert journal.unsettled() == {"stored.laz": 5.0}
 

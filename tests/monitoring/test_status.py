@@ -96,6 +96,26 @@ def test_status_before_the_first_start(make_site):
     assert sorted(path.name for path in site.station.data.iterdir()) == []
 
 
+def test_status_tells_why_the_service_pauses(make_site):
+    """For instance for a fault of the store that status itself cannot see; what it sees is told once."""
+    site = make_site()
+    with exclusive_lock(site.station.data) as folder:
+        for reason in ("epoch.nc: damaged\nat byte 7", f"the inbox {site.scans.inbox} cannot be listed: no"):
+            folder.record_pause(reason)
+            report = status(site)
+            assert report["service"] == "paused"
+            assert report["faults"] == [" ".join(reason.split())]
+            assert (site.station.data / "service.lock").stat().st_size == 4096
+        folder.record_pause("é" * 4000)
+        assert len(status(site)["faults"][0]) == 2048 - 3
+        folder.record_pause("")
+        report = status(site)
+        assert (report["service"], report["faults"]) == ("running", [])
+        folder.record_pause("killed meanwhile")
+    report = status(site)
+    assert (report["service"], report["faults"]) == ("not running", [])
+
+
 @pytest.mark.parametrize("running", [False, True])
 def test_status_lists_waiting_and_rejected_scans_with_reasons(make_site, running):
     site = make_site()

@@ -118,6 +118,23 @@ def test_unusual_settings_are_told(folder, map_section, scanner, message):
     assert [message in text for text in found] == ([True] if message else [])
 
 
+def test_tilt_of_sop_and_log_are_compared(folder):
+    """The SOP of another day, of which the mount has moved: the log knows."""
+    (finding,) = site_check._inclination(read_site(folder / "site.toml"))
+    assert finding["level"] == "ok", finding
+    log = next((folder / "inbox").glob("*-incl.txt"))
+    header, *rows = log.read_text().splitlines()
+    fields = [row.split(",") for row in rows]
+    log.write_text(
+        "\n".join([header, *(f"{time},{float(roll) + 1.0},{pitch}" for time, roll, pitch in fields)])
+    )
+    (finding,) = site_check._inclination(read_site(folder / "site.toml"))
+    assert finding["level"] == "warning"
+    assert finding["message"].endswith("in sop.dat: another SOP, a moved mount, or a wrong log?")
+    log.write_text("")
+    assert list(site_check._inclination(read_site(folder / "site.toml"))) == []
+
+
 def test_weather_log_of_another_time_zone_is_told():
     (message,) = warnings(plausibility.weather_time_findings(time.time() + 7200))
     assert "2.0 h in the future" in message

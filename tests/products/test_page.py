@@ -170,6 +170,13 @@ def test_newest_maps_are_drawn_first_and_few_per_call(series, site, monkeypatch)
         image.start.hour for image in update_gallery(series, folder, measured, style, lambda: None).change
     ]
     assert hours == list(range(6))
+    whole = sorted((folder / "maps").iterdir())
+    for path, damage in zip(whole[:3], (b"", b"RIFF\0\0\0\0WEBP", whole[2].read_bytes()[:-10]), strict=True):
+        path.write_bytes(damage)
+    for _ in range(2):  # damaged older maps are drawn again, as missing ones are
+        update_gallery(series, folder, measured, style, lambda: None)
+    sizes = [Image.open(path).convert("RGB").size for path in whole]
+    assert len(set(sizes)) == 1
 
 
 def test_cached_terrain_is_reused_and_a_damaged_cache_is_rebuilt(series, tmp_path):

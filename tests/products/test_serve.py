@@ -10,6 +10,9 @@ from urllib.request import Request, urlopen
 
 import pytest
 
+from station.commands.products import serve
+from station.errors import StationError
+
 
 @pytest.fixture
 def served(site, tmp_path):
@@ -62,6 +65,20 @@ def test_server_is_local_and_read_only(served):
         listening = [line.split()[1] for line in table if line.split()[3] == "0A"]
     assert [address for address in listening if address.endswith(port)] == [f"0100007F:{port}"]
     assert process.poll() is None
+
+
+@pytest.mark.parametrize("missing", ["starlette", "uvicorn"])
+def test_missing_library_is_told_instead_of_an_address(write_site, monkeypatch, capsys, missing):
+    site = write_site()
+    page = site.parent / "data" / "page"
+    page.mkdir(parents=True)
+    (page / "index.html").touch()
+    monkeypatch.setitem(sys.modules, missing, None)
+    for name in [name for name in sys.modules if name.startswith("starlette.") and missing == "starlette"]:
+        monkeypatch.setitem(sys.modules, name, None)
+    with pytest.raises(StationError, match="pip install"):
+        serve(site)
+    assert capsys.readouterr().err == ""
 
 
 @pytest.mark.integration

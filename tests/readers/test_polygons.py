@@ -57,10 +57,11 @@ def test_names_and_order(read):
             feature(polygon(square(20, 0, 10)), properties={"name": None, "id": 7}),
             feature(polygon(square(40, 0, 10)), properties=None, id="gate"),
             feature(polygon(square(60, 0, 10)), properties={"name": ""}),
+            feature(polygon(square(80, 0, 10)), properties={"Name": "Nord", "ID": 8}),
         )
     )
-    assert list(polygons) == ["Süd", "7", "gate", "area_4"]
-    assert [geometry.area for geometry in polygons.values()] == [100.0] * 4
+    assert list(polygons) == ["Süd", "7", "gate", "area_4", "Nord"]
+    assert [geometry.area for geometry in polygons.values()] == [100.0] * 5
 
 
 @pytest.mark.parametrize(

@@ -17,9 +17,9 @@ from pathlib import Path
 import pytest
 from support.fake_service import FakeWorker
 
-from station.errors import ConfigError, NotReadyError
+from station.errors import ConfigError, NotReadyError, StoreError
 from station.inbox.journal import Journal, State
-from station.inbox.lock import is_locked
+from station.inbox.lock import is_locked, read_identity
 from station.monitoring.status import status
 from station.service import daemon
 
@@ -33,6 +33,24 @@ def test_service_without_worker_processes_ends_for_systemd(write_site, monkeypat
     service = daemon.Daemon(write_site(), FakeWorker, daemon.LoopTiming())
     with pytest.raises(NotReadyError, match="no worker process could be started for 301 s"):
         service.serve()
+
+
+def test_folder_that_the_first_start_creates_is_remembered_at_once(write_site, monkeypatch, tmp_path):
+    """Another disk may be in its place at the second."""
+    site_path = write_site()
+    data = site_path.parent / "data"
+    shutil.rmtree(data, ignore_errors=True)
+    state = tmp_path / "state"
+    state.mkdir()
+    monkeypatch.setenv("STATE_DIRECTORY", str(state))
+    service = daemon.Daemon(site_path, FakeWorker, daemon.LoopTiming())
+    service.stop()
+    service.serve()
+    assert (state / "data_folder").read_text() == f"{data}\n{read_identity(data)}\n"
+    data.rename(tmp_path / "right")
+    data.mkdir()
+    with pytest.raises(StoreError, match="is not the folder of the stored series"):
+        daemon.Daemon(site_path, FakeWorker, daemon.LoopTiming()).serve()
 
 
 class Service:

@@ -81,6 +81,7 @@ def test_rejected_scan_is_judged_again_when_settings_limits_or_version_change(pr
 
     def reject():
         while journal.entry(NAME).state is not State.SET_ASIDE:
+            worker.process(scan(site, 0))
             assert not worker.process(scan(site, 1))
 
     def state_with(more):
@@ -111,6 +112,7 @@ def test_inconclusive_failure_is_repeated_ever_more_rarely_then_rejected_for_now
         worker.process(scan(site, 1))
         entry = journal.entry(NAME)
         assert (entry.state, entry.attempts) == (State.LATER, failure)
+    worker.process(scan(site, 0))  # the machine works
     worker.process(scan(site, 1))
     entry = journal.entry(NAME)
     assert entry.state is State.SET_ASIDE
@@ -121,6 +123,7 @@ def test_scan_rejected_for_now_gets_one_attempt_a_week(pretend, monkeypatch):
     site, journal, worker = pretend()
     worker.errors = {NAME: InconclusiveError("needs more than 2 GB")}
     for _ in range(MAX_FAILURES):
+        worker.process(scan(site, 0))
         worker.process(scan(site, 1))
     worker.run_maintenance()
     assert journal.entry(NAME).state is State.SET_ASIDE  # only just now
@@ -130,6 +133,7 @@ def test_scan_rejected_for_now_gets_one_attempt_a_week(pretend, monkeypatch):
         worker.run_maintenance()
         assert journal.entry(NAME).state is State.LATER
         if week == 1:
+            worker.process(scan(site, 0))
             worker.process(scan(site, 1))
             assert journal.entry(NAME).state is State.SET_ASIDE  # at once
     worker.errors = {}
@@ -180,7 +184,7 @@ def test_reference_waits_for_earlier_scans(pretend):
 def test_reference_does_not_wait_without_end(pretend):
     site, _, worker = pretend("[reference]\nscans = 2")
     worker.errors = {f"{scan_name(1)}.laz": NotReadyError("permission denied")}
-    for hour in (0, 1, 2, 1, 1, 1, 1):
+    for hour in (0, 1, 2, *[1] * (MAX_FAILURES - 2)):
         worker.process(scan(site, hour))
     assert worker.references == []
     worker.process(scan(site, 1))
@@ -228,6 +232,9 @@ class Station:
     def process(self, *hours):
         for hour in hours:
             self.worker.process(scan_file(self.site, self.path(hour)))
+
+    def process_ahead(self, hour):
+        self.worker.process(scan_file(self.site, self.path(hour)), ahead=True)
 
     def finish(self):
         """Process all that waits, the earliest first."""
@@ -285,6 +292,47 @@ def test_touched_scan_changes_no_value_although_the_reference_falls_due(make_sta
     station.finish()
     assert {station.row(hour).reference for hour in range(3)} == {"1"}
     assert_same_store(station, undisturbed)
+
+
+@integration
+@pytest.mark.parametrize("is_interrupted", [False, True])
+def test_live_scan_measured_ahead_changes_no_value(tmp_path, monkeypatch, is_interrupted):
+    """Once before the first reference, once before its update; then power fails before the journal knows."""
+    fork_server.ensure_running((*fork_server.PRELOAD, "pytest"))
+    folder = build(tmp_path / "simulated", hours=11, method="joint")
+    text = (folder / "site.toml").read_text()
+    (line,) = [line for line in text.splitlines() if line.startswith("scan =")]  # the first scan defines it
+    (folder / "site.toml").write_text(text.replace(line, "") + "[products]\npage = false\n")
+    undisturbed, station = (Station(shutil.copytree(folder, tmp_path / name)) for name in ("u", "s"))
+    undisturbed.drop(*range(11))
+    undisturbed.finish()
+    assert {undisturbed.row(hour).reference for hour in range(11)} == {"1", "2"}
+
+    station.drop(*range(11))
+    station.process_ahead(9)
+    assert "waits for" in station.row(9).waiting_reason  # for the first scan under its SOP
+    station.process(0)
+    station.process_ahead(9)
+    assert (station.row(9).epoch is None, station.row(9).reference) == (False, None)
+    station.process(1, 0, 1, 2)
+    assert station.row(2).reference == "1"
+    if is_interrupted:
+        monkeypatch.setattr(station.journal, "record_stored", lambda *_, **__: (_ for _ in ()).throw(OSError))
+        with pytest.raises(OSError):  # noqa: PT011 - it is the one above
+            station.process_ahead(10)
+        monkeypatch.undo()
+        assert station.row(10).epoch is None
+        station.worker = Worker(station.site, station.journal, in_service=True)
+        station.worker.recover()
+    else:
+        station.process_ahead(10)
+    assert (station.row(10).state, station.row(10).reference, station.row(10).ahead) == ("waiting", "1", True)
+    station.finish()
+    assert [row.ahead for row in map(station.row, range(11))] == [False] * 11
+    assert station.row(10).reference == "2"
+    assert_same_store(station, undisturbed)
+    station.journal.close()
+    undisturbed.journal.close()
 
 
 @integration

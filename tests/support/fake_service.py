@@ -50,11 +50,11 @@ class FakeWorker:
     def precheck(self, scan):
         self.record_call("precheck", scan.name)
 
-    def process(self, scan):
+    def process(self, scan, *, ahead=False):
         self.on_progress()
         if (self.site.station.data / "full").exists():
             raise StoreError("no space left on the device")
-        self.record_call("process", scan.name)
+        self.record_call("process", scan.name, *(["ahead"] if ahead else []))
         if "bug" in scan.name:
             raise ZeroDivisionError("division by zero")
         if "bad" in scan.name:

@@ -103,15 +103,21 @@ def saturated_fraction(log: InclinationLog, range_rad: float) -> float:
     return float(np.mean(tilt_rad >= range_rad - SENSOR_STEP_RAD / 2)) if len(tilt_rad) else 0.0
 
 
+def mount_inclination(mount: Floats) -> Floats:
+    """Return roll and pitch (2,) [rad] that a sensor without error shows on a mount.
+
+    `mount` (3, 3) rotates the scanner's frame into the local frame, the tilt of the mount included.
+    """
+    return np.array([math.atan2(mount[2, 1], mount[2, 2]), -math.asin(np.clip(mount[2, 0], -1.0, 1.0))])
+
+
 def axes_warnings(log: InclinationLog, mount: Floats) -> list[str]:
     """Return a message if roll and pitch of a clean log agree with the SOP only if swapped or reversed.
 
-    `mount` (3, 3) rotates the scanner's frame into the local frame, the tilt of the mount included. Logs of a
-    level mount, and of one whose tilt is not contained in the SOP, get no message.
+    `mount` is that of `mount_inclination`. Logs of a level mount, and of one whose tilt is not contained in
+    the SOP, get no message.
     """
-    expected_rad = np.array(
-        [math.atan2(mount[2, 1], mount[2, 2]), -math.asin(np.clip(mount[2, 0], -1.0, 1.0))]
-    )
+    expected_rad = mount_inclination(mount)
     mean_rad = np.array([log.roll_rad.mean(), log.pitch_rad.mean()])
     tolerance_rad = 2 * CYCLIC_ERROR_PRIOR_RAD + 2 * max(log.roll_rad.std(), log.pitch_rad.std())
     deviation_rad = float(np.linalg.norm(mean_rad - expected_rad))
