@@ -169,7 +169,7 @@ class BlockQueries:
                 "change_m": change_m,
                 "random_m2": np.asarray(random[rows], np.float64) ** 2,
                 "reference_m2": np.asarray(reference.random_variance_m2[rows], np.float64),
-                "stable": (np.asarray(quality[rows]) & int(Quality.STABLE_GROUND)) > 0,
+                "rock": (np.asarray(quality[rows]) & int(Quality.STABLE_GROUND | Quality.BARE_GROUND)) > 0,
                 "x_m": np.broadcast_to(grid.x_m, observed.shape),
                 "y_m": np.broadcast_to(grid.y_m[rows, None], observed.shape),
             }
@@ -200,8 +200,8 @@ class BlockQueries:
             sums["y_m"][observed] / count - position_m[1],
             surface_m[observed] - position_m[2],
         )
-        stable = sums["stable"][observed] > count / 2
-        return height_jacobian(params, offset_m, east, north, stable=stable)
+        rock = sums["rock"][observed] > count / 2
+        return height_jacobian(params, offset_m, east, north, rock=rock)
 
 
 def mean_covariances(day: Sequence[Blocks]) -> tuple[SharedParameters | None, SharedParameters | None]:
