@@ -40,6 +40,7 @@ from station.science.uncertainty.jacobian import HeightJacobian, height_jacobian
 from station.science.uncertainty.propagation import difference_to_reference
 
 DAY_S = 86_400.0
+ROCK = int(Quality.STABLE_GROUND | Quality.BARE_GROUND)
 MIN_GRADIENT_BLOCKS = 0.5  # one sigma of the Gaussian
 
 
@@ -157,33 +158,34 @@ class BlockQueries:
         )
         reference, grid = epoch_cells.reference, self._grid
         height = -(-CHUNK // self.cells) * self.cells
+        columns = np.arange(grid.nx) // self.cells
+        width = int(columns[-1]) + 1
         bands: list[dict[str, Floats]] = []
         for top in range(0, grid.ny, height):
             rows = slice(top, min(top + height, grid.ny))
-            change_m = np.asarray(change[rows], np.float64)
-            reference_m = np.asarray(reference.elevation_m[rows], np.float64)
-            known = np.isfinite(reference_m)
-            observed = known & (change_m < FILL / 2)
+            blocks = -(-(rows.stop - top) // self.cells), width
+            reference_m = np.asarray(reference.elevation_m[rows])
+            known = np.flatnonzero(np.isfinite(reference_m))
+            block = np.add.outer(np.arange(rows.stop - top) // self.cells * width, columns).ravel()[known]
+            change_m = np.asarray(change[rows]).ravel()[known]
+            observed = change_m < FILL / 2
+            cell, block_observed = known[observed], block[observed]
+            row, column = np.divmod(cell, grid.nx)
             fields = {
-                "count": observed,
-                "change_m": change_m,
-                "random_m2": np.asarray(random[rows], np.float64) ** 2,
-                "reference_m2": np.asarray(reference.random_variance_m2[rows], np.float64),
-                "rock": (np.asarray(quality[rows]) & int(Quality.STABLE_GROUND | Quality.BARE_GROUND)) > 0,
-                "x_m": np.broadcast_to(grid.x_m, observed.shape),
-                "y_m": np.broadcast_to(grid.y_m[rows, None], observed.shape),
+                "count": None,
+                "change_m": change_m[observed],
+                "random_m2": np.asarray(random[rows]).ravel()[cell].astype(np.float64) ** 2,
+                "reference_m2": np.asarray(reference.random_variance_m2[rows]).ravel()[cell],
+                "rock": (np.asarray(quality[rows]).ravel()[cell] & ROCK) > 0,
+                "x_m": grid.x_m[column],
+                "y_m": grid.y_m[rows][row],
             }
-            sums = {
-                name: self._block_sums(np.where(observed, values, 0.0)) for name, values in fields.items()
-            }
-            sums["known"] = self._block_sums(known.astype(np.float64))
-            sums["reference_m"] = self._block_sums(np.where(known, reference_m, 0.0))
-            bands.append(sums)
+            size = blocks[0] * width
+            sums = {name: np.bincount(block_observed, values, size) for name, values in fields.items()}
+            sums["known"] = np.bincount(block, minlength=size)
+            sums["reference_m"] = np.bincount(block, reference_m.ravel()[known], size)
+            bands.append({name: values.astype(np.float64).reshape(blocks) for name, values in sums.items()})
         return {name: np.concatenate([band[name] for band in bands]) for name in bands[0]}
-
-    def _block_sums(self, values: Floats) -> Floats:
-        rows, columns = (np.arange(0, size, self.cells) for size in values.shape)
-        return np.asarray(np.add.reduceat(np.add.reduceat(values, columns, axis=1), rows, axis=0))
 
     def _jacobian(self, epoch_cells: EpochCells, sums: dict[str, Floats]) -> HeightJacobian:
         """Return the Jacobian of the mean surfaces of the observed blocks."""
