@@ -45,7 +45,7 @@ _EXTERNAL_SIGNALS = {signal.SIGKILL, signal.SIGTERM, signal.SIGINT, signal.SIGHU
 RETRY_DELAYS_S = (1.0, 5.0, 30.0)
 
 
-class _WorkerLostError(NotReadyError):
+class _WorkerLostError(InconclusiveError):
     """The worker process was killed from outside or could not be started."""
 
 
@@ -91,10 +91,10 @@ def run_isolated(
     while it is blocked, for instance by a network folder that hangs.
 
     Raises the StationError that the task raised. Raises InconclusiveError if the worker ran out of memory or
-    time, panicked, or died by a signal that it caused: a corrupt scan does that, and so do a machine without
-    memory and a disk that hangs. Raises NotReadyError if `should_stop()` returned true, or if the worker was
-    blocked for STALL_S, repeatedly could not be started or was killed from outside. Raises RuntimeError with
-    the traceback of the worker for a bug.
+    time, panicked, died by a signal that it caused, or repeatedly could not be started or was killed from
+    outside: a corrupt scan does that, and so do a machine without memory or tasks and a disk that hangs.
+    Raises NotReadyError if `should_stop()` returned true, or if the worker was blocked for STALL_S. Raises
+    RuntimeError with the traceback of the worker for a bug.
     """
     hooks = on_progress, should_stop
     for delay_s in RETRY_DELAYS_S:
