@@ -1,9 +1,10 @@
 """Change of the ground since the reference, as unknowns of the adjustment.
 
 Moving ground changes by trends over all of it (mean, east, north, distance, squared distance, height) and
-smoothly between knots. Stable ground is not quite at rest: it heaves, as a whole and by blocks, and where
-moving ground rises it may be under thin snow. The sizes of trends and of the change between knots are not
-known. A model is one choice of them; an adjustment weighs all models by their likelihood.
+smoothly between knots. Ice and snow change for themselves, and so does bare ground: melt ends at the edge of
+the ice, as the refraction of cold air does. Stable ground is not quite at rest: it heaves, as a whole and by
+blocks, and where moving ground rises it may be under thin snow. The sizes of trends and of the change between
+knots are not known. A model is one choice of them; an adjustment weighs all models by their likelihood.
 Source: equations.md, 6.3; adjustment.md, 5.
 """
 
@@ -19,13 +20,16 @@ from station.quantities import Bools, Floats, Reals
 from station.science.adjustment.normal_equations import ScaledCholesky
 from station.science.adjustment.patches import RANGE_BIN_M, Patches
 from station.science.uncertainty import common_mode
-from station.science.uncertainty.parameters import TILT_KNOT_RAD
+from station.science.uncertainty.parameters import GLOBAL, TILT_KNOT_RAD
 
 CHANGE_AZIMUTH_KNOTS = 4  # sight-tilt knots between two knots of the change
 CHANGE_RANGE_BINS = 3  # range bins between two knots of the change
 CHANGE_STEPS_M = tuple(float(step) for step in np.geomspace(0.5 / 2**11, 0.5, 12))
 TREND_SIZES_M = tuple(float(size) for size in np.geomspace(0.0005, 2.0, 8))
 TRENDS = 6
+KINDS = 2  # of moving ground: ice and snow, bare ground
+KIND_SPACING = 10_000  # of the azimuth knots of two kinds, so that they are not correlated
+MIN_SHARE = 1e-6
 TREND_RATIO = 0.6  # of a trend's size to that of the mean: melt or settling from zero to twice the mean
 # Sigma of the change that neighbouring knots share, in sigmas of one knot: no, some or strong correlation.
 CORRELATED_CHANGE_RATIOS = (0.0, 3.0, 10.0)
@@ -108,7 +112,7 @@ class GroundChange:
     def precision_at(self, model: ChangeModel) -> tuple[Floats, float]:
         """Return the precision (k, k) of a model, and log |precision⁻¹|."""
         snow_m = min(model.size_m, THIN_SNOW_M) if self.surface_rises else NO_SNOW_M
-        trend_m = TREND_SIZES_M[model.trend] * np.array([1.0] + [TREND_RATIO] * (TRENDS - 1))
+        trend_m = TREND_SIZES_M[model.trend] * np.tile([1.0] + [TREND_RATIO] * (TRENDS - 1), KINDS)
         knots, step_m = len(self.knot_precisions[model.ratio]), CHANGE_STEPS_M[model.step]
         first, last = self.trend_columns, self.trend_columns + knots
         precision = np.zeros((self.design.shape[1],) * 2)
@@ -149,8 +153,9 @@ class GroundChange:
 
 def ground_change(patches: Patches, moving: Bools) -> GroundChange:
     """Return the unknown change of patches, of which `moving` (n,) are moving ground."""
-    knot_design, precisions, log_determinants = _knots(patches, moving)
-    trend_design = _trends(patches, moving)
+    shares = _shares(patches, moving)
+    knot_design, precisions, log_determinants = _knots(patches, shares)
+    trend_design = sparse.hstack([_trends(patches, share) for share in shares], format="csr")
     snow_design = _thin_snow(patches, moving) if moving.any() else sparse.csr_array((len(moving), 0))
     heave_design = _heave(patches, ~moving)
     return GroundChange(
@@ -165,23 +170,32 @@ def ground_change(patches: Patches, moving: Bools) -> GroundChange:
     )
 
 
-def _knots(patches: Patches, moving: Bools) -> tuple[sparse.csr_array, list[Floats], list[float]]:
+def _shares(patches: Patches, moving: Bools) -> Floats:
+    """Return the shares (KINDS, n) of ice and snow, and of bare ground, in moving patches; 0 in others."""
+    jacobian = patches.jacobian
+    ice_share = np.ones(len(moving))
+    moving_row = [name for name, _ in GLOBAL].index("refraction_moving")
+    np.divide(jacobian.pose[moving_row], jacobian.refraction, out=ice_share, where=jacobian.refraction != 0)
+    return np.stack([ice_share, 1 - ice_share]) * moving
+
+
+def _knots(patches: Patches, shares: Floats) -> tuple[sparse.csr_array, list[Floats], list[float]]:
     """Return the design (n, knots) of the smooth change, its precisions and log determinants for a unit step.
 
-    Knots form a grid in azimuth and range; the change is bilinear between them.
+    Knots form a grid in azimuth and range for each kind of ground; the change is bilinear between them.
     """
     u = patches.jacobian.knot_position / CHANGE_AZIMUTH_KNOTS
     v = (patches.range_bin + 0.5) / CHANGE_RANGE_BINS
     i, j = u.astype(np.int64), v.astype(np.int64)
     u, v = u - i, v - j
     range_knots = int(j.max(initial=0)) + 2
-    corners = [(a, b) for a in (0, 1) for b in (0, 1)]
-    columns = np.concatenate([(i + a) * range_knots + j + b for a, b in corners])
+    corners = [(kind, a, b) for kind in range(KINDS) for a in (0, 1) for b in (0, 1)]
+    columns = np.concatenate([(kind * KIND_SPACING + i + a) * range_knots + j + b for kind, a, b in corners])
     values = np.concatenate(
-        [np.where(moving, (u if a else 1 - u) * (v if b else 1 - v), 0) for a, b in corners]
+        [shares[kind] * (u if a else 1 - u) * (v if b else 1 - v) for kind, a, b in corners]
     )
     rows = np.tile(np.arange(len(u)), len(corners))
-    nonzero = values > 0
+    nonzero = values > MIN_SHARE
     knots, columns = np.unique(columns[nonzero], return_inverse=True)
     design = sparse.csr_array((values[nonzero], (rows[nonzero], columns)), shape=(len(u), len(knots)))
     azimuth_knot, range_knot = np.divmod(knots, range_knots)
@@ -202,19 +216,22 @@ def _position(patches: Patches) -> tuple[Reals, Reals, Reals]:
     return east_m, north_m, distance_m
 
 
-def _trends(patches: Patches, moving: Bools) -> sparse.csr_array:
-    """Return the design matrix (n, TRENDS) of the trends: a mean, and others of zero mean, unit variance."""
-    if not moving.any():
-        return sparse.csr_array((len(moving), 0))
+def _trends(patches: Patches, share: Floats) -> sparse.csr_array:
+    """Return the design matrix (n, TRENDS) of the trends of one kind of ground, by its share of patches (n,).
+
+    One is a mean, the others have zero mean and unit variance. There are none without such ground.
+    """
+    if not (share > MIN_SHARE).any():
+        return sparse.csr_array((len(share), 0))
     east_m, north_m, distance_m = _position(patches)
-    weight = np.where(moving, patches.cell_count, 0.0)
+    weight = share * patches.cell_count
     weight /= weight.sum()
     trends = np.stack(
         [np.ones_like(east_m), east_m, north_m, distance_m, distance_m**2, patches.height_m], axis=1
     )
     trends[:, 1:] -= weight @ trends[:, 1:]
     trends[:, 1:] /= np.maximum(np.sqrt(weight @ trends[:, 1:] ** 2), 1e-9)
-    return sparse.csr_array(trends * moving[:, None])
+    return sparse.csr_array(trends * share[:, None])
 
 
 def _thin_snow(patches: Patches, moving: Bools) -> sparse.csr_array:

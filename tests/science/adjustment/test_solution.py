@@ -21,8 +21,11 @@ PRIOR = prior.state_prior(
 COUNT, STABLE, SIGMA_M = 150, 15, 0.004
 
 
-def make_patches(seed, change_m):
-    """Return patches of a scanner at rest, of which the first are stable ground; the others have changed."""
+def make_patches(seed, change_m, bare_share=0.0):
+    """Return patches of a scanner at rest, of which the first are stable ground; the others have changed.
+
+    Except for a share of bare ground, that is, which is not known to be stable.
+    """
     rng = np.random.default_rng(seed)
     line, range_bin = rng.integers(0, PARAMS.line_groups, COUNT), rng.integers(8, 30, COUNT)
     azimuth, range_m, height_m = (
@@ -32,15 +35,16 @@ def make_patches(seed, change_m):
     )
     stable = np.arange(COUNT) < STABLE
     offset_m = range_m * np.sin(azimuth), range_m * np.cos(azimuth), height_m
-    jacobian = height_jacobian(PARAMS, offset_m, *rng.uniform(-0.3, 0.3, (2, COUNT)), rock=stable)
-    residual_m = rng.normal(0, SIGMA_M, COUNT) + np.where(stable, 0.0, change_m)
+    rock = stable | (rng.uniform(size=COUNT) < bare_share)
+    jacobian = height_jacobian(PARAMS, offset_m, *rng.uniform(-0.3, 0.3, (2, COUNT)), rock=rock)
+    residual_m = rng.normal(0, SIGMA_M, COUNT) + np.where(rock, 0.0, change_m)
     ground_class = np.where(stable, GroundClass.STABLE, GroundClass.MOVING).astype(np.int64)
     variance_m2, cells = np.full(COUNT, SIGMA_M**2), np.full(COUNT, 20.0)
     return Patches(jacobian, range_bin, height_m, ground_class, residual_m, variance_m2, cells)
 
 
-def solve(seed, change_m):
-    patches = make_patches(seed, change_m)
+def solve(seed, change_m, bare_share=0.0):
+    patches = make_patches(seed, change_m, bare_share)
     change = ground_change.ground_change(patches, patches.ground_class == GroundClass.MOVING)
     equations = NormalEquations(patches.jacobian, change.design, patches.residual_m, PRIOR, None)
     reduced = equations.reduce(1 / patches.variance_m2)
@@ -122,3 +126,14 @@ def test_change_that_looks_like_tilt_widens_sigma():
         return np.linalg.norm(mixture.factor.half_solve(on_all))
 
     assert far_sigma_m(-0.2 * distance_m / 2400) > 1.2 * far_sigma_m(0.0)
+
+
+@pytest.mark.parametrize("change_m", [0.0, 0.1, -3.0])
+def test_melt_that_ends_at_the_edge_of_the_ice_is_no_refraction(change_m):
+    """Neighbouring bare ground has not changed; k over ice does not differ."""
+    moving = PARAMS.names.index("refraction_moving")
+    standardised = []
+    for seed in range(12):
+        mixture = solve(seed, change_m, bare_share=0.4)[3].mixture()
+        standardised.append(mixture.estimate[moving] / sigma_of(mixture, moving + 1)[moving])
+    assert np.abs(standardised).max() < 3
