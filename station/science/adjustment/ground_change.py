@@ -1,10 +1,10 @@
 """Change of the ground since the reference, as unknowns of the adjustment.
 
-Moving ground changes by trends over all of it (mean, east, north, distance, squared distance, height) and
-smoothly between knots. Ice and snow change for themselves, and so does bare ground: melt ends at the edge of
-the ice, as the refraction of cold air does. Stable ground is not quite at rest: it heaves, as a whole and by
-blocks, and where moving ground rises it may be under thin snow. The sizes of trends and of the change between
-knots are not known. A model is one choice of them; an adjustment weighs all models by their likelihood.
+Ice and snow change by trends over all of them (mean, east, north, distance, squared distance, height) and
+smoothly between knots. Bare ground that is not known to be stable has knots of its own: melt ends at the edge
+of the ice, as the refraction of cold air does. Stable ground is not quite at rest: it heaves, as a whole and
+by blocks, and where moving ground rises it may be under thin snow. The sizes of trends and of the change
+between knots are not known. A model is one choice of them; an adjustment weighs all models by likelihood.
 Source: equations.md, 6.3; adjustment.md, 5.
 """
 
@@ -112,7 +112,7 @@ class GroundChange:
     def precision_at(self, model: ChangeModel) -> tuple[Floats, float]:
         """Return the precision (k, k) of a model, and log |precision⁻¹|."""
         snow_m = min(model.size_m, THIN_SNOW_M) if self.surface_rises else NO_SNOW_M
-        trend_m = TREND_SIZES_M[model.trend] * np.tile([1.0] + [TREND_RATIO] * (TRENDS - 1), KINDS)
+        trend_m = TREND_SIZES_M[model.trend] * np.array([1.0] + [TREND_RATIO] * (TRENDS - 1))
         knots, step_m = len(self.knot_precisions[model.ratio]), CHANGE_STEPS_M[model.step]
         first, last = self.trend_columns, self.trend_columns + knots
         precision = np.zeros((self.design.shape[1],) * 2)
@@ -155,7 +155,7 @@ def ground_change(patches: Patches, moving: Bools) -> GroundChange:
     """Return the unknown change of patches, of which `moving` (n,) are moving ground."""
     shares = _shares(patches, moving)
     knot_design, precisions, log_determinants = _knots(patches, shares)
-    trend_design = sparse.hstack([_trends(patches, share) for share in shares], format="csr")
+    trend_design = _trends(patches, shares[0])
     snow_design = _thin_snow(patches, moving) if moving.any() else sparse.csr_array((len(moving), 0))
     heave_design = _heave(patches, ~moving)
     return GroundChange(
@@ -217,9 +217,9 @@ def _position(patches: Patches) -> tuple[Reals, Reals, Reals]:
 
 
 def _trends(patches: Patches, share: Floats) -> sparse.csr_array:
-    """Return the design matrix (n, TRENDS) of the trends of one kind of ground, by its share of patches (n,).
+    """Return the design matrix (n, TRENDS) of the trends of ice and snow, by their share of patches (n,).
 
-    One is a mean, the others have zero mean and unit variance. There are none without such ground.
+    One is a mean, the others have zero mean and unit variance. There are none without ice and snow.
     """
     if not (share > MIN_SHARE).any():
         return sparse.csr_array((len(share), 0))

@@ -19,6 +19,8 @@ EM_STEPS = 10
 MOUNT_CREEP_RAD, MOUNT_CREEP_M = math.radians(0.005), 0.001  # in a day, growing with the root of time
 UNUSUAL_SIGMAS = 3.0  # of the usual motion
 TILT_COMPONENTS = ("tilt_drift_rad", "tilt_jitter_rad", "line_jitter_rad")
+MIN_TREND_SCANS = 3
+ICE = [name for name, _ in GLOBAL].index("refraction_moving")
 COMPONENT_SLICES = {  # variance components by the global parameters they describe
     "tilt_rad": slice(2),
     "heading_rad": slice(2, 3),
@@ -37,7 +39,8 @@ def estimate_variance_components(
 
     Each variance is the mean of estimate squared plus posterior variance, shrunk towards its initial value as
     if that came from `PRIOR_SCANS` scans. The tilt components differ in their correlation in time and are
-    separated by expectation-maximisation from `start`, which is returned with fewer than two scans.
+    separated by expectation-maximisation from `start`, which is returned with fewer than two scans. Of the
+    refraction over ice a trend from scan to scan, which are in order of time, does not count: it is melt.
     """
     first, last = len(GLOBAL), len(GLOBAL) + params.line_groups
     tilt_slice = slice(first, last)
@@ -45,10 +48,14 @@ def estimate_variance_components(
         np.zeros(last + 2 * params.refraction_knots),
         np.zeros((params.line_groups,) * 2),
     )
+    ice_moment = 0.0
+    ice_refraction: list[float] = []
     scan_lines: list[LineTimes] = []
     for lines, estimate, covariance in scans:  # one at a time: covariances are large
         scan_lines.append(lines)
         second_moment += estimate**2 + np.diag(covariance)
+        ice_refraction.append(float(estimate[ICE]))
+        ice_moment += float(covariance[ICE, ICE])
         tilt_moment += (
             np.outer(estimate[tilt_slice], estimate[tilt_slice]) + covariance[tilt_slice, tilt_slice]
         )
@@ -63,6 +70,10 @@ def estimate_variance_components(
         return math.sqrt(total / (count + prior_scans))
 
     variances = {name: float(second_moment[columns].mean()) for name, columns in COMPONENT_SLICES.items()}
+    if count > MIN_TREND_SCANS:
+        scan = np.arange(count)
+        residual = ice_refraction - np.polynomial.Polynomial.fit(scan, ice_refraction, 1)(scan)
+        variances["refraction_moving"] = ice_moment / count + float(residual @ residual) / (count - 2)
     variances["refraction_by_azimuth"] = float(second_moment[last : last + params.refraction_knots].mean())
     kernels = tilt_correlations(scan_lines[0])
     components = start

@@ -532,7 +532,8 @@ def test_an_avalanche_does_not_change_heights_elsewhere():
     rng = np.random.default_rng(70)
     _, root = dense_prior(PARAMS)
     state = root @ rng.normal(size=len(root))
-    stable, glacier, cells = random_sites(71, 100), random_sites(72, 3000, steep=0.3), random_sites(73, 400)
+    stable, cells = random_sites(71, 100), random_sites(73, 400)
+    glacier = replace(random_sites(72, 3000, steep=0.3), stable=False)
     path = (np.abs(glacier.line - 100) < 4) & (np.abs(glacier.range_bin - 20) < 3)
     assert 8 <= np.count_nonzero(path) <= 30
     plain_m = glacier.matrix() @ state + rng.normal(0, 0.01, 3000)
@@ -559,7 +560,7 @@ def simulate_thin_snow(seed, change_m):
     state = root @ rng.normal(size=len(root))
     stable, glacier, cells = (
         random_sites(seed + 90, 1500, steep=2.0),
-        random_sites(seed + 95, 1500, steep=0.3),
+        replace(random_sites(seed + 95, 1500, steep=0.3), stable=False),
         random_sites(99, 200),
     )
     snow_covered = np.hypot(stable.east, stable.north) < np.tan(np.radians(40)) if change_m > 0 else 0.0
