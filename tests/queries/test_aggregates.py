@@ -8,6 +8,7 @@ from functools import cache
 import numpy as np
 import pytest
 import xarray as xr
+from support.shared_parameters import SCANNER
 
 import station
 from station.archive import epochs
@@ -34,13 +35,6 @@ from station.science.uncertainty import jacobian, parameters, propagation
 
 GRID = Grid(west_m=632_000.0, north_m=5_186_000.0, cell_m=10.0, nx=40, ny=30)
 START_S = 1_763_683_200.0  # 2025-11-21 00:00 UTC
-SCANNER = {
-    "scanner_east": 631_200.0,
-    "scanner_north": 5_184_900.0,
-    "scanner_height": 3_010.0,
-    "scanner_axis_east": 0.04,
-    "scanner_axis_north": -0.02,
-}
 POSITION_M = tuple(list(SCANNER.values())[:3])
 AXIS = (0.04, -0.02, np.sqrt(1 - 0.04**2 - 0.02**2))
 EAST, NORTH = 0.25, -0.125  # slope of the reference, stored without rounding
