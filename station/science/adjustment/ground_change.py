@@ -1,10 +1,11 @@
 """Change of the ground since the reference, as unknowns of the adjustment.
 
-Ice and snow change by trends over all of them (mean, east, north, distance, squared distance, height) and
-smoothly between knots. Bare ground that is not known to be stable has knots of its own: melt ends at the edge
-of the ice, as the refraction of cold air does. Stable ground is not quite at rest: it heaves, as a whole and
-by blocks, and where moving ground rises it may be under thin snow. The sizes of trends and of the change
-between knots are not known. A model is one choice of them; an adjustment weighs all models by likelihood.
+Moving ground changes by trends over all of it (mean, east, north, distance, squared distance, height) and
+smoothly between knots. Bare ground that is not known to be stable has trends and knots of its own: melt ends
+at the edge of the ice, as the refraction of cold air does, and snow does not. Stable ground is not quite at
+rest: it heaves, as a whole and by blocks, and where moving ground rises it may be under thin snow. The sizes
+of trends and of the change between knots are not known. A model is one choice of them, and of whether bare
+ground has trends; an adjustment weighs all models by their likelihood.
 Source: equations.md, 6.3; adjustment.md, 5.
 """
 
@@ -40,7 +41,7 @@ SMALL_TREND_LOG_PRIOR = 2.0  # against each factor e by which trends are smaller
 CORRELATION_AZIMUTH_KNOTS, CORRELATION_RANGE_KNOTS = 4.0, 2.5  # correlation lengths, in knots
 # Where moving ground rises, stable ground may be under snow too thin to change its intensity.
 THIN_SNOW_M = 0.005  # upper bound of sigma; the change of moving ground bounds it too
-NO_SNOW_M = 1e-6
+NO_CHANGE_M = 1e-6
 MAX_SNOW_SLOPES = tuple(np.tan(np.radians((40.0, 50.0))))  # upper bounds (tan): full snow, some snow
 HEAVE_M = 0.002  # start value of sigma: frost and heat move rock by millimetres
 HEAVE_BLOCK_M = 500.0
@@ -49,11 +50,15 @@ MIN_HEAVE_M = 1e-5
 
 
 class ChangeModel(NamedTuple):
-    """Indices into `CORRELATED_CHANGE_RATIOS`, `CHANGE_STEPS_M` and `TREND_SIZES_M`."""
+    """Indices into `CORRELATED_CHANGE_RATIOS`, `CHANGE_STEPS_M` and `TREND_SIZES_M`.
+
+    `bare` is 1 if bare ground has trends of the same size as ice and snow, 0 if it has none.
+    """
 
     ratio: int
     step: int
     trend: int
+    bare: int = 0
 
     @property
     def step_m(self) -> float:
@@ -76,9 +81,11 @@ class ChangeModel(NamedTuple):
         steps_m = np.hypot(1.0, CORRELATED_CHANGE_RATIOS[ratio]) * np.array(CHANGE_STEPS_M)
         return self._replace(ratio=ratio, step=int(np.argmin(np.abs(np.log(steps_m / self.step_m)))))
 
-    def neighbours(self, *, ratios: bool = False) -> list[ChangeModel]:
-        """Return the models that differ by one index, of step or trend only unless `ratios`."""
+    def neighbours(self, *, bare: bool, ratios: bool = False) -> list[ChangeModel]:
+        """Return the models that differ by one index: step, trend, with `bare` and `ratios` also these."""
         sizes = {"step": len(CHANGE_STEPS_M), "trend": len(TREND_SIZES_M)}
+        if bare:
+            sizes["bare"] = KINDS
         if ratios:
             sizes["ratio"] = len(CORRELATED_CHANGE_RATIOS)
         return [
@@ -104,6 +111,7 @@ class GroundChange:
     knot_precisions: list[Floats]  # (knots, knots) for a unit step, one per correlation
     knot_log_determinants: list[float]  # of their inverses
     trend_columns: int
+    bare_columns: int  # the last of these, trends of bare ground
     snow_columns: int
     heave_columns: int
     heave_m: float
@@ -111,15 +119,17 @@ class GroundChange:
 
     def precision_at(self, model: ChangeModel) -> tuple[Floats, float]:
         """Return the precision (k, k) of a model, and log |precision⁻¹|."""
-        snow_m = min(model.size_m, THIN_SNOW_M) if self.surface_rises else NO_SNOW_M
+        snow_m = min(model.size_m, THIN_SNOW_M) if self.surface_rises else NO_CHANGE_M
         trend_m = TREND_SIZES_M[model.trend] * np.array([1.0] + [TREND_RATIO] * (TRENDS - 1))
+        bare_m = trend_m if model.bare else np.full(TRENDS, NO_CHANGE_M)
         knots, step_m = len(self.knot_precisions[model.ratio]), CHANGE_STEPS_M[model.step]
         first, last = self.trend_columns, self.trend_columns + knots
         precision = np.zeros((self.design.shape[1],) * 2)
         precision[first:last, first:last] = self.knot_precisions[model.ratio] / step_m**2
         sigma_m = np.concatenate(
             [
-                trend_m[: self.trend_columns],
+                trend_m[: self.trend_columns - self.bare_columns],
+                bare_m[: self.bare_columns],
                 np.full(self.snow_columns, snow_m),
                 np.full(self.heave_columns, self.heave_m),
             ]
@@ -155,7 +165,8 @@ def ground_change(patches: Patches, moving: Bools) -> GroundChange:
     """Return the unknown change of patches, of which `moving` (n,) are moving ground."""
     shares = _shares(patches, moving)
     knot_design, precisions, log_determinants = _knots(patches, shares)
-    trend_design = _trends(patches, shares[0])
+    trends = [_trends(patches, share) for share in shares]
+    trend_design = sparse.hstack(trends, format="csr")
     snow_design = _thin_snow(patches, moving) if moving.any() else sparse.csr_array((len(moving), 0))
     heave_design = _heave(patches, ~moving)
     return GroundChange(
@@ -164,6 +175,7 @@ def ground_change(patches: Patches, moving: Bools) -> GroundChange:
         precisions,
         log_determinants,
         trend_design.shape[1],
+        trends[-1].shape[1],
         snow_design.shape[1],
         heave_design.shape[1],
         HEAVE_M,
@@ -217,9 +229,9 @@ def _position(patches: Patches) -> tuple[Reals, Reals, Reals]:
 
 
 def _trends(patches: Patches, share: Floats) -> sparse.csr_array:
-    """Return the design matrix (n, TRENDS) of the trends of ice and snow, by their share of patches (n,).
+    """Return the design matrix (n, TRENDS) of the trends of one kind of ground, by its share of patches (n,).
 
-    One is a mean, the others have zero mean and unit variance. There are none without ice and snow.
+    One is a mean, the others have zero mean and unit variance. There are none without such ground.
     """
     if not (share > MIN_SHARE).any():
         return sparse.csr_array((len(share), 0))

@@ -79,7 +79,8 @@ class Solution:
 
     def _hill_climb(self, model: ChangeModel) -> ChangeModel:
         """Return a model whose neighbours of the same correlation are less likely."""
-        while (best := max([model, *model.neighbours()], key=self.log_odds)) != model:
+        bare = self._change.bare_columns > 0
+        while (best := max([model, *model.neighbours(bare=bare)], key=self.log_odds)) != model:
             model = best
         return model
 
@@ -144,7 +145,7 @@ class Solution:
             model = frontier.pop()
             if model not in likely and self.log_odds(model) >= limit:
                 likely.add(model)
-                frontier += model.neighbours(ratios=True)
+                frontier += model.neighbours(bare=self._change.bare_columns > 0, ratios=True)
         return sorted(likely)
 
 
