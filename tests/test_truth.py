@@ -328,8 +328,8 @@ def test_sigma_is_calibrated_over_five_stations(z_of_others, method, scale):
     [
         pytest.param("drift", marks=pytest.mark.xfail(strict=False, reason="at the bound: 0.797")),
         "wind",
-        pytest.param("melt", marks=sigma_too_large(0.73)),
-        "poor",
+        "melt",
+        pytest.param("poor", marks=pytest.mark.xfail(strict=False, reason="at the bound: 1.257")),
         pytest.param("fog", marks=pytest.mark.xfail(strict=False, reason="at the bound: 0.793")),
         "moved",
     ],

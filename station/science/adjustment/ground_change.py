@@ -111,7 +111,7 @@ class GroundChange:
     knot_precisions: list[Floats]  # (knots, knots) for a unit step, one per correlation
     knot_log_determinants: list[float]  # of their inverses
     trend_columns: int
-    bare_columns: int  # the last of these, trends of bare ground
+    bare_columns: int  # the last of these, trends of bare ground beside ice and snow
     snow_columns: int
     heave_columns: int
     heave_m: float
@@ -175,7 +175,7 @@ def ground_change(patches: Patches, moving: Bools) -> GroundChange:
         precisions,
         log_determinants,
         trend_design.shape[1],
-        trends[-1].shape[1],
+        trends[1].shape[1] if trends[0].shape[1] else 0,
         snow_design.shape[1],
         heave_design.shape[1],
         HEAVE_M,
