@@ -31,10 +31,7 @@ def sensitivity(
     from station.config import read_site
     from station.operations.sensitivity_report import format_report, sensitivity_report
 
-    try:
-        report = sensitivity_report(read_site(site), _epoch(epoch), maps)
-    except IndexError:
-        raise typer.BadParameter(f"the series has no epoch with index {epoch}") from None
+    report = sensitivity_report(read_site(site), _epoch(epoch), maps)
     print(json.dumps(json_safe(report), indent=2) if json_ else format_report(report))
 
 

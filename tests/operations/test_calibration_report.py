@@ -117,8 +117,8 @@ def test_sensitivity_of_a_given_epoch_as_json(site_path):
         # The model is nearly linear.
         assert all(abs(index["share"]) < 4 * index["error"] + 0.01 for index in interactions)
     missing = run("sensitivity", site_path, "--epoch", 99)
-    assert missing.exit_code == 2
-    assert "no epoch with index 99" in missing.output
+    assert missing.exit_code == 1
+    assert str(missing.exception) == "no epoch 99: the series has 3"
     invalid = run("sensitivity", site_path, "--epoch", "yesterday")
     assert invalid.exit_code == 2
     assert "neither a time" in invalid.output
