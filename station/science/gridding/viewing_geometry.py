@@ -33,7 +33,8 @@ from station.science.uncertainty.parameters import (
 
 MAX_MOVING_CELLS = 400_000  # cells of moving ground that an adjustment uses
 MAX_STABLE_CELLS = 800_000  # the same of stable ground, in whole rows; more add no information
-BLOCK_CELLS = 50_000  # cells per sector if the scanner's position is unknown
+BLOCK_CELLS = 50_000  # cells per sector if the scanner's position is unknown, and in passes over all cells
+MAX_BRIGHTNESS_CELLS = 100_000  # cells whose brightness is compared; of more, a sample
 VISIBILITY_BIN_M = 200.0  # range bin in which cells are counted for visibility
 MAX_VISIBILITY_CELLS = 500_000  # cells counted for visibility; of more, a sample
 MIN_ENCLOSED_SHARE = 0.3  # of the even cells of a kind; if fewer are, those at gaps are used too
@@ -383,13 +384,13 @@ def _mark_bare(
         return cells["intensity"][block], range_m, observation.cos_incidence
 
     count = len(cells["cell"])
-    sample = visibility_step(count)
+    sample = slice(None, count, 1 + count // MAX_BRIGHTNESS_CELLS)
     stable, smooth = (
         (cells["cell_class"][sample] & np.uint8(flag)) > 0 for flag in (CellClass.STABLE, CellClass.SMOOTH)
     )
     rock = ground_classes.rock_brightness(*brightness(sample), stable, smooth & ~stable, wavelength_um)
-    for first in range(0, count, MAX_VISIBILITY_CELLS):
-        block = slice(first, first + MAX_VISIBILITY_CELLS)
+    for first in range(0, count, BLOCK_CELLS):
+        block = slice(first, first + BLOCK_CELLS)
         cell_class = cells["cell_class"][block]
         bare = rock.resembles(*brightness(block)) & ((cell_class & np.uint8(CellClass.STABLE)) == 0)
         cell_class |= np.where(bare, np.uint8(CellClass.BARE), np.uint8(0))
