@@ -30,7 +30,7 @@ TREND_SIZES_M = tuple(float(size) for size in np.geomspace(0.0005, 2.0, 8))
 TRENDS = 6
 KINDS = 2  # of moving ground: ice and snow, bare ground
 KIND_SPACING = 10_000  # of the azimuth knots of two kinds, so that they are not correlated
-MIN_SHARE = 1e-6
+MIN_SHARE = 1e-6  # of a kind of ground in a patch; less is rounding
 TREND_RATIO = 0.6  # of a trend's size to that of the mean: melt or settling from zero to twice the mean
 # Sigma of the change that neighbouring knots share, in sigmas of one knot: no, some or strong correlation.
 CORRELATED_CHANGE_RATIOS = (0.0, 3.0, 10.0)
@@ -85,7 +85,7 @@ class ChangeModel(NamedTuple):
         """Return the models that differ by one index: step, trend, with `bare` and `ratios` also these."""
         sizes = {"step": len(CHANGE_STEPS_M), "trend": len(TREND_SIZES_M)}
         if bare:
-            sizes["bare"] = KINDS
+            sizes["bare"] = 2
         if ratios:
             sizes["ratio"] = len(CORRELATED_CHANGE_RATIOS)
         return [

@@ -76,7 +76,7 @@ class CellClass(IntFlag):
     STEEP = 16  # above 50°: sheds its snow
     ENCLOSED = 32  # all cells around it are known
     EVEN = 64  # of so little roughness that a tilt of the scanner has the expected effect
-    BARE = 128  # not stable, but as bright as stable ground: rock, not ice or snow
+    BARE = 128  # not known to be stable, but as bright as stable ground: rock, not ice or snow
 
 
 @dataclass(frozen=True)
