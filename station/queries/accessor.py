@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import cached_property
+from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
@@ -14,8 +15,11 @@ from station.archive.epochs import EpochRef
 from station.archive.series.index import list_epochs, series_in
 from station.errors import StationError
 from station.queries.aggregates import CHANGE, RANDOM
-from station.queries.grid_arrays import Epoch, to_grid, to_mask
+from station.queries.grid_arrays import to_grid, to_mask
 from station.queries.volumes import Volumes
+
+if TYPE_CHECKING:
+    from station.queries.grid_arrays import Epoch
 
 SAME_TIME_S = 1.0  # times of the dataset and of the store that differ less are of one epoch
 POINT_VARIABLES = (CHANGE, f"{CHANGE}_uncertainty", RANDOM, "point_count", "quality")

@@ -16,7 +16,7 @@ from station.archive.reference_files import open_reference
 from station.archive.series.index import list_epochs, nearest_epoch
 from station.errors import StationError, StoreError
 from station.quantities import Bools, ChangeErrors, Floats, Grid, Quality, Reals, Reference, SharedParameters
-from station.queries.grid_arrays import Epoch, to_index_or_time
+from station.queries.grid_arrays import to_index_or_time
 from station.science.adjustment import ground_classes
 from station.science.adjustment.leverage import leverage
 from station.science.analysis.voids import area_weights, void_variance
@@ -28,6 +28,8 @@ from station.science.uncertainty.propagation import aggregate_variance, align_to
 
 if TYPE_CHECKING:
     import xarray as xr
+
+    from station.queries.grid_arrays import Epoch
 
 MARGIN_CELLS = 6  # reach of the smoothed gradient around a cell
 CHANGE, RANDOM = "elevation_change", "elevation_change_random_uncertainty"

@@ -317,3 +317,10 @@ def wait_for(condition, within_s=10.0):
     while not condition():
         assert time.monotonic() < until_s
         time.sleep(0.02)
+
+
+def test_workers_do_not_import_xarray():
+    """Its import takes 70 MB, which counts in the memory of each worker; only users' queries need it."""
+    modules = ", ".join(module for module in fork_server.PRELOAD if module.startswith("station."))
+    code = f"import sys, {modules}; sys.exit(bool({{'xarray', 'pandas'}} & set(sys.modules)))"
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

@@ -126,14 +126,8 @@ class Solution:
             model_covariance = ScaledCholesky(self._normal + precision).inverse()
             change_m = model_covariance @ self._rhs
             mean_m += share * change_m
-            precision = model_covariance @ precision @ model_covariance
-            precision *= share  # in place: these matrices are the largest of an adjustment
-            bias += precision
-            del precision
-            model_covariance += np.outer(change_m, change_m)
-            model_covariance *= share
-            covariance += model_covariance
-            del model_covariance
+            covariance += share * (model_covariance + np.outer(change_m, change_m))
+            bias += share * (model_covariance @ precision @ model_covariance)
         covariance -= np.outer(mean_m, mean_m)
         information = ScaledCholesky(covariance).inverse()
         normal, first = self._reduced.normal.copy(), self._state_size

@@ -33,7 +33,7 @@ from station.science.uncertainty.parameters import (
 
 MAX_MOVING_CELLS = 400_000  # cells of moving ground that an adjustment uses
 MAX_STABLE_CELLS = 800_000  # the same of stable ground, in whole rows; more add no information
-BLOCK_CELLS = 50_000  # cells per sector if the scanner's position is unknown, and in passes over all cells
+BLOCK_CELLS = 50_000  # of passes over all cells, and of sectors if the scanner's position is unknown
 MAX_BRIGHTNESS_CELLS = 100_000  # cells whose brightness is compared; of more, a sample
 VISIBILITY_BIN_M = 200.0  # range bin in which cells are counted for visibility
 MAX_VISIBILITY_CELLS = 500_000  # cells counted for visibility; of more, a sample

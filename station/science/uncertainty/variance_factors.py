@@ -44,6 +44,13 @@ class VarianceFactors:
     random: Floats32
     systematic: float
 
+    def median_random(self, noise_class: NDArray[np.uint8]) -> float:
+        """Return the median of the random factors of cells (n,) of these noise classes, the lower of two."""
+        classes, cells = np.unique(noise_class, return_counts=True)
+        order = np.argsort(self.random[classes])
+        middle = np.searchsorted(np.cumsum(cells[order]), (len(noise_class) + 1) // 2)
+        return float(self.random[classes[order[middle]]])
+
 
 UNIT_FACTORS = VarianceFactors(np.ones(NOISE_CLASSES, np.float32), 1.0)
 

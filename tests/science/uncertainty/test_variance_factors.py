@@ -8,6 +8,7 @@ from station.science.geometry.robust_statistics import robust_scale
 from station.science.uncertainty.variance_factors import (
     NOISE_CLASSES,
     Residuals,
+    VarianceFactors,
     estimate_variance_factors,
     noise_class,
 )
@@ -105,6 +106,13 @@ def test_noise_classes_fit_a_byte_and_part_range_roughness_and_sampling():
     assert of_one == noise_class(one[0] + 200, one[1] + 0.02, np.array([True]))
     for other in ((1600.0, 0.07, True), (1200.0, 0.12, True), (1200.0, 0.07, False)):
         assert noise_class(*(np.array([value]) for value in other)) != of_one
+
+
+def test_median_of_random_factors_counts_cells():
+    rng = np.random.default_rng(2)
+    factors = VarianceFactors(rng.permutation(NOISE_CLASSES).astype(np.float32), 1.0)
+    classes = rng.choice(256, 1001, p=rng.dirichlet(np.ones(256))).astype(np.uint8)
+    assert factors.median_random(classes) == np.median(factors.random[classes])
 
 
 def test_scaled_parameters_have_the_factor_in_every_variance():
