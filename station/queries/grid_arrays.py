@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from datetime import UTC, datetime
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, cast
 
 import numpy as np
 import numpy.typing as npt
@@ -28,7 +28,7 @@ def to_grid(values: npt.ArrayLike | xr.DataArray, grid: Grid) -> Floats | Bools:
     A DataArray is aligned by its coordinates, whatever its order; cells outside it are zero. Raises
     ValueError if it does not fit the grid or contains NaN.
     """
-    aligned = _align(values, grid) if hasattr(values, "dims") else np.asarray(values)
+    aligned = _align(cast("xr.DataArray", values), grid) if hasattr(values, "dims") else np.asarray(values)
     if aligned.shape != grid.shape:
         raise ValueError(f"the array has shape {aligned.shape}, the grid {grid.shape}")
     if aligned.dtype == np.bool_:
