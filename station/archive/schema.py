@@ -257,8 +257,16 @@ VARIABLES: tuple[Variable, ...] = (
         "rejected_echo_share",
         ("time",),
         "f8",
-        "share of the points on the grid that are not of the surface of their cell: echoes of the air",
+        "share of the points on the grid that are not of the surface of their cell",
         "1",
+    ),
+    Variable(
+        "airborne_echo_share",
+        ("time",),
+        "f8",
+        "share of the points on the grid that are echoes of the air",
+        "1",
+        comment="rejected echoes above the surface, less as many as there are below it, and chance",
     ),
     Variable("coverage", ("time",), "f8", "share of the grid's cells with points", "1"),
     Variable(

@@ -290,6 +290,7 @@ def _compute_epoch(
     progress()
     scalars = _scalar_variables(measurement, inputs, *point_counts)
     scalars["rejected_echo_share"] = gridder.rejected_echo_share
+    scalars["airborne_echo_share"] = gridder.airborne_echo_share
     if adjustment is not None and viewing is not None:
         scalars |= holdout_statistics(measurement, viewing) | {"change_step": adjustment[1].change_size_m}
         scalars |= {
@@ -306,7 +307,7 @@ def _compute_epoch(
         scalars.get("stable_z_std", 0.0) if adjustment else None,
         inputs.faults,
         has_brightness=brightness_known,
-        rejected_echo_share=gridder.rejected_echo_share,
+        airborne_echo_share=gridder.airborne_echo_share,
         usual=components,
     )
     return epochs.Epoch(

@@ -34,7 +34,7 @@ MAX_HOLDOUT_Z_STD = 3.0  # of hold-out stable ground
 MAX_MISFIT_SIGMAS = 5.0  # of an unadjusted scan; beyond, its sigma does not cover the error
 MIN_STABLE_CELLS = 20
 MAX_MISFIT_CELLS = 100_000  # larger sets are thinned for the misfit
-MAX_REJECTED_ECHO_SHARE = 0.00125  # of the points on the grid; more are not from a few particles in clear air
+MAX_AIRBORNE_ECHO_SHARE = 0.00125  # of the points on the grid; more are not from a few particles in clear air
 NO_BRIGHTNESS = "no brightness: snow on stable ground cannot be recognised"
 
 
@@ -164,7 +164,7 @@ def assess(
     faults: Sequence[str] = (),
     *,
     has_brightness: bool = True,
-    rejected_echo_share: float = 0.0,
+    airborne_echo_share: float = 0.0,
     usual: VarianceComponents | None = None,
 ) -> tuple[str, str]:
     """Return the verdict of an epoch and its reasons, the gravest first.
@@ -173,15 +173,15 @@ def assess(
     error. Degraded: any other warning. `adjustment` is the adjustment of the scan even if it was not used in
     the end; `stable_z_std` is given only if it was used. `faults` are those of the inputs. `has_brightness`
     is False if the scan, or its reference, does not tell by brightness where snow lies; that degrades a scan
-    only if its change is measured: first scans make the reference. `rejected_echo_share` is that of the
-    points on the grid that are not of the surface of their cell. `usual` is the motion to expect of the
+    only if its change is measured: first scans make the reference. `airborne_echo_share` is that of the
+    points on the grid that are echoes of the air. `usual` is the motion to expect of the
     scanner since the reference; by default that of a scan soon after it.
     """
     fatal = [*([f"flagged: {flag}"] if flag else []), *faults]
     reasons = [*warnings, *([] if has_brightness or viewing is None else [NO_BRIGHTNESS])]
-    if viewing is not None and rejected_echo_share > MAX_REJECTED_ECHO_SHARE:
+    if viewing is not None and airborne_echo_share > MAX_AIRBORNE_ECHO_SHARE:
         reasons.append(
-            f"{rejected_echo_share:.2%} of the echoes are not from the ground: snow, rain or dust?"
+            f"{airborne_echo_share:.2%} of the echoes are not from the ground: snow, rain or dust?"
         )
     if viewing is not None and viewing.params is not None:
         visible = visibility(measurement.count, viewing)

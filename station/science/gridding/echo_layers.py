@@ -166,11 +166,11 @@ class EchoLayers:
             table = table.take(fullest)
         self._table, self._pending = [table], 0
 
-    def choose(self, dense: LayerSums, reference_cells: int) -> LayerSums:
-        """Return the run of each cell of `dense` that is its surface; these are the cells of the table.
+    def choose(self, dense: LayerSums, reference_cells: int) -> tuple[LayerSums, int]:
+        """Return the run of each cell of `dense` that is its surface, and the number of echoes below these.
 
-        It is the fullest run, of equal ones the lowest. In the first `reference_cells`, ground at its usual
-        height counts more, and a cloud nothing.
+        The cells are those of the table. The surface is the fullest run, of equal ones the lowest. In the
+        first `reference_cells`, ground at its usual height counts more, and a cloud nothing.
         """
         # The usual layer counts as one with echoes, which it is in a run that starts with it.
         usual = LayerSums(dense.cell_index, *np.zeros((6, len(dense)), np.int64))
@@ -183,7 +183,8 @@ class EchoLayers:
         last = np.flatnonzero(np.append(cell_index[1:] != cell_index[:-1], True))
         chosen = runs.take(order[last])
         self._run[chosen.cell_index] = np.stack([chosen.low, chosen.high], axis=1)
-        return chosen
+        surface_low = chosen.low[np.searchsorted(chosen.cell_index, runs.cell_index)]
+        return chosen, int(runs.count[runs.high < surface_low].sum())
 
     def cells_in_table(self) -> Ints:
         """Return the cells (m,) with layers in the table, ascending."""

@@ -109,6 +109,7 @@ class Gridder:
             thickness = np.ones(self.reference_cells, np.uint8)
         self._layers: EchoLayers | None = EchoLayers(cells, grid.cell_m, thickness)
         self.rejected = 0  # points that are not of the surface of their cell
+        self._below = 0  # those of them that lie below it
         # On a reference, intensity is only summed in the cells where it is compared with the reference's.
         self._intensity_cells = cells if surface is None else self.reference_cells
         self._has_intensity = False
@@ -171,7 +172,7 @@ class Gridder:
         cells = self._layers.cells_in_table()
         if len(cells):
             self._keep_surfaces(self._layers, cells)
-        self._reject_airborne(self._layers)
+        self._reject_lone(self._layers)
         self._layers = None
 
     def _keep_surfaces(self, layers: EchoLayers, cells: Ints) -> None:
@@ -187,22 +188,25 @@ class Gridder:
             self._intensity_sum[cells].astype(np.int64),
         )
         total = int(dense.count.sum()) + layers.stored
-        chosen = layers.choose(dense, self.reference_cells)
+        chosen, below = layers.choose(dense, self.reference_cells)
         self.rejected += total - int(chosen.count.sum())
+        self._below += below
         self._count[cells] = chosen.count
         self._moments[cells, 0], self._moments[cells, 1] = chosen.residual, chosen.square
         self._intensity_sum[cells] = chosen.intensity
 
-    def _reject_airborne(self, layers: EchoLayers) -> None:
+    def _reject_lone(self, layers: EchoLayers) -> None:
         """Empty the reference cells in which no echo is of a surface: the few far from it that are alone."""
         doubtful, clouds = layers.far_from_reference(self._count[: self.reference_cells])
         if not len(doubtful):
             return
         residual_m = self.take(doubtful.astype(np.int32)).mean_residual()
         neighbours_m = self._neighbours(doubtful)
-        airborne = doubtful[clouds | ~supported(residual_m, neighbours_m, layers.thickness_m(doubtful))]
-        self.rejected += int(self._count[airborne].sum())
-        self._count[airborne], self._moments[airborne], self._intensity_sum[airborne] = 0, 0, 0
+        alone = clouds | ~supported(residual_m, neighbours_m, layers.thickness_m(doubtful))
+        self.rejected += int(self._count[doubtful[alone]].sum())
+        self._below += int(self._count[doubtful[alone & (residual_m < 0)]].sum())
+        for sums in (self._count, self._moments, self._intensity_sum):
+            sums[doubtful[alone]] = 0
 
     def _neighbours(self, cell_index: Ints) -> Floats32:
         """Return the mean residuals of the eight cells around reference cells (n,) [m], NaN if unknown."""
@@ -235,8 +239,22 @@ class Gridder:
     @property
     def rejected_echo_share(self) -> float:
         """Share of the points on the grid that are not of the surface of their cell."""
+        return self._share(self.rejected)
+
+    @property
+    def airborne_echo_share(self) -> float:
+        """Share of the points on the grid that are of the air: rejected ones above the surface.
+
+        As many as there are below are taken off, and two standard deviations of that difference. Where few
+        points fall on rough ground, a beam that moved a little meets other ground, as often below the surface
+        of its cell as above it; air is only above.
+        """
+        return self._share(max(self.rejected - 2 * self._below - 2 * self.rejected**0.5, 0.0))
+
+    def _share(self, points: float) -> float:
+        """Return a number of points as a share of those on the grid."""
         total = int(self.count.sum(dtype=np.int64)) + self.rejected
-        return self.rejected / total if total else 0.0
+        return points / total if total else 0.0
 
     def add(self, cell_index: Ints32, residual_m: Floats, intensity: Floats | None) -> None:
         """Add points (n,): cell index, height above reference or datum [m], and intensity, 0-1."""

@@ -134,7 +134,7 @@ def assess(
     result = measurement(
         noise + change_m, sigma_m, random_cells(0.9) if observed is None else observed, viewing
     )
-    return verdict.assess("", warnings, result, viewing, None, z_std, rejected_echo_share=air)
+    return verdict.assess("", warnings, result, viewing, None, z_std, airborne_echo_share=air)
 
 
 def test_verdict_is_good_degraded_or_unusable():
@@ -172,7 +172,7 @@ def test_unusually_many_echoes_of_the_air_are_reported():
         "0.34% of the echoes are not from the ground: snow, rain or dust?",
     )
     result = measurement(0.0, 0.1, RANGE_M < 100, None)  # without a reference
-    assert verdict.assess("", (), result, None, None, None, rejected_echo_share=0.0034)[0] == "good"
+    assert verdict.assess("", (), result, None, None, None, airborne_echo_share=0.0034)[0] == "good"
 
 
 def test_missing_brightness_degrades_the_verdict():

@@ -135,6 +135,19 @@ def test_lone_echo_far_from_the_reference_empties_its_cell_but_real_change_stays
     assert gridder.rejected == 0
 
 
+@pytest.mark.parametrize("surface", [FLAT, None])
+@pytest.mark.parametrize(("above", "below"), [(400, 0), (400, 100), (120, 100)])
+def test_echoes_of_the_air_are_above_the_surface_beyond_as_many_below_and_chance(surface, above, below):
+    rng = np.random.default_rng(5)
+    far_m = rng.uniform(20, 80, above + below) * np.repeat([1, -1], [above, below])
+    residual_m = np.concatenate([np.zeros(1000 * CELLS), far_m])
+    cell = np.concatenate([np.tile(np.arange(CELLS), 1000), rng.integers(CELLS, size=len(far_m))])
+    _, gridder = gridded(cell, residual_m, surface=surface)
+    assert gridder.rejected_echo_share == (above + below) / len(cell)
+    excess = above - below - 2 * np.sqrt(above + below)  # two standard deviations of a Poisson difference
+    assert gridder.airborne_echo_share == pytest.approx(max(excess, 0) / len(cell))
+
+
 def test_cloud_without_ground_below_it_empties_its_cell():
     rng = np.random.default_rng(3)
     cell, heights_m = np.full(200, 8), rng.uniform(10, 30, 200)
