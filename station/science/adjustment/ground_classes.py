@@ -132,7 +132,7 @@ def rock_brightness(
 
     Their own brightness tells whether it falls with the cosine of the incidence, by Lambert's law, or is
     corrected for it. That of rock is unknown where too little of the moving ground looks otherwise: then it
-    may all be ice under debris.
+    may all be ice under debris. Source: equations.md, 6.9.
     """
     ring = (range_m / ICE_RANGE_M).astype(np.int64)
     known = stable & (intensity > 0)

@@ -41,6 +41,7 @@ def estimate_variance_components(
     if that came from `PRIOR_SCANS` scans. The tilt components differ in their correlation in time and are
     separated by expectation-maximisation from `start`, which is returned with fewer than two scans. Of the
     refraction over ice a trend from scan to scan, which are in order of time, does not count: it is melt.
+    Source: equations.md, 6.4.
     """
     first, last = len(GLOBAL), len(GLOBAL) + params.line_groups
     tilt_slice = slice(first, last)

@@ -282,6 +282,18 @@ def test_posterior_variance_counts_in_the_estimate_of_components():
         assert value == pytest.approx(getattr(COMPONENTS, name), rel=0.01)
 
 
+def test_refraction_over_ice_that_grows_from_scan_to_scan_is_melt_not_weather():
+    """Melt of 2 cm an hour looks like refraction that grows by 0.02 a scan, forty times its scatter."""
+    scans = simulated_estimates(COMPONENTS, 40)
+    components = []
+    for slope in (0.0, 0.02):
+        for index, (_, estimate, _) in enumerate(scans):
+            estimate[variance_components.ICE] += slope * index
+        components.append(variance_components.estimate_variance_components(COMPONENTS, PARAMS, scans))
+    for name, value in vars(components[0]).items():
+        assert getattr(components[1], name) == pytest.approx(value, rel=1e-9)
+
+
 @pytest.mark.parametrize("name", ["tilt_jitter_rad", "line_jitter_rad"])
 def test_tilt_components_are_separated(name):
     actual_components = replace(COMPONENTS, **{name: 2 * getattr(COMPONENTS, name)})
