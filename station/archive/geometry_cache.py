@@ -25,13 +25,8 @@ from station.archive.netcdf_layout import Series
 from station.archive.reference_files import reference_path
 from station.errors import StoreError
 from station.quantities import Reference
-from station.science.gridding.viewing_geometry import (
-    CELL_ARRAYS,
-    MAX_VISIBILITY_CELLS,
-    CellClass,
-    Position,
-    ViewingGeometry,
-)
+from station.science.gridding.reference_cells import CELL_ARRAYS, MAX_VISIBILITY_CELLS, CellClass, Position
+from station.science.gridding.viewing_geometry import ViewingGeometry
 from station.science.uncertainty.parameters import parameter_layout
 
 PREFIX = ".viewing_geometry-"

@@ -31,8 +31,9 @@ from station.science.geometry.pose import ScannerToMap, TimedRotation, timed_rot
 from station.science.geometry.robust_statistics import nmad
 from station.science.gridding.cell_estimates import CellEstimator, estimate_cells
 from station.science.gridding.gridder import Gridder
+from station.science.gridding.reference_cells import CellClass
 from station.science.gridding.significance import supported_variance
-from station.science.gridding.viewing_geometry import CellClass, ViewingGeometry, compute_viewing_geometry
+from station.science.gridding.viewing_geometry import ViewingGeometry, compute_viewing_geometry
 from station.science.uncertainty import propagation
 from station.science.uncertainty.jacobian import HeightJacobian
 from station.science.uncertainty.parameters import ParameterLayout

@@ -94,7 +94,7 @@ class Adjustment:
     def to_shared_parameters(self, sampling_ratio: float = 0.0) -> SharedParameters:
         """Return the estimate and its covariance on knots, for the store.
 
-        `sampling_ratio` is the mean of that of stable cells (`viewing_geometry.sampling_ratio`): rough ground
+        `sampling_ratio` is the mean of that of stable cells (`reference_cells.sampling_ratio`): rough ground
         responds to a motion of the beams by a little more or less than modelled. Source: equations.md, 6.8.
         """
         shared = self.posterior.to_shared_parameters(self.estimate)

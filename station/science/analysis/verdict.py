@@ -14,12 +14,8 @@ import numpy as np
 from station.quantities import Bools, Floats, Ints, Ints32, Measurement, VarianceComponents
 from station.science.adjustment.joint import Adjustment
 from station.science.geometry.robust_statistics import NORMAL_MAD
-from station.science.gridding.viewing_geometry import (
-    VISIBILITY_ARRAYS,
-    VISIBILITY_BIN_M,
-    CellClass,
-    ViewingGeometry,
-)
+from station.science.gridding.reference_cells import VISIBILITY_ARRAYS, VISIBILITY_BIN_M, CellClass
+from station.science.gridding.viewing_geometry import ViewingGeometry
 from station.science.uncertainty.parameters import TILT_KNOT_RAD, TILT_KNOTS_PER_REFRACTION
 
 MAX_REJECTED_SHARE = 0.3  # of the stable ground, rejected by the adjustment

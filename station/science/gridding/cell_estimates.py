@@ -26,12 +26,8 @@ from station.science.geometry.observation import Observation
 from station.science.geometry.terrain import HALO_ROWS, gradient_at
 from station.science.gridding import significance
 from station.science.gridding.gridder import CellSums, Gridder, slope_sampling_variance
-from station.science.gridding.viewing_geometry import (
-    HIGH_INCIDENCE_COS,
-    AzimuthSector,
-    CellClass,
-    ViewingGeometry,
-)
+from station.science.gridding.reference_cells import HIGH_INCIDENCE_COS, CellClass
+from station.science.gridding.viewing_geometry import AzimuthSector, ViewingGeometry
 from station.science.uncertainty import budget, parameters, shot_noise
 from station.science.uncertainty.jacobian import HeightJacobian, height_jacobian
 from station.science.uncertainty.variance_factors import class_with_excess

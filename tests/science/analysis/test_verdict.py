@@ -86,7 +86,7 @@ def test_visibility_from_a_sample_of_cells_is_the_same(monkeypatch):
     observed = random_cells(0.9) & (RANGE_M < 1400)
     all_cells = observe(observed, reference())
     monkeypatch.setattr(
-        "station.science.gridding.viewing_geometry.MAX_VISIBILITY_CELLS", GRID.nx * GRID.ny // 3
+        "station.science.gridding.reference_cells.MAX_VISIBILITY_CELLS", GRID.nx * GRID.ny // 3
     )
     sampled = observe(observed, reference())
     assert sampled.share == pytest.approx(all_cells.share, rel=0.02)

@@ -10,8 +10,9 @@ from scipy import ndimage
 from station.quantities import Grid, Reference, Scanner, SharedParameters, VarianceComponents
 from station.science.adjustment import prior
 from station.science.geometry.inclination import NO_CYCLIC_ERROR
-from station.science.gridding import viewing_geometry
-from station.science.gridding.viewing_geometry import CellClass, compute_viewing_geometry
+from station.science.gridding import reference_cells, viewing_geometry
+from station.science.gridding.reference_cells import CellClass
+from station.science.gridding.viewing_geometry import compute_viewing_geometry
 from station.science.uncertainty import parameters
 from station.science.uncertainty.jacobian import height_jacobian
 
@@ -103,8 +104,8 @@ def test_adjustment_uses_a_sample_of_very_many_cells(monkeypatch, max_moving):
         compute_viewing_geometry(plane(), STABLE, VZ6000, POSITION_M).sectors(sampled=True)
     )
     assert len(all_arrays["cell"]) == np.count_nonzero(KNOWN)  # few are enclosed: even those at gaps
-    monkeypatch.setattr(viewing_geometry, "MAX_STABLE_CELLS", 3000)
-    monkeypatch.setattr(viewing_geometry, "MAX_MOVING_CELLS", max_moving)
+    monkeypatch.setattr(reference_cells, "MAX_STABLE_CELLS", 3000)
+    monkeypatch.setattr(reference_cells, "MAX_MOVING_CELLS", max_moving)
     sample = all_cells(compute_viewing_geometry(plane(), STABLE, VZ6000, POSITION_M).sectors(sampled=True))
     chosen = np.zeros(GRID.shape, bool)
     chosen.reshape(-1)[sample["cell"]] = True
@@ -117,7 +118,7 @@ def test_adjustment_uses_a_sample_of_very_many_cells(monkeypatch, max_moving):
 def test_adjustment_uses_enclosed_and_even_cells(monkeypatch):
     rough_m = np.where(np.arange(GRID.nx) < 75, 0.02, 3.0)
     reference = replace(plane(), roughness_m2=np.broadcast_to(rough_m.astype(np.float32) ** 2, GRID.shape))
-    monkeypatch.setattr(viewing_geometry, "MIN_ENCLOSED_SHARE", 0.0)
+    monkeypatch.setattr(reference_cells, "MIN_ENCLOSED_SHARE", 0.0)
     used = all_cells(compute_viewing_geometry(reference, STABLE, VZ6000, POSITION_M).sectors(sampled=True))
     enclosed = ndimage.binary_erosion(KNOWN, np.ones((3, 3)), border_value=1)
     expected = enclosed & (np.arange(GRID.nx) < 75)
@@ -182,6 +183,6 @@ def test_sampling_ratio_is_the_error_of_a_tilt_on_ground_of_another_slope_than_t
         effects.append(computed[1] - (drop_m + surface_slope * (computed[0] - distance_m)))
     roughness_m = cell_m * slope_error / np.sqrt(12)
     sin_grazing = np.sin(depression + np.arctan(surface_slope))
-    expected = viewing_geometry.sampling_ratio(np.array([roughness_m]), cell_m, np.array([sin_grazing]))[0]
+    expected = reference_cells.sampling_ratio(np.array([roughness_m]), cell_m, np.array([sin_grazing]))[0]
     shift_m = tilt * np.hypot(distance_m, drop_m)
     assert abs(effects[1] - effects[0]) / shift_m == pytest.approx(expected, rel=0.1)
