@@ -1,4 +1,4 @@
-"""`station areas`, `station plot` and `station serve`."""
+"""`station areas`, `station trend`, `station plot` and `station serve`."""
 
 from __future__ import annotations
 
@@ -13,6 +13,13 @@ from station.commands._options import Against, FromOption, SiteArgument, ToOptio
 
 if TYPE_CHECKING:
     from station.config import Site
+
+
+class Period(StrEnum):
+    """A period for which `station trend` gives a rate."""
+
+    day = "1D"
+    month = "1M"
 
 
 class PlotKind(StrEnum):
@@ -58,6 +65,46 @@ def areas(
     settings, span = read_site(site), Span.parse(first, last)
     _print_epochs(settings, against)
     records = area_records(settings, polygons, span, against, progress_bar("summing up"))
+    if table is None:
+        print(as_text(records))
+    elif table == "-":
+        print(as_csv(records), end="")
+    else:
+        Path(table).write_text(as_csv(records), encoding="utf-8")
+
+
+def trend(
+    site: SiteArgument,
+    polygons: Annotated[
+        Path | None,
+        typer.Argument(
+            metavar="[POLYGONS]",
+            help="GeoJSON of named polygons; without it, those of the site.",
+            show_default=False,
+        ),
+    ] = None,
+    area: Annotated[str | None, typer.Option(help="One area instead of all.", show_default=False)] = None,
+    first: FromOption = None,
+    last: ToOption = None,
+    every: Annotated[
+        Period | None, typer.Option(help="A rate for each day or month, UTC.", show_default=False)
+    ] = None,
+    table: Annotated[
+        str | None, typer.Option("--csv", metavar="FILE", help="Write CSV; - is stdout.", show_default=False)
+    ] = None,
+) -> None:
+    """Print how fast areas change, and whether they speed up, with 95 % intervals.
+
+    The rate is that of the straight line through the mean change of the area. Its interval knows that the
+    epochs share the errors of the reference and of the weather. CSV has the inverse velocity too.
+    """
+    from station.config import read_site
+    from station.products.area_tables import Span
+    from station.products.trend_tables import as_csv, as_text, trend_records
+
+    settings, span = read_site(site), Span.parse(first, last)
+    period = every.value if every else None
+    records = trend_records(settings, polygons, span, area, period, progress_bar("summing up"))
     if table is None:
         print(as_text(records))
     elif table == "-":

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import csv
 import io
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from datetime import UTC, date, datetime, timedelta
 from pathlib import Path
@@ -119,16 +119,7 @@ def area_records(
     The areas are those of a GeoJSON file or of the site. `track` iterates over the epochs to compute, as a
     progress bar does. Raises ConfigError if there are no areas, StationError if an epoch does not exist.
     """
-    series = series_in(site.station.data)
-    file = polygons or (site.areas.file if site.areas else None)
-    if file is None:
-        raise ConfigError(
-            "no areas: give a GeoJSON file of polygons, or name one as [areas] file in the site file"
-        )
-    areas = {
-        name: cells_inside(polygon, series.grid)
-        for name, polygon in read_polygons(file, site.map.crs).items()
-    }
+    series, areas = series_in(site.station.data), area_cells(site, polygons)
     if (
         against == REFERENCE
         and matches(series.folder / "areas.nc", series, areas)
@@ -137,6 +128,20 @@ def area_records(
         yield from _from_file(stored, span, read_epoch_table(series))
     else:
         yield from _compute(series, areas, span, against, track)
+
+
+def area_cells(site: Site, polygons: Path | None) -> dict[str, Bools]:
+    """Return the cells (ny, nx) of the areas of a GeoJSON file, or of the site.
+
+    Raises ConfigError if there are none.
+    """
+    file = polygons or (site.areas.file if site.areas else None)
+    if file is None:
+        raise ConfigError(
+            "no areas: give a GeoJSON file of polygons, or name one as [areas] file in the site file"
+        )
+    grid = series_in(site.station.data).grid
+    return {name: cells_inside(polygon, grid) for name, polygon in read_polygons(file, site.map.crs).items()}
 
 
 def _from_file(stored: list[AreaSeries], span: Span, table: EpochTable) -> Iterator[AreaRecord]:
@@ -220,7 +225,7 @@ def as_text(records: Iterable[AreaRecord]) -> str:
     body = [
         (
             f"{record.start:%Y-%m-%d %H:%M}",
-            "".join(character if character.isprintable() else "�" for character in record.area),
+            record.area,
             f"{statistics['mean_change']:+.4f}",
             f"±{statistics['mean_change_high'] - statistics['mean_change']:.4f}",
             f"{statistics['median_change']:+.4f}",
@@ -234,12 +239,20 @@ def as_text(records: Iterable[AreaRecord]) -> str:
     ]
     if not body:
         return "no epoch with a change in this span"
-    widths = [max(len(row[column]) for row in (header, *body)) for column in range(len(header))]
-    left_aligned = (0, 1, len(header) - 1)
+    return text_table(header, body, left_aligned=(0, 1, len(header) - 1))
+
+
+def text_table(header: Sequence[str], body: Sequence[Sequence[str]], left_aligned: Collection[int]) -> str:
+    """Return rows of a header and a body as aligned text, without characters that a terminal acts on."""
+    rows = [
+        ["".join(character if character.isprintable() else "�" for character in cell) for cell in row]
+        for row in (header, *body)
+    ]
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     return "\n".join(
         "  ".join(
             cell.ljust(width) if column in left_aligned else cell.rjust(width)
             for column, (cell, width) in enumerate(zip(row, widths, strict=True))
         ).rstrip()
-        for row in (header, *body)
+        for row in rows
     )

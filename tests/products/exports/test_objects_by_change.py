@@ -33,7 +33,8 @@ def recipe(path, grid):
     )
 
 
-def test_py4dgeo_finds_a_deposit_in_an_exported_file(series, tmp_path):
+def test_py4dgeo_finds_a_deposit_in_an_exported_file(series, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)  # where py4dgeo writes its log
     rng = np.random.default_rng(1)
     for hour in range(EPOCHS):
         change_m = rng.normal(0, 0.02, series.grid.shape)
