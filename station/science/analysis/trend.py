@@ -68,7 +68,7 @@ def fit_trend(time_s: Floats, values: Floats, covariance: Floats) -> Trend:
     def last_coefficient(degree: int) -> tuple[float, float]:
         design = np.stack([day**power for power in range(degree + 1)], axis=1)
         whitened = linalg.solve_triangular(whitener, np.column_stack([design, values]), lower=True)
-        factor = np.asarray(np.linalg.qr(whitened, mode="r"))  # its last row of the design: coefficient, sigma
+        factor = np.asarray(np.linalg.qr(whitened, mode="r"))  # last row: coefficient over sigma
         corner = factor[degree, degree]
         return float(factor[degree, degree + 1] / corner), float(1 / abs(corner))
 
