@@ -174,7 +174,7 @@ def dense_jacobian(ds, index):
         "range_bias": height_above_slope / np.hypot(distance, z),
         "range_scale": height_above_slope * 1e-6,
         "refraction": bending,
-        "refraction_moving": bending * ((ds.quality[index].values.astype(int) & 8) == 0),
+        "refraction_ice": bending * ((ds.quality[index].values.astype(int) & 8) == 0),
     }
     rotations = derivatives["tilt_east"], derivatives["tilt_north"], -derivatives["heading"]
     cross_tilt = sum(rotation * part for rotation, part in zip(rotations, sight, strict=True))
