@@ -10,7 +10,7 @@ import numpy as np
 
 from station.archive.areas import AreaChange
 from station.archive.epochs import EpochRef
-from station.archive.netcdf_layout import Series, decode_text
+from station.archive.netcdf_layout import Series, decode_parameters
 from station.archive.raster_io import bounding_slices
 from station.archive.reference_files import open_reference
 from station.archive.series.index import list_epochs, nearest_epoch
@@ -341,7 +341,9 @@ class Aggregates:
             return None
         if self._shared_cache is None or self._shared_cache[0] != epoch:
             file.set_auto_chartostring(False)
-            names, units = (tuple(decode_text(np.ma.getdata(file[name][:]))) for name in PARAMETER_VARIABLES)
+            names, units = (
+                tuple(decode_parameters(np.ma.getdata(file[name][:]))) for name in PARAMETER_VARIABLES
+            )
             estimate, covariance, line_tilt_variance, *change_fields = (
                 np.ma.filled(file[name][epoch.index].astype(np.float64), 0.0)  # 0 where not this epoch's
                 for name in (
