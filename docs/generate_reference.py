@@ -227,7 +227,8 @@ def _code(text: str | None) -> str:
 def _variables() -> str:
     parts = [NOTE, "# Variables\n"]
     for heading, variables in (
-        ("`series.nc` and the epoch files", VARIABLES),
+        ("`series.nc`", [row for row in VARIABLES if row.is_result]),
+        ("`processing.nc`", [row for row in VARIABLES if not row.is_result]),
         ("`areas.nc`", AREA_VARIABLES),
         ("`boxes.nc` and `daily.nc`", DAILY_VARIABLES),
     ):

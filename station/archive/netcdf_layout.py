@@ -47,6 +47,11 @@ class Series:
         """Path of `series.nc`, the file that users open."""
         return self.folder / "series.nc"
 
+    @property
+    def processing_path(self) -> Path:
+        """Path of `processing.nc`: everything about each scan but the rasters."""
+        return self.folder / "processing.nc"
+
 
 def create_file(
     file: netCDF4.Dataset,

@@ -5,12 +5,16 @@ from dataclasses import replace
 import netCDF4
 import numpy as np
 import pytest
+from support.shared_parameters import random_shared
 
+import station
 from station.archive import epochs, reference_files
+from station.archive.schema import VARIABLES
+from station.archive.series import virtual
 from station.archive.series.epoch_reader import read_source
 from station.archive.series.virtual import build_series
+from station.products.epoch_table import read_epoch_table
 from station.quantities import Reference, VarianceComponents
-from tests.support.shared_parameters import random_shared
 
 
 def with_older_name(path):
@@ -32,9 +36,32 @@ def test_the_refraction_over_ice_keeps_its_column_under_its_older_name(series, e
         epochs.write_epoch(series, replace(epoch(hour), shared=replace(shared, estimate=estimate)))
     with_older_name(epochs.epoch_files(series)[0].path)
     build_series(series)
-    source = read_source(series.path, 0, 0, 2)
+    source = read_source(series.processing_path, 0, 0, 2)
     assert list(source.parameters) == list(shared.names)
     assert source.scalars["shared_parameter"].tolist() == [estimate.tolist()] * 2
+
+
+def test_a_series_that_contained_everything_is_read_until_the_next_scan(series, epoch, monkeypatch):
+    def only_series(series):
+        text = "This file is virtual."
+        return (virtual._VirtualFile(series.path, "Elevation change", text, VARIABLES),)
+
+    with monkeypatch.context() as older:
+        older.setattr(virtual, "_virtual_files", only_series)
+        older.setattr(virtual, "write_manifest", lambda *_: None)
+        for hour in (3, 5):
+            epochs.write_epoch(series, epoch(hour))
+            build_series(series)
+    assert not series.processing_path.exists()
+    table = read_epoch_table(series)
+    assert table.scalars["platform_roll"].tolist() == [0.12, 0.12]
+    with station.open(series.folder) as ds:
+        covariance = ds.station.processing.shared_parameter_covariance.load()
+    build_series(series)
+    with station.open(series.folder) as ds:
+        assert "shared_parameter_covariance" not in ds
+        assert ds.station.processing.shared_parameter_covariance.load().identical(covariance)
+    assert read_epoch_table(series).scalars["platform_roll"].tolist() == [0.12, 0.12]
 
 
 def test_a_reference_of_an_older_version_keeps_its_refraction_over_ice(series):
