@@ -15,7 +15,7 @@ from station.archive.epochs import EpochRef
 from station.archive.series.index import list_epochs, processing_file, series_in
 from station.archive.series.lazy import open_virtual
 from station.errors import StationError
-from station.queries.aggregates import CHANGE, RANDOM
+from station.queries.epoch_cells import CHANGE, RANDOM
 from station.queries.grid_arrays import Epoch, to_grid, to_mask
 from station.queries.volumes import Volumes
 

@@ -8,6 +8,7 @@ from functools import cache
 import numpy as np
 import pytest
 import xarray as xr
+from support.epochs import START_S, random_epoch
 from support.series import open_with_processing
 from support.shared_parameters import SCANNER
 
@@ -21,7 +22,6 @@ from station.errors import StationError, StoreError
 from station.quantities import (
     ChangeErrors,
     Grid,
-    Measurement,
     Quality,
     Reference,
     SharedParameters,
@@ -35,7 +35,6 @@ from station.science.analysis.voids import area_weights, void_variance
 from station.science.uncertainty import jacobian, parameters, propagation
 
 GRID = Grid(west_m=632_000.0, north_m=5_186_000.0, cell_m=10.0, nx=40, ny=30)
-START_S = 1_763_683_200.0  # 2025-11-21 00:00 UTC
 POSITION_M = tuple(list(SCANNER.values())[:3])
 AXIS = (0.04, -0.02, np.sqrt(1 - 0.04**2 - 0.02**2))
 EAST, NORTH = 0.25, -0.125  # slope of the reference, stored without rounding
@@ -59,28 +58,13 @@ def random_parameters(seed, size):
 
 
 def make_epoch(hour, adjustment, shared, *, empty=False):
-    rng = np.random.default_rng(hour)
-    observed = (rng.uniform(size=GRID.shape) < 0.8) & (not empty)
-    change_m = np.where(observed, rng.normal(hour / 10, 0.1, GRID.shape), np.nan).astype(np.float32)
-    sigma_m = np.where(observed, rng.uniform(0.01, 0.1, GRID.shape), np.nan).astype(np.float32)
-    measurement = Measurement.from_rasters(
+    random_m = np.random.default_rng(hour).uniform(0.01, 0.1, GRID.shape)
+    return random_epoch(
+        hour,
         GRID,
-        observed.astype(np.uint8),
-        elevation_m=np.where(observed, 2900.0, np.nan),
-        change_m=change_m,
-        uncertainty_m=2 * sigma_m,
-        random_uncertainty_m=sigma_m,
-        spread_m=sigma_m,
-        count=observed.astype(np.int32),
-    )
-    return epochs.Epoch(
-        start_s=START_S + 3600 * hour,
-        end_s=START_S + 3600 * hour + 900,
-        scan_id=f"251121_{hour:02d}0000",
-        measurement=measurement,
+        random_m,
+        unseen=np.full(GRID.shape, empty),
         shared=shared,
-        verdict="good",
-        verdict_reason="",
         scalars=SCANNER if shared else {},
         provenance={"adjustment": adjustment, "reference_version": "1"},
     )
