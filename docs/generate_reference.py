@@ -23,7 +23,8 @@ from station.archive.areas import AREA_VARIABLES
 from station.archive.derived.boxes import DAILY_VARIABLES
 from station.archive.schema import VARIABLES
 from station.cli import app
-from station.sections import Section, SiteFile
+from station.section_types import Section
+from station.sections import SiteFile
 
 ROOT = Path(__file__).parents[1]
 REFERENCE = ROOT / "docs" / "reference"

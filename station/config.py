@@ -19,7 +19,8 @@ from pydantic import BaseModel, ValidationError
 from station._version import __version__
 from station.errors import ConfigError
 from station.quantities import Grid, Scanner
-from station.sections import Section, SiteFile
+from station.section_types import Section
+from station.sections import SiteFile
 
 PLAIN_MESSAGES = {  # instead of those of pydantic, which name Python classes
     "path_type": "give a path in quotes",
