@@ -37,6 +37,7 @@ LOG_KEYS = {
     "scan": "name of the scan file",
     "verdict": "what became of the scan: good, degraded, unusable, set_aside, later, same, gone",
     "reason": "why, in a sentence",
+    "mirror": "failed, with the reason; renewed, when a fault is gone",
     "points": "points read",
     "discarded_pct": "share of the points that are not the last return, withheld, or classified as noise [%]",
     "rejected_echo_pct": "share of the points on the grid that are not of the surface of their cell [%]",

@@ -351,6 +351,14 @@ class ProductsSection(Section):
     change_limit_m: Positive | None = None
 
 
+class MirrorSection(Section):
+    """Descriptions of the series for the cloud and for data servers, renewed by the service."""
+
+    folder: Path
+    url: str = ""
+    formats: tuple[Literal["references", "ncml", "erddap"], ...] = ("references", "ncml")
+
+
 class SiteFile(Section):
     """The whole file."""
 
@@ -372,6 +380,7 @@ class SiteFile(Section):
     retention: RetentionSection = RetentionSection()
     service: ServiceSection = ServiceSection()
     products: ProductsSection = ProductsSection()
+    mirror: MirrorSection | None = None
     alarms: AlarmsSection | None = None
 
     @model_validator(mode="after")
