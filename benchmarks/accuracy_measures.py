@@ -12,7 +12,7 @@ import xarray as xr
 from numpy.typing import NDArray
 from scipy import stats
 
-from station.archive.series.lazy import open_series
+from station.archive.series.lazy import open_series, open_virtual
 from station.config import Site
 from station.processing.scan_tasks import series_for
 from station.quantities import Bools, Floats, Quality
@@ -47,6 +47,8 @@ class StationErrors:
         self.aggregates = Aggregates(series_for(site))
         with open_series(site.station.data) as series:
             self.series = series.load()
+        with open_virtual(series_for(site).processing_path) as processing:
+            scanner_m = [float(processing[f"scanner_{axis}"][0]) for axis in ("east", "north")]
         with xr.open_dataset(truth_file) as truth:
             true_m = truth.change.values
             stable = truth.stable_polygons.values > 0
@@ -56,8 +58,7 @@ class StationErrors:
         self.epochs = [self.aggregates.find_epoch(scan) for scan in self.scans]
         self.observed = np.isfinite(self.error_m)
         self.moving = ~stable & (self.observed.mean(axis=0) > 0.5)
-        east_m, north_m = (float(self.series[f"scanner_{axis}"][0]) for axis in ("east", "north"))
-        self.range_m = np.hypot(self.grid.x_m - east_m, self.grid.y_m[:, None] - north_m)
+        self.range_m = np.hypot(self.grid.x_m - scanner_m[0], self.grid.y_m[:, None] - scanner_m[1])
 
     def records(self) -> Records:
         """Return the errors at all scales; with a sigma for a sample of the boxes, the same in each scan."""

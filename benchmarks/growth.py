@@ -43,8 +43,8 @@ from station.archive.series.virtual import build_series
 from station.config import Site, read_site
 from station.inbox.file_hash import sha256_file
 from station.inbox.journal import Entry, Journal, State
+from station.processing.epoch_recorder import EpochRecorder
 from station.processing.integrity import store_files
-from station.processing.previews import PreviewRecorder
 from station.processing.scan_tasks import StoredResult, load_areas, series_for
 from station.processing.store_tasks import update_series
 from station.quantities import Bools, Grid, Measurement, Reference, SharedParameters
@@ -339,10 +339,11 @@ def cost(site: Site, start: datetime) -> dict[str, float]:
 
 def _write(site: Site, epoch: epochs.Epoch) -> StoredResult:
     series = series_for(site)
-    preview = PreviewRecorder(site, series, "1")
-    path = epochs.write_epoch(series, epoch, on_rows=preview.add).path
+    recorder = EpochRecorder(site, series, "1")
+    path = epochs.write_epoch(series, epoch, on_rows=recorder.add).path
+    recorder.keep_sums(path)
     name = str(path.relative_to(series.folder))
-    return StoredResult(epoch.start_s, "", name, 1, "good", "", "1", {}, "", "", preview.overview)
+    return StoredResult(epoch.start_s, "", name, 1, "good", "", "1", {}, "", "", recorder.overview)
 
 
 def reading(folder: Path) -> dict[str, float]:

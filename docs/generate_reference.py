@@ -23,7 +23,8 @@ from station.archive.areas import AREA_VARIABLES
 from station.archive.derived.boxes import DAILY_VARIABLES
 from station.archive.schema import VARIABLES
 from station.cli import app
-from station.sections import Section, SiteFile
+from station.section_types import Section
+from station.sections import SiteFile
 
 ROOT = Path(__file__).parents[1]
 REFERENCE = ROOT / "docs" / "reference"
@@ -36,6 +37,7 @@ LOG_KEYS = {
     "scan": "name of the scan file",
     "verdict": "what became of the scan: good, degraded, unusable, set_aside, later, same, gone",
     "reason": "why, in a sentence",
+    "mirror": "failed, with the reason; renewed, when a fault is gone",
     "points": "points read",
     "discarded_pct": "share of the points that are not the last return, withheld, or classified as noise [%]",
     "rejected_echo_pct": "share of the points on the grid that are not of the surface of their cell [%]",
@@ -227,7 +229,8 @@ def _code(text: str | None) -> str:
 def _variables() -> str:
     parts = [NOTE, "# Variables\n"]
     for heading, variables in (
-        ("`series.nc` and the epoch files", VARIABLES),
+        ("`series.nc`", [row for row in VARIABLES if row.is_result]),
+        ("`processing.nc`", [row for row in VARIABLES if not row.is_result]),
         ("`areas.nc`", AREA_VARIABLES),
         ("`boxes.nc` and `daily.nc`", DAILY_VARIABLES),
     ):

@@ -19,7 +19,8 @@ from pydantic import BaseModel, ValidationError
 from station._version import __version__
 from station.errors import ConfigError
 from station.quantities import Grid, Scanner
-from station.sections import Section, SiteFile
+from station.section_types import Section
+from station.sections import SiteFile
 
 PLAIN_MESSAGES = {  # instead of those of pydantic, which name Python classes
     "path_type": "give a path in quotes",
@@ -207,10 +208,12 @@ def _file_fault(file: Path) -> str:
 
 
 def _folder_faults(site: Site) -> list[str]:
-    """Return a fault if the data folder and the inbox, which is not to be changed, contain each other."""
+    """Return a fault if data folder or mirror are in the inbox, which is not to be changed."""
     inbox, data = site.scans.inbox.resolve(), site.station.data.resolve()
     if inbox.is_relative_to(data) or data.is_relative_to(inbox):
         return [f"  station.data: {data} and the inbox, {inbox}, must be separate folders"]
+    if site.mirror and site.mirror.folder.resolve().is_relative_to(inbox):
+        return [f"  mirror.folder: {site.mirror.folder} must not be in the inbox"]
     return []
 
 

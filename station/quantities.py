@@ -219,7 +219,7 @@ class VarianceComponents:
     range_bias_m: float = 0.004
     range_scale_ppm: float = 0.8
     refraction: float = 0.08
-    refraction_moving: float = 0.03
+    refraction_ice: float = 0.03
     refraction_by_azimuth: float = 0.02
     tilt_drift_rad: float = radians(0.0018)
     tilt_jitter_rad: float = radians(0.0010)

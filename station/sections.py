@@ -6,69 +6,25 @@ The commented files in `config/` explain the keys.
 from __future__ import annotations
 
 import math
-import re
-from datetime import UTC, datetime
 from ipaddress import ip_address
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import AfterValidator, AwareDatetime, BaseModel, ConfigDict, Field, model_validator
+from pydantic import AfterValidator, ConfigDict, Field, model_validator
 
 from station.quantities import Air, IntensityScale, Scanner
 from station.scanners import SCANNERS
-
-Positive = Annotated[float, Field(gt=0)]
-NotNegative = Annotated[float, Field(ge=0)]
-Arm = Annotated[float, Field(ge=-2, le=2)]
-Place = Annotated[float, Field(ge=-1e8, le=1e8)]  # metres on a map; no map of the Earth is larger
-
-
-def _without_required(schema: dict[str, Any]) -> None:
-    """Remove the required keys from a JSON Schema: those of a known instrument have values."""
-    schema.pop("required", None)
-
-
-def _in_utc(time: datetime) -> datetime:
-    return time.astimezone(UTC)
-
-
-def require_projected(crs: str) -> str:
-    """Return a CRS; raise ValueError unless it is known, projected, and in metres."""
-    from pyproj import CRS  # noqa: PLC0415 - a tenth of a second that not every command needs
-    from pyproj.exceptions import CRSError  # noqa: PLC0415
-
-    advice = "name a projected CRS in metres, such as EPSG:32632"
-    try:
-        parsed = CRS.from_user_input(crs)
-    except CRSError as error:
-        raise ValueError(f"unknown to PROJ: {advice}") from error
-    horizontal = parsed.sub_crs_list[0] if parsed.is_compound else parsed
-    if not horizontal.is_projected:
-        in_degrees = ", in degrees" if horizontal.is_geographic else ""
-        raise ValueError(f"is a {horizontal.type_name}{in_degrees}: {advice}")
-    units = {axis.unit_name for axis in horizontal.axis_info if axis.unit_conversion_factor != 1.0}
-    if units:
-        raise ValueError(f"is in {' and '.join(sorted(units))}: {advice}")
-    return crs
-
-
-def _require_time_pattern(pattern: str) -> str:
-    """Return a pattern of scan names; raise ValueError unless times survive being written and read by it."""
-    time = datetime(2025, 7, 15, 13, 14, 15, tzinfo=UTC)
-    try:
-        datetime.strptime(time.strftime(pattern), pattern)  # noqa: DTZ007 - the pattern may contain a zone
-    except (ValueError, re.error, OverflowError) as error:
-        raise ValueError(f"not a pattern of times, such as %y%m%d_%H%M%S: {error}") from error
-    return pattern
-
-
-Utc = Annotated[AwareDatetime, AfterValidator(_in_utc)]
-
-
-class Section(BaseModel):
-    """A table of the site file: no unknown keys, immutable."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+from station.section_types import (
+    Arm,
+    NotNegative,
+    Place,
+    Positive,
+    Section,
+    Utc,
+    require_projected,
+    require_time_pattern,
+    without_required,
+)
 
 
 class StationSection(Section):
@@ -116,7 +72,7 @@ class ScansSection(Section):
     """Where scans arrive and how they are named."""
 
     inbox: Path
-    name: Annotated[str, AfterValidator(_require_time_pattern)] = "%y%m%d_%H%M%S"
+    name: Annotated[str, AfterValidator(require_time_pattern)] = "%y%m%d_%H%M%S"
     frame: Literal["scanner", "map"] = "scanner"
     point_time: Literal["auto", "none"] = "auto"
     intensity: IntensityScale = "auto"
@@ -129,7 +85,7 @@ class ScansSection(Section):
 class ScannerSection(Section):
     """The instrument: a known model; each of its values can be overridden."""
 
-    model_config = ConfigDict(json_schema_extra=_without_required)
+    model_config = ConfigDict(json_schema_extra=without_required)
 
     model: str = "riegl-vz-6000"
     wavelength_um: Annotated[float, Field(ge=0.3, le=2.5)]
@@ -395,6 +351,14 @@ class ProductsSection(Section):
     change_limit_m: Positive | None = None
 
 
+class MirrorSection(Section):
+    """Descriptions of the series for the cloud and for data servers, renewed by the service."""
+
+    folder: Path
+    url: str = ""
+    formats: tuple[Literal["references", "ncml", "erddap"], ...] = ("references", "ncml")
+
+
 class SiteFile(Section):
     """The whole file."""
 
@@ -416,6 +380,7 @@ class SiteFile(Section):
     retention: RetentionSection = RetentionSection()
     service: ServiceSection = ServiceSection()
     products: ProductsSection = ProductsSection()
+    mirror: MirrorSection | None = None
     alarms: AlarmsSection | None = None
 
     @model_validator(mode="after")

@@ -10,7 +10,7 @@ import time
 
 import numpy as np
 import pytest
-from support.series import without_dates
+from support.series import open_with_processing, without_dates
 
 import station
 from station.simulation.station import simulate, small
@@ -126,7 +126,7 @@ def test_station_survives_kills_bad_files_and_late_scans(service):
     assert service.end(signal.SIGTERM) == 0
     assert "Traceback" not in service.log()[logged:], service.log()[-12_000:]
 
-    with station.open(service.folder / "data") as series:
+    with open_with_processing(service.folder / "data") as series:
         assert np.isfinite(series.elevation_change.values).any(axis=(1, 2)).all()
         assert set(series.reference_version.values.tolist()) == {"1", "2"}  # replaced at four scans
         assert "joint" in series.adjustment.values.tolist()
@@ -138,7 +138,7 @@ def test_station_survives_kills_bad_files_and_late_scans(service):
     time.sleep(1.5)
     assert service.end(signal.SIGTERM) == 0
     assert sorted((service.folder / "data" / "epochs").rglob("*.nc")) == files
-    with station.open(service.folder / "data") as series:
+    with open_with_processing(service.folder / "data") as series:
         assert without_dates(series.load()).identical(before)
 
 
@@ -202,8 +202,8 @@ def test_random_kills_lose_no_scan_and_change_no_value(service, tmp_path):
     undisturbed.wait_until(lambda: undisturbed.status()["counts"]["waiting"] == 0)
     assert undisturbed.end(signal.SIGTERM) == 0
     with (
-        station.open(service.folder / "data") as actual,
-        station.open(undisturbed.folder / "data") as expected,
+        open_with_processing(service.folder / "data") as actual,
+        open_with_processing(undisturbed.folder / "data") as expected,
     ):
         for name in set(expected.variables) - {"epoch_file"}:  # the revision may differ
             assert actual[name].identical(expected[name]), f"{name}, seed {seed}"

@@ -7,8 +7,8 @@ import laspy
 import numpy as np
 import pytest
 import xarray as xr
+from support.series import open_with_processing
 
-import station
 from station.config import read_site
 from station.inbox.inbox import ScanFile
 from station.monitoring.log_clock import log_clock_offset
@@ -52,7 +52,7 @@ class ProcessedStation:
         reference_tasks.build_reference_version(self.site, scans[:REFERENCE], "1", lambda: None)
         self.results = [scan_tasks.process(self.site, scan, lambda: None) for scan in scans[first:]]
         store_tasks.update_series(self.site, lambda: None)
-        self.series = station.open(self.site.station.data).load()
+        self.series = open_with_processing(self.site.station.data).load()
         truth = xr.open_dataset(folder / "truth.nc").load()
         before = truth.change[:REFERENCE].mean("time")
         self.true_change = (truth.change[first:] - before).values

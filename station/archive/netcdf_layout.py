@@ -19,6 +19,7 @@ CHUNK = 128  # rows and columns of a chunk
 TIMES_PER_CHUNK = 512  # epochs per chunk of a variable that is small per scan, in a file of many epochs
 CONVENTIONS = "CF-1.11, ACDD-1.3"
 ENCODING = "utf-8"  # of texts; older files declare ascii, a subset
+RENAMED_PARAMETERS = {"refraction_moving": "refraction_ice"}  # older names of shared parameters
 
 
 @dataclass(frozen=True)
@@ -45,6 +46,11 @@ class Series:
     def path(self) -> Path:
         """Path of `series.nc`, the file that users open."""
         return self.folder / "series.nc"
+
+    @property
+    def processing_path(self) -> Path:
+        """Path of `processing.nc`: everything about each scan but the rasters."""
+        return self.folder / "processing.nc"
 
 
 def create_file(
@@ -275,3 +281,8 @@ def decode_text(characters: np.ndarray[Any, Any]) -> list[str]:
     rows = np.ascontiguousarray(characters).view(f"S{characters.shape[-1]}")
     joined_bytes = b"\0".join(rows[:, 0].tolist())
     return joined_bytes.decode(ENCODING, "replace").split("\0") if len(rows) else []  # one call for all
+
+
+def decode_parameters(characters: np.ndarray[Any, Any]) -> list[str]:
+    """Return the names of shared parameters in a file; files of older versions get the names of today."""
+    return [RENAMED_PARAMETERS.get(name, name) for name in decode_text(characters)]

@@ -13,7 +13,13 @@ import netCDF4
 import numpy as np
 
 from station.archive.atomic_files import atomic_write
-from station.archive.netcdf_layout import Series, create_file, create_variable, decode_text
+from station.archive.netcdf_layout import (
+    RENAMED_PARAMETERS,
+    Series,
+    create_file,
+    create_variable,
+    decode_parameters,
+)
 from station.archive.raster_io import LazyRaster, rounded, write_rasters
 from station.archive.schema import FILL, Variable
 from station.errors import StoreError
@@ -267,7 +273,8 @@ def _reference_from_file(file: netCDF4.Dataset, path: Path, series: Series) -> R
     shared = None
     if "parameter_name" in file.variables:
         names, units = (
-            tuple(decode_text(np.ma.getdata(file[name][:]))) for name in ("parameter_name", "parameter_unit")
+            tuple(decode_parameters(np.ma.getdata(file[name][:])))
+            for name in ("parameter_name", "parameter_unit")
         )
         covariance = np.asarray(file["shared_parameter_covariance"][:], dtype=np.float64)
         line_tilt_variance = np.asarray(file["shared_parameter_line_tilt_variance"][:], dtype=np.float64)
@@ -289,12 +296,14 @@ def _reference_from_file(file: netCDF4.Dataset, path: Path, series: Series) -> R
 
 
 def _read_components(file: netCDF4.Dataset) -> VarianceComponents:
-    return VarianceComponents(
-        **{
-            field.name: float(file.getncattr(f"{COMPONENT_PREFIX}{field.name}"))
-            for field in fields(VarianceComponents)
-        }
-    )
+    attributes = set(file.ncattrs())
+    older = {name: old for old, name in RENAMED_PARAMETERS.items()}
+
+    def component(name: str) -> float:
+        stored = f"{COMPONENT_PREFIX}{name}"
+        return float(file.getncattr(stored if stored in attributes else f"{COMPONENT_PREFIX}{older[name]}"))
+
+    return VarianceComponents(**{field.name: component(field.name) for field in fields(VarianceComponents)})
 
 
 def _replace_fill(values: np.ndarray[Any, Any], fill: float = np.nan) -> Floats32:

@@ -15,6 +15,10 @@ VERDICTS = ("good", "degraded", "unusable")
 
 RASTER = ("time", "y", "x")
 TEXT = ("time", "text")
+SERIES_SCALARS = {  # of `series.nc`: what one needs with the rasters; all others are in `processing.nc`
+    "scan_id", "verdict", "verdict_reason", "coverage", "valid_count", "stable_nmad", "air_temperature",
+    "reference_version", "epoch_file",
+}  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -42,8 +46,13 @@ class Variable:
 
     @property
     def is_large(self) -> bool:
-        """True if `series.nc` links to the variable in the epoch files instead of copying it."""
+        """True if `series.nc` and `processing.nc` link to the variable in the epoch files."""
         return len(self.dims) > 2
+
+    @property
+    def is_result(self) -> bool:
+        """True if the variable is in `series.nc`; the others say how a scan was processed."""
+        return self.is_raster or self.name in SERIES_SCALARS
 
 
 _MEAN = "area: mean"

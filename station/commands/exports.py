@@ -77,7 +77,12 @@ def export(
         ),
     ] = None,
     variables: Annotated[
-        str | None, typer.Option(metavar="A,B,…", help="NetCDF, Zarr: only these.", show_default=False)
+        str | None,
+        typer.Option(
+            metavar="A,B,…",
+            help="NetCDF, Zarr: only these; all: those of processing.nc too.",
+            show_default=False,
+        ),
     ] = None,
     chunks: Annotated[
         str | None,

@@ -173,7 +173,7 @@ def serve(
 ) -> None:
     """Serve the station's page on this machine, read-only."""
     from station.config import read_site
-    from station.processing.previews import page_folder
+    from station.processing.epoch_recorder import page_folder
     from station.products.serve import server_for
 
     serve_page = server_for(page_folder(read_site(site)), port)

@@ -6,6 +6,7 @@ import h5py
 import numpy as np
 
 from station.archive.schema import FILL
+from station.archive.series.index import processing_file
 from station.config import Site
 from station.errors import StoreError
 from station.processing.scan_tasks import series_for
@@ -22,7 +23,7 @@ def log_clock_offset(site: Site) -> str:
 
     The offset of each log is estimated from the ground. Raises StoreError if the series cannot be read.
     """
-    path = series_for(site).path
+    path = processing_file(series_for(site))
     names = ("log_clock_offset", "log_clock_offset_uncertainty")
     try:
         with h5py.File(path, "r") as file:

@@ -13,6 +13,7 @@ import numpy as np
 from station.archive.netcdf_layout import Series, decode_text
 from station.archive.reference_files import read_variance_components
 from station.archive.schema import VERDICTS
+from station.archive.series.index import processing_file
 from station.config import Site
 from station.errors import StoreError
 from station.processing.scan_tasks import series_for
@@ -62,8 +63,9 @@ def step_shown_by(site: Site, start_utc_s: float | None) -> tuple[str, str]:
 
 def _read_poses(series: Series) -> tuple[Floats, Floats]:
     """Return start [s] (n,) and pose (n, 6) of the newest comparable scans."""
+    path = processing_file(series)
     try:
-        with h5py.File(series.path, "r") as file:
+        with h5py.File(path, "r") as file:
             if "shared_parameter" not in file:
                 return np.empty(0), np.empty((0, len(POSE_PARAMETERS)))
             rows = slice(-MAX_SCANS, None)
@@ -76,7 +78,7 @@ def _read_poses(series: Series) -> tuple[Floats, Floats]:
                 file["verdict"][rows] != VERDICTS.index("unusable")
             )
     except (OSError, RuntimeError, IndexError, ValueError) as error:
-        raise StoreError(f"{series.path}: cannot be read: {error}") from error
+        raise StoreError(f"{path}: cannot be read: {error}") from error
     comparable &= np.all(np.abs(pose) < 1e3, axis=1)  # excludes netCDF's fill value
     if comparable.any():
         comparable &= sop == sop[comparable][-1]

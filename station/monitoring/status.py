@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from station.config import Site
 
 MAX_LISTED = 50  # scans of a kind, in the text
+MIRROR_FAULT = ".mirror_fault"  # file in the data folder: why the mirror could not be renewed
 Status = dict[str, Any]  # printed by `station status --json`
 
 
@@ -88,6 +89,7 @@ def _queue_status(site: Site, journal: Journal) -> Status:
         clock_problem(site.station.data, time.time()),
         *site.input_faults,
         weather_fault(site),
+        _mirror_fault(site),
         pause_reason(site.station.data),
     )
     return {
@@ -95,6 +97,15 @@ def _queue_status(site: Site, journal: Journal) -> Status:
         "set_aside": set_aside,
         "faults": [*dict.fromkeys(fault for fault in faults if fault)],
     }
+
+
+def _mirror_fault(site: Site) -> str:
+    """Return why the service could not renew the mirror; '' if it could, or there is none."""
+    try:
+        fault = (site.station.data / MIRROR_FAULT).read_text(encoding="utf-8") if site.mirror else ""
+    except (OSError, ValueError):
+        return ""
+    return fault and f"the mirror is not up to date: {fault}"
 
 
 def _service_state(data: Path) -> str:

@@ -282,10 +282,12 @@ def _check_series(series: Series, refs: list[EpochRef], *, is_complete: bool) ->
     """Return findings if `series.nc` does not contain the stored epochs in order of time."""
     if not refs:
         return []
-    if not series.path.is_file():
-        return [("fault", "series", "series.nc is missing: the service rebuilds it when it starts")]
+    for path in (series.path, series.processing_path):
+        if not path.is_file():
+            return [("fault", "series", f"{path.name} is missing: the service rebuilds it when it starts")]
     if not is_intact(series):
-        return [("fault", "series", "series.nc is damaged: the service rebuilds it with the next scan")]
+        what = "series.nc or processing.nc is damaged"
+        return [("fault", "series", f"{what}: the service rebuilds both with the next scan")]
     try:
         missing = [path for path in source_files(series.path) if not path.is_file()]
         with h5py.File(series.path, "r") as file:

@@ -26,6 +26,7 @@ from station.errors import ScanError
 from station.inbox.file_hash import hash_if_unchanged, sha256_file
 from station.inbox.inbox import ScanFile
 from station.inbox.journal import Journal
+from station.processing.epoch_recorder import EpochRecorder
 from station.processing.isolation import trim_heap
 from station.processing.pipeline import (
     AdjustmentInputs,
@@ -40,7 +41,6 @@ from station.processing.pipeline import (
     usual_motion,
     variance_factors,
 )
-from station.processing.previews import PreviewRecorder
 from station.processing.scan_inputs import ScanInputs, load_scan_inputs
 from station.processing.usable_inputs import usable_site
 from station.products.overview import Overview
@@ -194,8 +194,10 @@ def process(
     if not history.revision:
         _require_new_start(site, epoch.start_s)
     version, epoch_file = epoch.provenance["reference_version"], _identical_epoch(series, epoch)
-    preview = PreviewRecorder(site, series, version if with_preview and epoch_file is None else "")
-    epoch_file = epoch_file or epochs.write_epoch(series, epoch, history.revision, preview.add)
+    recorder = EpochRecorder(site, series, "" if epoch_file else version, with_preview=with_preview)
+    if epoch_file is None:
+        epoch_file = epochs.write_epoch(series, epoch, history.revision, recorder.add)
+        recorder.keep_sums(epoch_file.path)
     return StoredResult(
         start_utc_s=epoch.start_s,
         sha256=scan_sha256,
@@ -207,7 +209,7 @@ def process(
         metrics=_log_metrics(epoch, time.monotonic() - began_s),
         log_sha256=epoch.provenance["log_sha256"],
         epoch_sha256=sha256_file(epoch_file.path),
-        overview=preview.overview,
+        overview=recorder.overview,
     )
 
 

@@ -14,6 +14,7 @@ from station.archive.areas import AREA_VARIABLES
 from station.archive.chunk_codec import read_column
 from station.archive.netcdf_layout import Series, decode_text
 from station.archive.schema import FILL, VERDICTS
+from station.archive.series.index import processing_file
 from station.errors import StoreError
 from station.quantities import Floats
 
@@ -51,9 +52,10 @@ class AreaSeries:
 
 
 def read_epoch_table(series: Series) -> EpochTable:
-    """Return the epoch table of `series.nc`; raise StoreError if it cannot be read."""
+    """Return the epoch table of `processing.nc`; raise StoreError if it cannot be read."""
+    path = processing_file(series)
     try:
-        with h5py.File(series.path, "r") as file:
+        with h5py.File(path, "r") as file:
             bounds_s = np.asarray(file["time_bnds"][:], dtype=np.float64)
             return EpochTable(
                 start_s=bounds_s[:, 0],
@@ -63,7 +65,7 @@ def read_epoch_table(series: Series) -> EpochTable:
                 texts={name: decode_text(read_column(file[name])) for name in TEXT_VARIABLES},
             )
     except (OSError, RuntimeError, KeyError, IndexError, ValueError, IsalError) as error:  # type: ignore[misc] # the stub has no class
-        raise StoreError(f"{series.path}: cannot be read: {error}") from error
+        raise StoreError(f"{path}: cannot be read: {error}") from error
 
 
 def read_area_series(series: Series) -> list[AreaSeries]:

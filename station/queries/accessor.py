@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import cached_property
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -12,9 +13,10 @@ import shapely
 import xarray as xr
 
 from station.archive.epochs import EpochRef
-from station.archive.series.index import list_epochs, series_in
+from station.archive.series.index import list_epochs, processing_file, series_in
+from station.archive.series.lazy import open_virtual
 from station.errors import StationError
-from station.queries.aggregates import CHANGE, RANDOM
+from station.queries.epoch_cells import CHANGE, RANDOM
 from station.queries.grid_arrays import to_grid, to_mask
 from station.queries.volumes import Volumes
 
@@ -34,13 +36,31 @@ class StationAccessor:
 
     @cached_property
     def _volumes(self) -> Volumes:
+        return Volumes(series_in(self._store))
+
+    @cached_property
+    def _store(self) -> Path:
+        """Folder of the store; raises StationError if the dataset was not read from `series.nc`."""
         source = self._ds.encoding.get("source")
         if source is None:
             raise StationError(
                 "this dataset does not know its store: use ds.station on what station.open returned, or on a"
                 " selection of it; or call station.variance(folder, ...)"
             )
-        return Volumes(series_in(source))
+        if Path(source).name != "series.nc":
+            raise StationError(
+                f"{source}: has neither the reference surface nor the covariances from which the variance of"
+                " a sum follows: use ds.station on station.open(folder of the station), or call"
+                " station.variance(folder, weights, ds.time[0]); boxes.nc and daily.nc have the uncertainty"
+                " of blocks, and the comment of elevation_change_uncertainty a safe bound"
+            )
+        return Path(source).parent
+
+    @property
+    def processing(self) -> xr.Dataset:
+        """How the epochs of the dataset were processed, lazily: the content of `processing.nc`."""
+        path = processing_file(series_in(self._store))
+        return open_virtual(path).sel(time=self._ds["time"])
 
     def variance(self, weights: npt.ArrayLike | xr.DataArray) -> xr.DataArray:
         """Return the variance of a weighted sum of elevation change in each epoch [m² times squared weights].

@@ -2,85 +2,38 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from dataclasses import replace
+from typing import TYPE_CHECKING
 
 import netCDF4
 import numpy as np
 
 from station.archive.areas import AreaChange
 from station.archive.epochs import EpochRef
-from station.archive.netcdf_layout import Series, decode_text
-from station.archive.raster_io import bounding_slices
-from station.archive.reference_files import open_reference
-from station.archive.series.index import list_epochs, nearest_epoch
-from station.errors import StationError, StoreError
-from station.quantities import Bools, ChangeErrors, Floats, Grid, Quality, Reals, Reference, SharedParameters
-from station.queries.grid_arrays import to_index_or_time
+from station.archive.netcdf_layout import Series
+from station.quantities import Bools, Floats, Grid, Quality, Reals
+from station.queries.epoch_cells import CHANGE, RANDOM, EpochCells, EpochReader, bounding_box, read_cells_of
 from station.science.adjustment import ground_classes
 from station.science.adjustment.leverage import leverage
 from station.science.analysis.voids import area_weights, void_variance
 from station.science.geometry.terrain import smooth_gradient
 from station.science.uncertainty.common_mode import cross_covariance
 from station.science.uncertainty.jacobian import HeightJacobian, cell_jacobian
-from station.science.uncertainty.parameters import ParameterLayout, parameter_layout
-from station.science.uncertainty.propagation import aggregate_variance, align_to, difference_to_reference
+from station.science.uncertainty.propagation import aggregate_variance, difference_to_reference
 
 if TYPE_CHECKING:
     import xarray as xr
 
-    from station.queries.grid_arrays import Epoch
-
 MARGIN_CELLS = 6  # reach of the smoothed gradient around a cell
-CHANGE, RANDOM = "elevation_change", "elevation_change_random_uncertainty"
 
 
-@dataclass(frozen=True)
-class EpochCells:
-    """Data of an epoch at some cells (n,), and the error parameters they share."""
-
-    change_m: Floats
-    random_m: Floats
-    shared: SharedParameters | None
-    scanner: tuple[float, ...]  # position [m], east and north component of the rotation axis
-    reference: Reference
-    adjusted: bool  # to the reference; `shared` is then relative to it
-    epoch: EpochRef
-
-
-class Aggregates:
+class Aggregates(EpochReader):
     """Means and variances over cells of the epochs of a store."""
 
     def __init__(self, series: Series) -> None:
-        self.series = series
-        self.grid = series.grid
-        self._references: dict[str | None, Reference] = {}
-        # Of the last cells, reused by the median; and of the last epoch: its areas are queried one by one.
+        super().__init__(series)
+        # Of the last cells, reused by the median.
         self._jacobian_cache: tuple[EpochCells, Bools, HeightJacobian] | None = None
-        self._shared_cache: tuple[EpochRef, SharedParameters] | None = None
-
-    def reference(self, version: str | None = None) -> Reference:
-        """Return the newest reference surface or a version; raise StoreError if there is none."""
-        if version not in self._references:
-            reference = open_reference(self.series, version)
-            if reference is None:
-                raise StoreError(f"{self.series.folder}: no reference {version or 'yet'}: no change")
-            self._references[version] = reference
-        return self._references[version]
-
-    def find_epoch(self, epoch: Epoch) -> EpochRef:
-        """Return the epoch at an index in the series, or the nearest one within 12 h of a time (UTC).
-
-        Raises StationError if there is none, ValueError if `epoch` is neither.
-        """
-        epochs, wanted = list_epochs(self.series), to_index_or_time(epoch)
-        if not epochs:
-            raise StoreError(f"{self.series.folder}: nothing is stored yet")
-        if not isinstance(wanted, int):
-            return nearest_epoch(epochs, float((wanted - np.datetime64(0, "s")) / np.timedelta64(1, "s")))
-        if not -len(epochs) <= wanted < len(epochs):
-            raise StationError(f"no epoch {wanted}: the series has {len(epochs)}")
-        return epochs[wanted]
 
     def variance(self, weights: Floats | Bools, epoch: EpochRef, other: EpochRef | None = None) -> float:
         """Return the variance of the weighted sum of change [m² times squared weights].
@@ -114,7 +67,7 @@ class Aggregates:
         """
         epochs = self._read_epochs(cells, epoch, other)
         common_cells = observed_in_all(epochs, cells)
-        bounds = _bounding_box(cells, 0)
+        bounds = bounding_box(cells, 0)
         observed = common_cells[bounds][cells[bounds]]
         if not observed.any():
             return AreaChange(np.nan, np.nan, np.nan, np.nan, 0.0)
@@ -313,7 +266,7 @@ class Aggregates:
     def _compute_jacobian(self, epoch_cells: EpochCells, cells: Bools) -> HeightJacobian:
         grid, elevation_m = self.grid, epoch_cells.reference.elevation_m
         params, position_m = self.parameter_layout_of(epoch_cells.scanner)
-        rows, columns = _bounding_box(cells, MARGIN_CELLS)
+        rows, columns = bounding_box(cells, MARGIN_CELLS)
         corner_m = grid.west_m + columns.start * grid.cell_m, grid.north_m - rows.start * grid.cell_m
         window_m = elevation_m[rows, columns]
         window_grid = Grid(*corner_m, grid.cell_m, window_m.shape[1], window_m.shape[0])
@@ -321,61 +274,7 @@ class Aggregates:
         rock = _has_quality(epoch_cells.epoch, cells, Quality.STABLE_GROUND | Quality.BARE_GROUND)
         return cell_jacobian(params, window_grid, position_m, window_m, gradient, cells[rows, columns], rock)
 
-    def read_cells(self, epoch: EpochRef, cells: Bools) -> EpochCells:
-        """Return the data of an epoch at the selected cells (ny, nx); raise ValueError on another grid."""
-        if cells.shape != self.grid.shape:
-            raise ValueError(f"the array has shape {cells.shape}, the grid {self.grid.shape}")
-        with netCDF4.Dataset(epoch.path) as file:
-            reference = self.reference(str(file["reference_version"][epoch.index]))
-            change_m, random_m = (read_cells_of(file[name], epoch.index, cells) for name in (CHANGE, RANDOM))
-            scanner = tuple(
-                float(np.ma.filled(file[name][epoch.index], np.nan)) for name in SCANNER_VARIABLES
-            )
-            adjusted = str(file["adjustment"][epoch.index]) == "joint"
-            shared = self._read_shared(file, epoch, scanner)
-        return EpochCells(change_m, random_m, shared, scanner, reference, adjusted, epoch)
 
-    def _read_shared(
-        self, file: netCDF4.Dataset, epoch: EpochRef, scanner: tuple[float, ...]
-    ) -> SharedParameters | None:
-        """Return the shared parameters of an epoch; None if the file does not contain them."""
-        if "parameter_name" not in file.variables or not np.isfinite(scanner).all():
-            return None
-        if self._shared_cache is None or self._shared_cache[0] != epoch:
-            file.set_auto_chartostring(False)
-            names, units = (tuple(decode_text(np.ma.getdata(file[name][:]))) for name in PARAMETER_VARIABLES)
-            estimate, covariance, line_tilt_variance, *change_fields = (
-                np.ma.filled(file[name][epoch.index].astype(np.float64), 0.0)  # 0 where not this epoch's
-                for name in (
-                    *SHARED_VARIABLES,
-                    *(CHANGE_ERROR_VARIABLES if set(CHANGE_ERROR_VARIABLES) <= set(file.variables) else ()),
-                )
-            )
-            change_errors = ChangeErrors(*change_fields) if change_fields else None
-            shared = SharedParameters(names, units, estimate, covariance, line_tilt_variance, change_errors)
-            self._shared_cache = epoch, align_to(self.parameter_layout_of(scanner)[0], shared)
-        return self._shared_cache[1]
-
-    def parameter_layout_of(
-        self, scanner: tuple[float, ...]
-    ) -> tuple[ParameterLayout, tuple[float, float, float]]:
-        """Return parameter layout and position [m] of a scanner."""
-        east_m, north_m, height_m, axis_east, axis_north = scanner
-        axis_up = float(np.sqrt(max(1 - axis_east**2 - axis_north**2, 0.0)))
-        position_m = east_m, north_m, height_m
-        return parameter_layout(self.grid, position_m, (axis_east, axis_north, axis_up)), position_m
-
-
-SCANNER_VARIABLES = (
-    "scanner_east",
-    "scanner_north",
-    "scanner_height",
-    "scanner_axis_east",
-    "scanner_axis_north",
-)
-PARAMETER_VARIABLES = ("parameter_name", "parameter_unit")
-SHARED_VARIABLES = ("shared_parameter", "shared_parameter_covariance", "shared_parameter_line_tilt_variance")
-CHANGE_ERROR_VARIABLES = ("change_errors", "change_pattern")  # in the order of the fields of `ChangeErrors`
 LEVERAGE_VARIABLES = ("adjustment_leverage_moving", "adjustment_leverage_stable")
 
 
@@ -396,7 +295,7 @@ def common_error_covariance(epochs: list[EpochCells]) -> Floats | None:
 
 def observed_in_all(epochs: list[EpochCells], cells: Bools) -> Bools:
     """Return the mask (ny, nx) of the cells with a change and a reference in every epoch."""
-    observed, bounds = np.zeros(cells.shape, np.bool_), _bounding_box(cells, 0)
+    observed, bounds = np.zeros(cells.shape, np.bool_), bounding_box(cells, 0)
     observed[bounds][cells[bounds]] = np.logical_and.reduce(
         [
             np.isfinite(epoch_cells.change_m) & np.isfinite(epoch_cells.reference.elevation_m[cells])
@@ -411,21 +310,3 @@ def _has_quality(epoch: EpochRef, cells: Bools, flags: Quality) -> Bools:
     with netCDF4.Dataset(epoch.path) as file:
         quality = read_cells_of(file["quality"], epoch.index, cells).astype(np.int64)
     return np.asarray((quality & flags) > 0)
-
-
-def read_cells_of(variable: Any, index: int, cells: Bools) -> Floats:  # noqa: ANN401 - netCDF4 has no types
-    """Return the selected cells (n,) of a raster; only their bounding box is read."""
-    if not cells.any():
-        return np.empty(0)
-    bounds = _bounding_box(cells, 0)
-    values = np.ma.filled(variable[(index, *bounds)].astype(np.float64), np.nan)
-    return np.asarray(values[cells[bounds]])
-
-
-def _bounding_box(cells: Bools, margin: int) -> tuple[slice, slice]:
-    """Return the rows and columns that bound the selected cells (ny, nx), extended by a margin."""
-    rows, columns = bounding_slices(cells)
-    return (
-        slice(max(rows.start - margin, 0), rows.stop + margin),
-        slice(max(columns.start - margin, 0), columns.stop + margin),
-    )

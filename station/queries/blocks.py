@@ -19,7 +19,6 @@ from scipy import sparse
 from station.archive.chunk_codec import read_column
 from station.archive.derived.boxes import (
     BOX_M,
-    DAILY_BLOCK_M,
     Entries,
     Rasters,
     box_file,
@@ -27,12 +26,12 @@ from station.archive.derived.boxes import (
     update_blocks,
 )
 from station.archive.epochs import EpochRef
-from station.archive.netcdf_layout import CHUNK, Series
-from station.archive.raster_io import LazyRaster
-from station.archive.schema import FILL, VERDICTS
+from station.archive.netcdf_layout import Series
+from station.archive.schema import VERDICTS
 from station.archive.series.index import SeriesIndex
-from station.quantities import Bools, Floats, Ints, Quality, SharedParameters
-from station.queries.aggregates import CHANGE, RANDOM, Aggregates, EpochCells
+from station.quantities import Bools, Floats, Ints, Reference, SharedParameters
+from station.queries.block_sums import Sums, cells_per_block, drop_epoch_sums, epoch_sums, reference_sums
+from station.queries.epoch_cells import CHANGE, RANDOM, EpochCells, EpochReader
 from station.science.analysis.calibration import SparseJacobian
 from station.science.geometry.terrain import GRADIENT_CELLS, smooth_gradient
 from station.science.uncertainty.common_mode import cross_covariance
@@ -40,7 +39,6 @@ from station.science.uncertainty.jacobian import HeightJacobian, height_jacobian
 from station.science.uncertainty.propagation import difference_to_reference
 
 DAY_S = 86_400.0
-ROCK = int(Quality.STABLE_GROUND | Quality.BARE_GROUND)
 MIN_GRADIENT_BLOCKS = 0.5  # one sigma of the Gaussian
 
 
@@ -51,7 +49,7 @@ class Blocks:
     count: Floats  # cells with a change
     change_m: Floats
     random_m2: Floats  # variance of the mean
-    reference_m2: Floats  # the part of it that comes from the reference
+    reference_m2: Floats  # the part of it that comes from the reference, at the mean of its known cells
     jacobian: HeightJacobian | None  # of the observed blocks; None if the epoch has no shared parameters
     cells: EpochCells  # without cells: the shared parameters
 
@@ -76,8 +74,9 @@ class BlockQueries:
     """Blocks of about 10 m, and boxes of about 100 m made of them, of the epochs of a store."""
 
     def __init__(self, series: Series) -> None:
-        self._aggregates, self._grid = Aggregates(series), series.grid
-        self.cells = max(round(DAILY_BLOCK_M / series.grid.cell_m), 1)  # rows and columns of a block
+        self._reader, self._series = EpochReader(series), series
+        self._surfaces: dict[str, Sums] = {}  # by version of the reference
+        self.cells = cells_per_block(series.grid)  # rows and columns of a block
         self.blocks_per_box = max(round(BOX_M / (self.cells * series.grid.cell_m)), 1)
 
     def boxes(self, epoch: EpochRef) -> Rasters:
@@ -140,62 +139,39 @@ class BlockQueries:
         }
 
     def _read(self, epoch: EpochRef) -> Blocks:
-        """Return the blocks of an epoch; its rasters are read band by band."""
-        epoch_cells = self._aggregates.read_cells(epoch, np.zeros(self._grid.shape, np.bool_))
-        sums = self._sums(epoch, epoch_cells)
-        count = np.maximum(sums["count"], 1)
-        change_m, random_m2, reference_m2 = (
-            sums[name] / divisor
-            for name, divisor in (("change_m", count), ("random_m2", count**2), ("reference_m2", count**2))
+        """Return the blocks of an epoch."""
+        epoch_cells = self._reader.read_shared(epoch)
+        sums, surface = epoch_sums(self._series, epoch), self._reference_sums(epoch_cells.reference)
+        count, known = np.maximum(sums["count"], 1), np.maximum(surface["known"], 1)
+        observed = (sums["count"] > 0) & (surface["known"] > 0)
+        jacobian = None
+        if epoch_cells.shared is not None:
+            jacobian = self._jacobian(epoch_cells, sums, surface, observed)
+        random_m2 = sums["random_m2"] / count**2
+        return Blocks(
+            np.where(observed, sums["count"], 0.0),
+            np.where(observed, sums["change_m"] / count, 0.0),
+            np.where(observed, random_m2, 0.0),
+            np.where(observed, np.minimum(surface["random_m2"] / known / count, random_m2), 0.0),
+            jacobian,
+            epoch_cells,
         )
-        jacobian = self._jacobian(epoch_cells, sums) if epoch_cells.shared is not None else None
-        return Blocks(sums["count"], change_m, random_m2, reference_m2, jacobian, epoch_cells)
 
-    def _sums(self, epoch: EpochRef, epoch_cells: EpochCells) -> dict[str, Floats]:
-        """Return sums (by, bx) over the cells of each block that have a change, and over those known."""
-        change, random, quality = (
-            LazyRaster(epoch.path, name, index=epoch.index) for name in (CHANGE, RANDOM, "quality")
-        )
-        reference, grid = epoch_cells.reference, self._grid
-        height = -(-CHUNK // self.cells) * self.cells
-        columns = np.arange(grid.nx) // self.cells
-        width = int(columns[-1]) + 1
-        bands: list[dict[str, Floats]] = []
-        for top in range(0, grid.ny, height):
-            rows = slice(top, min(top + height, grid.ny))
-            blocks = -(-(rows.stop - top) // self.cells), width
-            reference_m = np.asarray(reference.elevation_m[rows])
-            known = np.flatnonzero(np.isfinite(reference_m))
-            block = np.add.outer(np.arange(rows.stop - top) // self.cells * width, columns).ravel()[known]
-            change_m = np.asarray(change[rows]).ravel()[known]
-            observed = change_m < FILL / 2
-            cell, block_observed = known[observed], block[observed]
-            row, column = np.divmod(cell, grid.nx)
-            fields = {
-                "count": None,
-                "change_m": change_m[observed],
-                "random_m2": np.asarray(random[rows]).ravel()[cell].astype(np.float64) ** 2,
-                "reference_m2": np.asarray(reference.random_variance_m2[rows]).ravel()[cell],
-                "rock": (np.asarray(quality[rows]).ravel()[cell] & ROCK) > 0,
-                "x_m": grid.x_m[column],
-                "y_m": grid.y_m[rows][row],
-            }
-            size = blocks[0] * width
-            sums = {name: np.bincount(block_observed, values, size) for name, values in fields.items()}
-            sums["known"] = np.bincount(block, minlength=size)
-            sums["reference_m"] = np.bincount(block, reference_m.ravel()[known], size)
-            bands.append({name: values.astype(np.float64).reshape(blocks) for name, values in sums.items()})
-        return {name: np.concatenate([band[name] for band in bands]) for name in bands[0]}
+    def _reference_sums(self, reference: Reference) -> Sums:
+        if reference.version not in self._surfaces:
+            self._surfaces[reference.version] = reference_sums(self._series, reference)
+        return self._surfaces[reference.version]
 
-    def _jacobian(self, epoch_cells: EpochCells, sums: dict[str, Floats]) -> HeightJacobian:
+    def _jacobian(
+        self, epoch_cells: EpochCells, sums: Sums, surface: Sums, observed: Bools
+    ) -> HeightJacobian:
         """Return the Jacobian of the mean surfaces of the observed blocks."""
-        observed = sums["count"] > 0
         with np.errstate(invalid="ignore"):
-            surface_m = sums["reference_m"] / sums["known"]
-        block_m = self.cells * self._grid.cell_m
+            surface_m = surface["surface_m"] / surface["known"]
+        block_m = self.cells * self._series.grid.cell_m
         gradient = smooth_gradient(surface_m, block_m, max(GRADIENT_CELLS / self.cells, MIN_GRADIENT_BLOCKS))
         east, north = (np.nan_to_num(component[observed].astype(np.float64)) for component in gradient)
-        params, position_m = self._aggregates.parameter_layout_of(epoch_cells.scanner)
+        params, position_m = self._reader.parameter_layout_of(epoch_cells.scanner)
         count = sums["count"][observed]
         offset_m = (
             sums["x_m"][observed] / count - position_m[0],
@@ -269,6 +245,8 @@ def update_boxes(series: Series, queries: BlockQueries, progress: Callable[[], N
         lambda entry: queries.daily_mean([index[position] for position in days[entry].tolist()]),
         progress,
     )
+    last_day = np.flatnonzero(start_s // DAY_S == start_s[-1] // DAY_S).tolist()
+    drop_epoch_sums(series, {index[position].epoch_file for position in last_day})
 
 
 def _closed_days(

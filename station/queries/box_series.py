@@ -15,7 +15,8 @@ from scipy import sparse
 from station.archive.epochs import EpochRef
 from station.archive.netcdf_layout import Series
 from station.quantities import Bools, Grid, Ints
-from station.queries.aggregates import Aggregates, EpochCells
+from station.queries.aggregates import Aggregates
+from station.queries.epoch_cells import EpochCells
 from station.queries.stable_ground import sample_epochs
 from station.science.analysis.calibration import SparseJacobian, group_means, renormalise
 from station.science.geometry.observation import Observation

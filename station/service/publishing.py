@@ -12,7 +12,7 @@ from station.inbox.journal import Journal
 from station.monitoring.log_clock import log_clock_offset
 from station.monitoring.pose_stability import step_shown_by
 from station.monitoring.status import queue_status
-from station.processing.previews import page_folder
+from station.processing.epoch_recorder import page_folder
 from station.processing.scan_tasks import Progress, StoredResult, series_for
 from station.products.export import export
 from station.products.page import PageContext, write_page

@@ -66,6 +66,7 @@ from station.processing.store_tasks import (
 from station.processing.usable_inputs import with_usable_inputs
 from station.science.geometry.pose import horizontal_crs, is_same_map
 from station.service.background_compaction import BackgroundCompaction
+from station.service.mirror import BackgroundMirror, record_mirror_fault
 from station.service.publishing import publish
 from station.service.retention import apply_retention, expired_scans
 
@@ -110,6 +111,8 @@ class Worker:
         self._reported_outdated = 0
         self._reported_faults: tuple[str, ...] = ()
         self._compaction = BackgroundCompaction(site, on_compacted)
+        self._mirror = BackgroundMirror(site)
+        self._mirror_is_due, self._mirror_fault = site.mirror is not None, ""
 
     def process(self, scan: ScanFile, *, ahead: bool = False) -> bool:
         """Measure and store a scan, record it in journal and log; return True if it is stored.
@@ -151,6 +154,7 @@ class Worker:
         if isinstance(result, Duplicate):
             return self._record_duplicate(scan, result)
         uncompacted = self._with_repair(update_series)
+        self._mirror_is_due = self._site.mirror is not None
         record_result(self._journal, scan.name, result, ahead=ahead)
         _log_result(scan.name, result)
         self.publish(scan.name, result)
@@ -223,13 +227,29 @@ class Worker:
             self._record_compacted(checksums)
 
     def close(self) -> None:
-        """Stop background compaction."""
+        """Stop background compaction and the renewal of the mirror."""
         self._compaction.close()
+        self._mirror.close()
+
+    def update_mirror(self) -> None:
+        """Renew the mirror in the background if the series has changed; a fault is only logged, once."""
+        fault = self._mirror.result()
+        if fault is not None and fault != self._mirror_fault:
+            if fault:
+                log.warning("%s", logfmt(mirror="failed", reason=fault))
+            else:
+                log.info("%s", logfmt(mirror="renewed"))
+            self._mirror_fault = fault
+        if fault is not None:
+            record_mirror_fault(self._site.station.data, fault)
+        if self._mirror_is_due and self._series.path.is_file() and self._mirror.start():
+            self._mirror_is_due = False
 
     def _record_compacted(self, checksums: Checksums) -> None:
         if checksums:
             self._journal.add_checksums(checksums)
             self._with_repair(update_series)
+            self._mirror_is_due = self._site.mirror is not None
         self._write_digest()
 
     def _write_digest(self) -> None:
@@ -247,6 +267,7 @@ class Worker:
         """
         if holds_epochs(self._series):
             self._with_repair(update_series)
+            self._mirror_is_due = self._site.mirror is not None  # a fault may have gone
         self._journal.drop_checksums(self._with_repair(delete_expired))
         affected = self._with_repair(late_inputs, self._journal.rows(State.STORED))
         names = [name for name in affected if (self._site.scans.inbox / name).is_file()]

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import xarray as xr
 from support.epochs import GRID, make_epoch
-from support.series import without_dates
+from support.series import open_with_processing, without_dates
 
 import station
 from station.archive import epochs
@@ -32,7 +32,7 @@ def compact_and_build(series, now, progress=lambda: None):
 
 
 def values(series):
-    with station.open(series.folder) as dataset:
+    with open_with_processing(series.folder) as dataset:
         return without_dates(dataset.load())
 
 

@@ -45,7 +45,8 @@ def built(series, epoch):
 
 def test_compliance_checker_accepts_epoch_series_and_reference(built, tmp_path):
     epoch = built.parent / "epochs/2025/11/21/hef_20251121T010000Z.nc"
-    assert findings(tmp_path / "report.json", built, built.parent / "reference.nc", epoch) == []
+    beside = (built.parent / name for name in ("processing.nc", "reference.nc"))
+    assert findings(tmp_path / "report.json", built, *beside, epoch) == []
 
 
 def test_data_discovery_checker_misses_only_what_is_not_computed(series, epoch, tmp_path):

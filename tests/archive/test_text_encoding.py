@@ -59,8 +59,8 @@ def test_ascii_texts_of_older_files_are_decoded():
 def test_epochs_and_series_return_the_texts_also_after_compaction(built, series):
     with station.open(series.folder) as ds:
         assert ds.verdict_reason.values.tolist() == ["", TEXT]
-        assert ds.sop_id.values.tolist() == ["sop-1", "Sommer-Größe"]
-    for path in (built, epochs.epoch_files(series)[1].path):
+        assert ds.station.processing.sop_id.values.tolist() == ["sop-1", "Sommer-Größe"]
+    for path in (built.with_name("processing.nc"), epochs.epoch_files(series)[1].path):
         assert epochs.read_provenance(path)["verdict_reason"] in ("", TEXT)
         with netCDF4.Dataset(path) as file:
             assert file["scan_id"]._Encoding == "utf-8"

@@ -480,7 +480,7 @@ class World:
             if row.state is State.STORED and name not in self.names
         ]
         defects += [line for line in self.log if "a bug" in line]
-        for file in ("series.nc", "areas.nc"):
+        for file in ("series.nc", "processing.nc", "areas.nc"):
             try:
                 actual, expected = values(self.data / file), values(undisturbed.data / file)
             except (OSError, RuntimeError) as error:

@@ -284,6 +284,7 @@ class Soak:
     def fault_derived_damaged(self):
         derived = [
             "series.nc",
+            "processing.nc",
             "areas.nc",
             *(f"sop_tilt_offset/{p.name}" for p in self.station.data.glob("sop*/*")),
         ]

@@ -12,9 +12,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import xarray as xr
-from support.series import without_dates
+from support.series import open_with_processing, without_dates
 
-import station
 from station.archive.reference_files import read_reference_provenance
 from station.config import read_site
 from station.errors import ConfigError, NotReadyError
@@ -66,7 +65,7 @@ def edited_site(folder, *changes, more=""):
 
 
 def read_series(folder):
-    with station.open(folder / "data") as series:
+    with open_with_processing(folder / "data") as series:
         return without_dates(series.load())
 
 

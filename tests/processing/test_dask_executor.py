@@ -4,9 +4,8 @@ import shutil
 from dataclasses import replace
 
 import pytest
-from support.series import without_dates
+from support.series import open_with_processing, without_dates
 
-import station
 from station.config import read_site
 from station.errors import ConfigError, NotReadyError
 from station.operations.batch import process_scans
@@ -38,7 +37,7 @@ def processed(tmp_path_factory):
 
 
 def read_series(folder):
-    with station.open(folder / "data") as series:
+    with open_with_processing(folder / "data") as series:
         return without_dates(series.load())
 
 

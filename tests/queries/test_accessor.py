@@ -14,6 +14,7 @@ from station.archive.areas import update_areas
 from station.archive.epochs import write_epoch
 from station.archive.netcdf_layout import Series
 from station.archive.reference_files import write_reference
+from station.archive.series.index import series_in
 from station.archive.series.virtual import build_series
 from station.errors import StationError
 from station.quantities import Reference
@@ -42,6 +43,37 @@ def folder(tmp_path_factory):
 def ds(folder):
     with station.open(folder) as ds:
         yield ds
+
+
+def test_the_series_has_the_results_and_the_accessor_how_they_were_computed(ds):
+    assert set(ds.data_vars) == {
+        "elevation", "elevation_change", "elevation_change_uncertainty",
+        "elevation_change_random_uncertainty", "elevation_spread", "point_count", "quality", "scan_id",
+        "verdict", "verdict_reason", "coverage", "valid_count", "stable_nmad", "air_temperature",
+        "reference_version", "epoch_file",
+    }  # fmt: skip
+    assert set(ds.dims) == {"time", "y", "x", "bnds"}
+    processing = ds.isel(time=[3, 1]).station.processing
+    assert processing.change_errors[:, 0, 0].values == pytest.approx([5e-6, 1e-6])
+    assert processing.sop_id.values.tolist() == ["sop-1"] * 2
+    assert (processing.time == ds.time[[3, 1]]).all()
+
+
+@pytest.mark.parametrize("variables", [None, "all"])
+def test_an_export_says_where_its_variances_are(folder, tmp_path, variables):
+    from station.products.area_tables import Span
+    from station.products.exports.formats import FORMATS
+    from station.products.exports.selection import select, split
+
+    selection = select(series_in(folder), Span.parse(None, None), variables=variables)
+    parts = split(selection, tmp_path / "all.nc", ".nc", None)
+    (path,) = FORMATS["netcdf"].write(selection, parts, lambda _: None, lambda _: None)
+    with xr.open_dataset(path) as exported:
+        with pytest.raises(StationError, match=r"all\.nc: has neither .* station\.variance\(folder, weights"):
+            exported.station.variance(np.ones(GRID.shape, bool))
+        cells = np.ones(GRID.shape, bool)
+        expected = station.variance(folder, cells, 1)
+        assert station.variance(folder, cells, exported.time[1]) == expected
 
 
 @pytest.fixture

@@ -8,6 +8,8 @@ from functools import cache
 import numpy as np
 import pytest
 import xarray as xr
+from support.epochs import START_S, random_epoch
+from support.series import open_with_processing
 from support.shared_parameters import SCANNER
 
 import station
@@ -20,7 +22,6 @@ from station.errors import StationError, StoreError
 from station.quantities import (
     ChangeErrors,
     Grid,
-    Measurement,
     Quality,
     Reference,
     SharedParameters,
@@ -34,7 +35,6 @@ from station.science.analysis.voids import area_weights, void_variance
 from station.science.uncertainty import jacobian, parameters, propagation
 
 GRID = Grid(west_m=632_000.0, north_m=5_186_000.0, cell_m=10.0, nx=40, ny=30)
-START_S = 1_763_683_200.0  # 2025-11-21 00:00 UTC
 POSITION_M = tuple(list(SCANNER.values())[:3])
 AXIS = (0.04, -0.02, np.sqrt(1 - 0.04**2 - 0.02**2))
 EAST, NORTH = 0.25, -0.125  # slope of the reference, stored without rounding
@@ -58,28 +58,13 @@ def random_parameters(seed, size):
 
 
 def make_epoch(hour, adjustment, shared, *, empty=False):
-    rng = np.random.default_rng(hour)
-    observed = (rng.uniform(size=GRID.shape) < 0.8) & (not empty)
-    change_m = np.where(observed, rng.normal(hour / 10, 0.1, GRID.shape), np.nan).astype(np.float32)
-    sigma_m = np.where(observed, rng.uniform(0.01, 0.1, GRID.shape), np.nan).astype(np.float32)
-    measurement = Measurement.from_rasters(
+    random_m = np.random.default_rng(hour).uniform(0.01, 0.1, GRID.shape)
+    return random_epoch(
+        hour,
         GRID,
-        observed.astype(np.uint8),
-        elevation_m=np.where(observed, 2900.0, np.nan),
-        change_m=change_m,
-        uncertainty_m=2 * sigma_m,
-        random_uncertainty_m=sigma_m,
-        spread_m=sigma_m,
-        count=observed.astype(np.int32),
-    )
-    return epochs.Epoch(
-        start_s=START_S + 3600 * hour,
-        end_s=START_S + 3600 * hour + 900,
-        scan_id=f"251121_{hour:02d}0000",
-        measurement=measurement,
+        random_m,
+        unseen=np.full(GRID.shape, empty),
         shared=shared,
-        verdict="good",
-        verdict_reason="",
         scalars=SCANNER if shared else {},
         provenance={"adjustment": adjustment, "reference_version": "1"},
     )
@@ -174,7 +159,7 @@ def dense_jacobian(ds, index):
         "range_bias": height_above_slope / np.hypot(distance, z),
         "range_scale": height_above_slope * 1e-6,
         "refraction": bending,
-        "refraction_moving": bending * ((ds.quality[index].values.astype(int) & 8) == 0),
+        "refraction_ice": bending * ((ds.quality[index].values.astype(int) & 8) == 0),
     }
     rotations = derivatives["tilt_east"], derivatives["tilt_north"], -derivatives["heading"]
     cross_tilt = sum(rotation * part for rotation, part in zip(rotations, sight, strict=True))
@@ -238,7 +223,7 @@ def independent_m2(ds, index, reference_m2):
 
 def test_the_variance_of_an_unadjusted_epoch_includes_its_covariance_and_the_references(stored):
     queries = Queries(stored)
-    with station.open(stored.folder) as ds:
+    with open_with_processing(stored.folder) as ds:
         for weights, counted in weight_cases(ds, LOG_ONLY):
             variance = queries.variance_of(weights, LOG_ONLY)
             expected = dense_variance(ds, counted, LOG_ONLY, reference=random_parameters(7, 0.5))
@@ -249,7 +234,7 @@ def test_the_variance_of_an_unadjusted_epoch_includes_its_covariance_and_the_ref
 
 def test_the_variance_of_an_adjusted_epoch_is_relative_to_the_reference(stored):
     queries = Queries(stored)
-    with station.open(stored.folder) as ds:
+    with open_with_processing(stored.folder) as ds:
         for weights, counted in weight_cases(ds, JOINT):
             variance = queries.variance_of(weights, JOINT)
             assert variance == pytest.approx(dense_variance(ds, counted, JOINT), rel=1e-4)
@@ -277,7 +262,7 @@ def test_an_older_epoch_without_cross_tilt_is_read_as_if_its_variance_were_zero(
 
 def test_a_difference_has_the_errors_of_both_epochs_and_none_of_the_reference(stored):
     queries, reference_m2 = Queries(stored), reference_random_m2(stored)
-    with station.open(stored.folder) as ds:
+    with open_with_processing(stored.folder) as ds:
         for weights, counted in weight_cases(ds, LOG_ONLY, JOINT):
             expected = sum(
                 dense_variance(ds, counted, index, random_m2=independent_m2(ds, index, reference_m2))
@@ -304,7 +289,7 @@ def test_leverage_reduces_the_variance_of_a_difference(stored):
     queries, reference_m2 = Queries(stored), reference_random_m2(stored)
     holdout = ground_classes.is_holdout(*np.meshgrid(GRID.x_m, GRID.y_m))
     assert 0 < holdout.sum() < holdout.size
-    with station.open(stored.folder) as ds:
+    with open_with_processing(stored.folder) as ds:
         for weights, counted in weight_cases(ds, -2, -1):
             expected, without_leverage = 0.0, 0.0
             for index in (-2, -1):
@@ -358,7 +343,7 @@ def test_common_errors_after_similar_change_cancel_in_a_difference(stored, facto
         epochs.write_epoch(stored, epoch_after_change(size, scaled, hour))
     build_series(stored)
     queries, reference_m2, shares = Queries(stored), reference_random_m2(stored), []
-    with station.open(stored.folder) as ds:
+    with open_with_processing(stored.folder) as ds:
         for weights, counted in weight_cases(ds, -2, -1):
             total, effects = 0.0, []
             for index, hour in ((-2, 12), (-1, 13)):
@@ -403,7 +388,7 @@ def test_the_variance_of_a_difference_is_at_least_its_random_part(stored):
         epochs.write_epoch(stored, replace(epoch, shared=replace(epoch.shared, change_errors=change_errors)))
     build_series(stored)
     queries, reference_m2 = Queries(stored), reference_random_m2(stored)
-    with station.open(stored.folder) as ds:
+    with open_with_processing(stored.folder) as ds:
         for weights, counted in weight_cases(ds, -2, -1):
             random_m2 = sum(independent_m2(ds, index, reference_m2) for index in (-2, -1))
             lower_bound = np.nansum(counted**2 * random_m2)
@@ -412,7 +397,7 @@ def test_the_variance_of_a_difference_is_at_least_its_random_part(stored):
 
 def test_an_epoch_without_shared_parameters_has_random_errors_only(stored):
     queries = Queries(stored)
-    with station.open(stored.folder) as ds:
+    with open_with_processing(stored.folder) as ds:
         random_m2 = ds.elevation_change_random_uncertainty[NO_PARAMETERS].values.astype(float) ** 2
         for weights, counted in weight_cases(ds, NO_PARAMETERS):
             expected = np.nansum(counted**2 * random_m2)
@@ -434,7 +419,7 @@ def test_an_epoch_after_a_relocation_has_a_variance(stored):
 
 def test_cells_without_a_change_do_not_contribute(stored):
     queries = Queries(stored)
-    with station.open(stored.folder) as ds:
+    with open_with_processing(stored.folder) as ds:
         unobserved = np.isnan(ds.elevation_change[LOG_ONLY].values) | np.isnan(make_reference().elevation_m)
     assert unobserved.sum() > 200
     weights = np.full(GRID.shape, 1e-3)
@@ -500,7 +485,7 @@ def area_with_voids(ds, *indices):
 
 def test_mean_and_median_of_an_area_with_voids(stored):
     queries = Queries(stored)
-    with station.open(stored.folder) as ds:
+    with open_with_processing(stored.folder) as ds:
         for index in (LOG_ONLY, JOINT, NO_PARAMETERS):
             area, observed, weights, fill_distance = area_with_voids(ds, index)
             change_m = np.where(observed, ds.elevation_change[index].values, np.nan).astype(float)
@@ -526,7 +511,7 @@ def test_mean_and_median_of_an_area_with_voids(stored):
 
 def test_the_change_of_an_area_between_two_epochs(stored):
     queries = Queries(stored)
-    with station.open(stored.folder) as ds:
+    with open_with_processing(stored.folder) as ds:
         area, observed, weights, _ = area_with_voids(ds, JOINT, LOG_ONLY)
         change_m = (ds.elevation_change[JOINT] - ds.elevation_change[LOG_ONLY]).values.astype(float)
     forward, backward = queries.area_of(area, JOINT, LOG_ONLY), queries.area_of(area, LOG_ONLY, JOINT)
@@ -642,7 +627,7 @@ def test_coarsened_cells_are_means_of_their_points(stored):
     """Compared with a plain loop; the shared part of the variance does not shrink with the points."""
     cells = 7
     actual = station.coarsen(stored.folder, JOINT, cells)
-    with station.open(stored.folder) as ds:
+    with open_with_processing(stored.folder) as ds:
         change, sigma, random, count = (
             ds[name][JOINT].values.astype(float)
             for name in (

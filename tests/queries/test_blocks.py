@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import xarray as xr
+from support.epochs import START_S, random_epoch
 from support.shared_parameters import SCANNER, random_shared
 
 import station
@@ -15,43 +16,31 @@ from station.archive.netcdf_layout import Series
 from station.archive.reference_files import write_reference
 from station.archive.series.index import SeriesIndex, list_epochs
 from station.archive.series.virtual import build_series
-from station.quantities import Grid, Measurement, Quality, Reference
+from station.quantities import Grid, Quality, Reference
+from station.queries import block_sums
+from station.queries.block_sums import FOLDER, EpochSummer, keep_epoch_sums
 from station.queries.blocks import BlockQueries, update_boxes
 
 GRID = Grid(
     west_m=632_000.0, north_m=5_186_000.0, cell_m=2.0, nx=130, ny=90
 )  # the boxes at the edges are cut
-START_S = 1_763_683_200.0  # 2025-11-21 00:00 UTC
 HOURS = (1, 5, 20, 26, 30)
 REFERENCE_M = 0.01
 RANDOM_M = 0.05
 
 
 def make_epoch(hour, *, verdict="good"):
-    rng = np.random.default_rng(hour)
-    observed = rng.uniform(size=GRID.shape) < 0.8
-    observed[60:, :40] = False
-    change_m = np.where(observed, rng.normal(hour / 10, 0.05, GRID.shape), np.nan).astype(np.float32)
-    sigma_m = np.where(observed, RANDOM_M, np.nan).astype(np.float32)
-    stable = np.where(GRID.x_m[None, :] < 632_100, int(Quality.STABLE_GROUND), 0)
-    measurement = Measurement.from_rasters(
+    unseen = np.zeros(GRID.shape, bool)
+    unseen[60:, :40] = True
+    return random_epoch(
+        hour,
         GRID,
-        np.where(observed, stable, 0).astype(np.uint8),
-        elevation_m=np.where(observed, 2900.0, np.nan),
-        change_m=change_m,
-        uncertainty_m=2 * sigma_m,
-        random_uncertainty_m=sigma_m,
-        spread_m=sigma_m,
-        count=observed.astype(np.int32),
-    )
-    return epochs.Epoch(
-        start_s=START_S + 3600 * hour,
-        end_s=START_S + 3600 * hour + 900,
-        scan_id=f"scan_{hour}",
-        measurement=measurement,
+        np.full(GRID.shape, RANDOM_M),
+        unseen=unseen,
+        quality=np.where(GRID.x_m[None, :] < 632_100, int(Quality.STABLE_GROUND), 0),
+        scatter_m=0.05,
         shared=random_shared(hour, GRID),
         verdict=verdict,
-        verdict_reason="",
         scalars=SCANNER,
         provenance={"adjustment": "joint", "reference_version": "1"},
     )
@@ -167,6 +156,60 @@ def test_only_new_epochs_are_computed_and_the_result_is_that_of_a_new_file(store
     assert grown[1].epoch_count.max(("y", "x")).values.tolist() == [3, 2]  # unusable epochs do not count
     for name in ("boxes.nc", "daily.nc"):
         (stored.folder / name).unlink()
+    update_boxes(stored, BlockQueries(stored), lambda: None)
+    for name, old in zip(("boxes.nc", "daily.nc"), grown, strict=True):
+        xr.testing.assert_equal(read(stored, name), old)
+
+
+def keep(series, epoch, rows_at_once=7):
+    """Write an epoch and keep the sums of its blocks, some rows at a time, as a worker process does."""
+    summer = EpochSummer(series.grid)
+
+    def add(rows, rasters):
+        for first in range(rows.start, rows.stop, rows_at_once):
+            part = slice(first, min(first + rows_at_once, rows.stop))
+            within = slice(part.start - rows.start, part.stop - rows.start)
+            summer.add(part, {name: raster[within] for name, raster in rasters.items()})
+
+    path = epochs.write_epoch(series, epoch, on_rows=add).path
+    keep_epoch_sums(series, path, summer)
+    return path
+
+
+def test_sums_kept_while_an_epoch_is_written_have_the_bits_of_the_stored_rasters(stored, monkeypatch):
+    path = keep(stored, make_epoch(31))
+    ref = list_epochs(stored)[-1]
+    kept = stored.folder / FOLDER / f"{path.name}.npz"
+    with monkeypatch.context() as no_raster:
+        no_raster.setattr(block_sums, "LazyRaster", None)
+        expected = BlockQueries(stored).boxes(ref)
+    content = bytearray(kept.read_bytes())
+    content[len(content) // 2] ^= 1
+    for damaged in (bytes(content), bytes(content)[:100], b""):
+        kept.write_bytes(damaged)
+        for name, values in BlockQueries(stored).boxes(ref).items():
+            assert values.tobytes() == expected[name].tobytes()
+
+
+def test_kept_sums_of_another_file_of_that_name_are_not_used(stored):
+    path = keep(stored, make_epoch(31))
+    coverage = BlockQueries(stored).boxes(list_epochs(stored)[-1])["coverage"]
+    path.unlink()
+    epochs.write_epoch(stored, replace(make_epoch(32), start_s=START_S + 31 * 3600.0))
+    assert (BlockQueries(stored).boxes(list_epochs(stored)[-1])["coverage"] != coverage).any()
+
+
+def test_sums_are_kept_until_their_day_is_in_the_daily_means(stored):
+    for hour in (32, 33, 50):
+        keep(stored, make_epoch(hour))
+        build_series(stored)
+        update_boxes(stored, BlockQueries(stored), lambda: None)
+    names = [path.name for path in (stored.folder / FOLDER).glob("hef_*")]
+    assert names == ["hef_20251123T020000Z.nc.npz"]
+    grown = [read(stored, name) for name in ("boxes.nc", "daily.nc")]
+    for name in ("boxes.nc", "daily.nc"):
+        (stored.folder / name).unlink()
+    shutil.rmtree(stored.folder / FOLDER)
     update_boxes(stored, BlockQueries(stored), lambda: None)
     for name, old in zip(("boxes.nc", "daily.nc"), grown, strict=True):
         xr.testing.assert_equal(read(stored, name), old)

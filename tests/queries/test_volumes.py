@@ -130,9 +130,10 @@ def test_the_covariance_of_points_along_the_beam_is_that_of_the_range(site, box)
     row, column = np.argwhere(cells)[[5, 500, 1500]].T
     with station.open(site) as ds:
         height_m = ds.elevation[LAST].values[row, column]
-        position_m = [float(ds[f"scanner_{name}"][LAST]) for name in ("east", "north", "height")]
-        covariance = ds.shared_parameter_covariance[LAST].values
-        names = [str(name) for name in ds.parameter_name.values]
+        processing = ds.station.processing.isel(time=LAST).load()
+    position_m = [float(processing[f"scanner_{name}"]) for name in ("east", "north", "height")]
+    covariance = processing.shared_parameter_covariance.values
+    names = [str(name) for name in processing.parameter_name.values]
     points_m = np.stack([x[column], y[row], height_m], axis=-1)
     actual = station.point_covariance(site, points_m, LAST)
     assert actual.shape == (3, 3, 3)

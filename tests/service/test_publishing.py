@@ -15,8 +15,8 @@ from station.config import read_site
 from station.inbox.journal import Journal
 from station.inbox.scan_files import scan_file
 from station.operations.batch import process_scans
-from station.processing import previews
-from station.processing.previews import page_folder
+from station.processing import epoch_recorder
+from station.processing.epoch_recorder import page_folder
 from station.processing.reference_tasks import build_reference_version
 from station.processing.scan_tasks import ScanHistory, process_new
 from station.processing.store_tasks import update_series
@@ -60,9 +60,12 @@ def test_previews_come_from_memory_and_their_failure_loses_no_epoch(tmp_path, mo
     scans = [scan_file(site, path) for path in sorted(site.scans.inbox.glob("*.laz"))]
     build_reference_version(site, scans, "1", lambda: None)
     with monkeypatch.context() as broken:
-        broken.setattr(previews.OverviewBuilder, "add", lambda *_: 1 / 0)
+        broken.setattr(epoch_recorder.OverviewBuilder, "add", lambda *_: 1 / 0)
+        broken.setattr(epoch_recorder.EpochSummer, "add", lambda *_: 1 / 0)
         without_overview = process_new(site, scans[0], ScanHistory(), lambda: None)
     with_overview = process_new(site, scans[1], ScanHistory(), lambda: None)
+    kept = [path.name for path in (site.station.data / ".block_sums").iterdir()]
+    assert kept == [f"{Path(with_overview.epoch).name}.npz"]
     assert (without_overview.overview, without_overview.verdict) == (None, with_overview.verdict)
     update_series(site, lambda: None)
     Journal(site.station.data / "journal.sqlite").close()

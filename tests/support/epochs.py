@@ -1,5 +1,7 @@
 """Fixtures of a small store on a grid at Hintereisferner."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -61,3 +63,30 @@ def make_epoch(hour, *, value=None, grid=GRID, terms=False):
         scalars={"platform_roll": 0.12, "air_temperature": -3.5, "point_total": 1234.0, "coverage": 0.5},
         provenance={"scan_sha256": "ab" * 32, "sop_id": "sop-1", "reference_version": "1"},
     )
+
+
+def random_epoch(hour, grid, random_m, *, unseen=None, quality=0, scatter_m=0.1, **fields):
+    """Return an epoch with a random change of `hour` / 10 [m] in four of five cells.
+
+    `random_m` (ny, nx) is its random uncertainty, half of its total one; none of the cells `unseen` is
+    observed.
+    """
+    rng = np.random.default_rng(hour)
+    observed = rng.uniform(size=grid.shape) < 0.8
+    if unseen is not None:
+        observed &= ~unseen
+    change_m = np.where(observed, rng.normal(hour / 10, scatter_m, grid.shape), np.nan).astype(np.float32)
+    sigma_m = np.where(observed, random_m, np.nan).astype(np.float32)
+    measurement = Measurement.from_rasters(
+        grid,
+        np.where(observed, quality | observed, 0).astype(np.uint8),
+        elevation_m=np.where(observed, 2900.0, np.nan),
+        change_m=change_m,
+        uncertainty_m=2 * sigma_m,
+        random_uncertainty_m=sigma_m,
+        spread_m=sigma_m,
+        count=observed.astype(np.int32),
+    )
+    start_s = START_S + 3600 * hour
+    epoch = Epoch(start_s, start_s + 900, f"251121_{hour:02d}0000", measurement, None, "good", "", {}, {})
+    return replace(epoch, **fields)

@@ -44,6 +44,9 @@ class FakeWorker:
     def close(self):
         pass
 
+    def update_mirror(self):
+        pass
+
     def run_maintenance(self):
         self.record_call("maintenance")
 

@@ -13,7 +13,7 @@ import h5py
 import numpy as np
 
 from station.archive.epochs import EpochRef
-from station.archive.netcdf_layout import decode_text
+from station.archive.netcdf_layout import decode_parameters
 from station.archive.schema import VARIABLES
 from station.errors import StoreError
 
@@ -60,7 +60,7 @@ def read_source(path: Path, file_start: int, series_start: int, count: int) -> E
             names = set(file)
             small_names = {"time_bnds", *(spec.name for spec in SMALL_VARIABLES)} & names
             parameter_texts = [
-                decode_text(_read(file, name))
+                decode_parameters(_read(file, name))
                 for name in ("parameter_name", "parameter_unit")
                 if name in names
             ]

@@ -148,13 +148,19 @@ class SeriesIndex(Sequence[EpochRef]):
         )
 
 
+def processing_file(series: Series) -> Path:
+    """Return `processing.nc`, or `series.nc` of an older version, which contained everything."""
+    return series.processing_path if series.processing_path.is_file() else series.path
+
+
 def source_files(series_path: Path) -> set[Path]:
-    """Return the files that a `series.nc` refers to; empty if there is no series."""
+    """Return the files that a `series.nc` or `processing.nc` refers to; empty if there is no such file."""
     if not series_path.is_file():
         return set()
     try:
         with h5py.File(series_path, "r") as file:
-            return {series_path.parent / source.file_name for source in file["elevation"].virtual_sources()}
+            linked = file["elevation" if "elevation" in file else "time"]
+            return {series_path.parent / source.file_name for source in linked.virtual_sources()}
     except (OSError, RuntimeError, KeyError) as error:
         raise StoreError(f"{series_path}: damaged, cannot be read: {error}") from error
 

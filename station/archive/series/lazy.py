@@ -13,7 +13,7 @@ from xarray.core.indexing import LazilyIndexedArray
 
 from station.archive.netcdf_layout import CHUNK
 from station.archive.series.index import data_folder, source_files
-from station.archive.series.virtual import COMMENT
+from station.archive.series.virtual import COMMENT, PROCESSING_COMMENT
 from station.errors import StoreError
 
 PREFERRED_CHUNKS = {"time": 24, "y": 4 * CHUNK, "x": 4 * CHUNK}  # 24 MiB
@@ -33,6 +33,11 @@ def open_series(site_or_folder: str | Path, chunks: Chunks = None) -> xr.Dataset
     path = data_folder(site_or_folder) / "series.nc"
     if not path.is_file():
         raise StoreError(f"{path}: no series yet; has a scan been processed? (station status)")
+    return open_virtual(path, chunks)
+
+
+def open_virtual(path: Path, chunks: Chunks = None) -> xr.Dataset:
+    """Return a `series.nc` or `processing.nc` as a lazy dataset, as `open_series` does."""
     sources = source_files(path)
     missing = _missing(sources)
     if missing:
@@ -51,8 +56,8 @@ def open_series(site_or_folder: str | Path, chunks: Chunks = None) -> xr.Dataset
         ds = ds.assign(rasters.data_vars)
     ds = ds.set_coords([name for name in COORDINATES if name in ds])
     ds.encoding["source"] = str(path.resolve())
-    comment = ds.attrs.pop("comment", "").removesuffix(COMMENT).rstrip()  # what is written is not virtual
-    if comment:
+    comment = ds.attrs.pop("comment", "")  # what is written is not virtual
+    if comment := comment.removesuffix(COMMENT).removesuffix(PROCESSING_COMMENT).rstrip():
         ds.attrs["comment"] = comment
     _prepare_writing(ds)
     return ds

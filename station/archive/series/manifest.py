@@ -1,4 +1,4 @@
-"""Manifest of the sources of `series.nc`, so that a new epoch is added without opening the earlier ones.
+"""Manifest of the sources of the series, so that a new epoch is added without opening the earlier ones.
 
 Only a cache: if it is missing or does not match the files, the series is rebuilt from them.
 """
@@ -49,6 +49,7 @@ def write_manifest(series: Series, manifest: SeriesManifest) -> None:
     content = {
         "header_hash": _header_hash(series),
         "series": fingerprint(series.path),
+        "processing": fingerprint(series.processing_path),
         "files": sorted(list_files(series)),
         "parameters": manifest.parameters,
         "last_s": manifest.last_s,
@@ -109,8 +110,15 @@ def index_if_current(series: Series) -> SeriesIndex | None:
 
 
 def is_intact(series: Series) -> bool:
-    """Return True if `series.nc` is as it was written."""
-    return listed_sources(series) is not None
+    """Return True if `series.nc` and `processing.nc` are as they were written."""
+    content = read_checked_json(series.folder / MANIFEST)
+    return content is not None and _matches(series, content)
+
+
+def _matches(series: Series, content: dict[str, Any]) -> bool:
+    return matches_fingerprint(series.path, content["series"]) and matches_fingerprint(
+        series.processing_path, content.get("processing")
+    )
 
 
 def listed_sources(series: Series) -> set[Path] | None:
@@ -128,7 +136,7 @@ def source_count(series: Series) -> int:
 
 
 def _read_manifest(series: Series) -> dict[str, Any] | None:
-    """Return the manifest if `series.nc` is intact and its sources are unchanged; else None."""
+    """Return the manifest if both files are intact and their sources unchanged; else None."""
     content: dict[str, Any] | None = read_checked_json(series.folder / MANIFEST)
     if content is None or content["header_hash"] != _header_hash(series):
         return None
@@ -138,7 +146,7 @@ def _read_manifest(series: Series) -> dict[str, Any] | None:
         )
     except OSError:
         return None
-    return content if is_current and matches_fingerprint(series.path, content["series"]) else None
+    return content if is_current and _matches(series, content) else None
 
 
 def _source_from_manifest(series: Series, entry: dict[str, Any], parameters: Parameters) -> EpochSource:

@@ -1,10 +1,14 @@
-"""Building `series.nc`: the whole series as a virtual HDF5 file over the files of epochs, days and months."""
+"""Building `series.nc` and `processing.nc`: virtual HDF5 files over the files of epochs, days and months.
+
+`series.nc` contains the results, `processing.nc` everything about each scan but the rasters: how it was
+processed, and what the variance of a sum needs.
+"""
 
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator
-from dataclasses import replace
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
 from itertools import groupby, product
 from pathlib import Path
 from typing import Any
@@ -17,10 +21,8 @@ from station.archive.atomic_files import atomic_write
 from station.archive.discovery import time_coverage
 from station.archive.epochs import list_files
 from station.archive.netcdf_layout import TIMES_PER_CHUNK, Series, attributes, create_file, create_variable
-from station.archive.schema import FILL, Variable
+from station.archive.schema import FILL, VARIABLES, Variable
 from station.archive.series.epoch_reader import (
-    LARGE_VARIABLES,
-    SMALL_VARIABLES,
     EpochSource,
     Parameters,
     contiguous_runs,
@@ -37,16 +39,45 @@ SCALE_ATTRIBUTES = ("CLASS", "NAME", "REFERENCE_LIST", "_FillValue")  # of a dim
 COMMENT = (
     "This file is virtual: times and rasters are read from days/, months/ and epochs/ beside it; copy the"
     " whole folder. Without a source, its times are 9.96921e36 and its rasters empty: the number of valid"
-    " cells of elevation_change is then below valid_count."
+    " cells of elevation_change is then below valid_count. How each scan was processed is in processing.nc."
+)
+PROCESSING_COMMENT = (
+    "This file is virtual: times and covariances are read from days/, months/ and epochs/ beside it; copy the"
+    " whole folder. Without a source, its times are 9.96921e36. The results are in series.nc."
 )
 
 
-def build_series(series: Series) -> Path:
-    """Bring `series.nc` up to date with the files of the store, by atomic replacement, and return its path.
+@dataclass(frozen=True)
+class _VirtualFile:
+    """One of the two files: its path, title, comment, and rows of the schema."""
 
-    If only later epochs were added, the other epochs are copied from the old `series.nc` and no other file is
-    opened. A damaged `series.nc` is never opened: it is built again from the epochs. Raises StoreError if an
-    epoch is damaged, nothing is stored yet, or the file cannot be written.
+    path: Path
+    title: str
+    comment: str
+    variables: tuple[Variable, ...]
+
+
+def _virtual_files(series: Series) -> tuple[_VirtualFile, ...]:
+    """Return the two files in the order of writing: `series.nc` names nothing that is not in the other."""
+    name = series.name or series.station_id
+    own_comment = dict(series.metadata).get("comment")
+    processing = tuple(spec for spec in VARIABLES if not spec.is_raster)
+    results = tuple(spec for spec in VARIABLES if spec.is_result)
+    return tuple(
+        _VirtualFile(path, f"{title} at {name}", " ".join(filter(None, [own_comment, comment])), variables)
+        for path, title, comment, variables in (
+            (series.processing_path, "Processing of the scans", PROCESSING_COMMENT, processing),
+            (series.path, "Elevation change", COMMENT, results),
+        )
+    )
+
+
+def build_series(series: Series) -> Path:
+    """Bring `series.nc` and `processing.nc` up to date with the store; return the path of `series.nc`.
+
+    Each is replaced atomically. If only later epochs were added, the other epochs are copied from the old
+    files and no other file is opened. If one is damaged, both are built again from the epochs. Raises
+    StoreError if an epoch is damaged, nothing is stored yet, or a file cannot be written.
     """
     pending = pending_epochs(series)
     if pending is None:
@@ -55,16 +86,16 @@ def build_series(series: Series) -> Path:
     if not new_sources:
         return series.path
     unchanged = manifest.count // TIMES_PER_CHUNK * TIMES_PER_CHUNK
-    last_chunk = read_source(series.path, unchanged, unchanged, manifest.count - unchanged)
-    with atomic_write(series.path) as tmp_path:
-        with netCDF4.Dataset(tmp_path, "w", clobber=False) as file:
-            _write_stored(file, series, [last_chunk, *new_sources], manifest.parameters)
-        with h5py.File(tmp_path, "r+", libver=LIBVER_VIRTUAL) as file:
-            with h5py.File(series.path, "r") as old_file:
-                copy_unchanged(
-                    old_file, file, ("time_bnds", *(spec.name for spec in SMALL_VARIABLES)), unchanged
-                )
-            _link_sources(file, series, [*manifest.sources, *new_sources], manifest.parameters)
+    for virtual in _virtual_files(series):
+        last_chunk = read_source(virtual.path, unchanged, unchanged, manifest.count - unchanged)
+        with atomic_write(virtual.path) as tmp_path:
+            with netCDF4.Dataset(tmp_path, "w", clobber=False) as file:
+                _write_stored(file, series, virtual, [last_chunk, *new_sources], manifest.parameters)
+            with h5py.File(tmp_path, "r+", libver=LIBVER_VIRTUAL) as file:
+                with h5py.File(virtual.path, "r") as old_file:
+                    names = ("time_bnds", *(spec.name for spec in virtual.variables if not spec.is_large))
+                    copy_unchanged(old_file, file, names, unchanged)
+                _link_sources(file, series, virtual, [*manifest.sources, *new_sources], manifest.parameters)
     write_manifest(series, replace(manifest, sources=[*manifest.sources, *new_sources]))
     return series.path
 
@@ -77,24 +108,31 @@ def _rebuild(series: Series) -> Path:
     parameters: Parameters = {}
     for source in reversed(epoch_sources):
         parameters = source.parameters | parameters
-    with atomic_write(series.path) as tmp_path:
-        with netCDF4.Dataset(tmp_path, "w", clobber=False) as file:
-            _write_stored(file, series, epoch_sources, parameters)
-        with h5py.File(tmp_path, "r+", libver=LIBVER_VIRTUAL) as file:
-            _link_sources(file, series, epoch_sources, parameters)
-        _touch_replaced(series, {source.path for source in epoch_sources})
+    for virtual in _virtual_files(series):
+        with atomic_write(virtual.path) as tmp_path:
+            with netCDF4.Dataset(tmp_path, "w", clobber=False) as file:
+                _write_stored(file, series, virtual, epoch_sources, parameters)
+            with h5py.File(tmp_path, "r+", libver=LIBVER_VIRTUAL) as file:
+                _link_sources(file, series, virtual, epoch_sources, parameters)
+            _touch_replaced(series, {source.path for source in epoch_sources})
     newest_start_s = max(epoch.start for epoch in epochs).timestamp()
     write_manifest(series, SeriesManifest(epoch_sources, parameters, epochs[-1].time_s, newest_start_s))
     return series.path
 
 
 def _write_stored(
-    file: netCDF4.Dataset, series: Series, epoch_sources: list[EpochSource], parameters: Parameters
+    file: netCDF4.Dataset,
+    series: Series,
+    virtual: _VirtualFile,
+    epoch_sources: list[EpochSource],
+    parameters: Parameters,
 ) -> None:
-    """Write all that the series contains itself."""
-    title = f"Elevation change at {series.name or series.station_id}"
-    write_scalars(file, series, title, epoch_sources, parameters)
-    file.comment = " ".join(filter(None, [dict(series.metadata).get("comment"), COMMENT]))
+    """Write all that a virtual file contains itself."""
+    has_parameters = any("parameter" in spec.dims for spec in virtual.variables)
+    write_scalars(
+        file, series, virtual.title, epoch_sources, parameters if has_parameters else {}, virtual.variables
+    )
+    file.comment = virtual.comment
 
 
 def _touch_replaced(series: Series, used: set[Path]) -> None:
@@ -113,6 +151,7 @@ def write_scalars(
     title: str,
     epoch_sources: list[EpochSource],
     parameters: Parameters,
+    variables: Sequence[Variable] = VARIABLES,
 ) -> None:
     """Write all of a file of many epochs but the large variables; missing values keep the fill value.
 
@@ -122,8 +161,8 @@ def write_scalars(
     file.set_auto_chartostring(False)
     first, count = epoch_sources[0].series_start, epoch_sources[-1].series_start + epoch_sources[-1].count
     create_file(file, series, title, count, (tuple(parameters), tuple(parameters.values())))
-    for spec in SMALL_VARIABLES:
-        if all(dim in file.dimensions for dim in spec.dims):
+    for spec in variables:
+        if not spec.is_large and all(dim in file.dimensions for dim in spec.dims):
             create_variable(file, spec, series, count)
     for name, variable in file.variables.items():
         if variable.dimensions[:1] != ("time",):
@@ -158,6 +197,7 @@ def _parameter_indices(source: EpochSource, parameters: Parameters) -> list[int]
 def _link_sources(
     file: Any,  # noqa: ANN401 - h5py has no types
     series: Series,
+    virtual: _VirtualFile,
     epoch_sources: list[EpochSource],
     parameters: Parameters,
 ) -> None:
@@ -169,8 +209,8 @@ def _link_sources(
     paths = [str(source.path.relative_to(series.folder)).encode() for source in epoch_sources]
     _link_time(file, epoch_sources, paths)
     spaces: dict[tuple[object, ...], list[tuple[Any, Any]]] = {}  # the same for all rasters
-    for spec in LARGE_VARIABLES:
-        if not any(spec.name in source.raster_shapes for source in epoch_sources):
+    for spec in virtual.variables:
+        if not spec.is_large or not any(spec.name in source.raster_shapes for source in epoch_sources):
             continue
         shape = tuple(len(file[dim]) for dim in spec.dims)
         layout = h5py.h5p.create(h5py.h5p.DATASET_CREATE)

@@ -15,7 +15,7 @@ import numpy as np
 from station.archive.epochs import EpochRef
 from station.archive.netcdf_layout import CHUNK, Series
 from station.archive.schema import BY_NAME
-from station.archive.series.index import SeriesIndex
+from station.archive.series.index import SeriesIndex, processing_file
 from station.errors import StationError
 from station.products.area_tables import Span
 from station.quantities import Grid
@@ -25,6 +25,7 @@ FORMAT_VERSION = 1  # of exported files: those of another version are written ag
 FINGERPRINT = "export_fingerprint"  # global attribute by which an exported file is recognised
 PERIODS = {"1D": "%Y%m%d", "1M": "%Y%m"}  # periods of files: time format in their names
 MAX_CHUNK_BYTES = 2**26  # a reader decodes whole chunks
+ALL = "all"  # variables: how each scan was processed, too
 KEPT = ("scan_id", "verdict", "verdict_reason")  # variables without which an epoch can be misread
 
 
@@ -146,15 +147,22 @@ def _metres(values_m: tuple[float, ...]) -> str:
 
 
 def _names(series: Series, text: str | None) -> frozenset[str]:
-    """Return the variables of the series, or those of them that are named and KEPT."""
-    with h5py.File(series.path, "r") as file:
-        stored = [name for name in BY_NAME if name in file]
+    """Return the variables of `series.nc`; or those that are named and KEPT; or all, with `processing.nc`."""
+    results, processing = (_stored_names(path) for path in (series.path, processing_file(series)))
     if text is None:
-        return frozenset(stored)
-    names = [name.strip() for name in text.split(",")]
+        return frozenset(results)
+    stored = [name for name in BY_NAME if name in {*results, *processing}]
+    names = stored if text.strip() == ALL else [name.strip() for name in text.split(",")]
     if unknown := [name for name in names if name not in stored]:
-        raise StationError(f"{unknown[0]!r}: not a variable of the series: choose from {', '.join(stored)}")
+        raise StationError(
+            f"{unknown[0]!r}: not a variable of the series: choose {ALL} or from {', '.join(stored)}"
+        )
     return frozenset((*names, *KEPT))
+
+
+def _stored_names(path: Path) -> list[str]:
+    with h5py.File(path, "r") as file:
+        return [name for name in BY_NAME if name in file]
 
 
 def _chunks(text: str | None, shape: tuple[int, int, int]) -> tuple[int, int, int]:

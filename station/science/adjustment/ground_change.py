@@ -186,7 +186,7 @@ def _shares(patches: Patches, moving: Bools) -> Floats:
     """Return the shares (KINDS, n) of ice and snow, and of bare ground, in moving patches; 0 in others."""
     jacobian = patches.jacobian
     ice_share = np.ones(len(moving))
-    moving_row = [name for name, _ in GLOBAL].index("refraction_moving")
+    moving_row = [name for name, _ in GLOBAL].index("refraction_ice")
     np.divide(jacobian.pose[moving_row], jacobian.refraction, out=ice_share, where=jacobian.refraction != 0)
     return np.stack([ice_share, 1 - ice_share]) * moving
 

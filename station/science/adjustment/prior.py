@@ -48,7 +48,7 @@ def globals_sigma(components: VarianceComponents, *, weather_known: bool) -> Flo
         (components.tilt_rad, components.tilt_rad, components.heading_rad),
         (components.translation_m,) * 3,
     )
-    refraction = components.refraction, components.refraction_moving
+    refraction = components.refraction, components.refraction_ice
     return np.array([*rotations, *translations, components.range_bias_m, scale_ppm, *refraction])
 
 

@@ -14,13 +14,13 @@ from station.science.uncertainty.parameters import GLOBAL, ParameterLayout
 
 INITIAL = VarianceComponents()
 PRIOR_SCANS = 8  # weight of the initial values, in scans
-ICE_PRIOR_SCANS = 2  # of `refraction_moving`: from site to site it differs tenfold (Hirt et al., 2010)
+ICE_PRIOR_SCANS = 2  # of `refraction_ice`: from site to site it differs tenfold (Hirt et al., 2010)
 EM_STEPS = 10
 MOUNT_CREEP_RAD, MOUNT_CREEP_M = math.radians(0.005), 0.001  # in a day, growing with the root of time
 UNUSUAL_SIGMAS = 3.0  # of the usual motion
 TILT_COMPONENTS = ("tilt_drift_rad", "tilt_jitter_rad", "line_jitter_rad")
 MIN_TREND_SCANS = 3
-ICE = [name for name, _ in GLOBAL].index("refraction_moving")
+ICE = [name for name, _ in GLOBAL].index("refraction_ice")
 COMPONENT_SLICES = {  # variance components by the global parameters they describe
     "tilt_rad": slice(2),
     "heading_rad": slice(2, 3),
@@ -28,7 +28,7 @@ COMPONENT_SLICES = {  # variance components by the global parameters they descri
     "range_bias_m": slice(6, 7),
     "range_scale_ppm": slice(7, 8),
     "refraction": slice(8, 9),
-    "refraction_moving": slice(9, 10),
+    "refraction_ice": slice(9, 10),
 }
 
 
@@ -66,7 +66,7 @@ def estimate_variance_components(
     second_moment, tilt_moment = second_moment / (count - 1), tilt_moment / count
 
     def shrunk_sigma(name: str, variance: float) -> float:
-        prior_scans = ICE_PRIOR_SCANS if name == "refraction_moving" else PRIOR_SCANS
+        prior_scans = ICE_PRIOR_SCANS if name == "refraction_ice" else PRIOR_SCANS
         total = variance * count + getattr(INITIAL, name) ** 2 * prior_scans
         return math.sqrt(total / (count + prior_scans))
 
@@ -74,7 +74,7 @@ def estimate_variance_components(
     if count > MIN_TREND_SCANS:
         scan = np.arange(count)
         residual = ice_refraction - np.polynomial.Polynomial.fit(scan, ice_refraction, 1)(scan)
-        variances["refraction_moving"] = ice_moment / count + float(residual @ residual) / (count - 2)
+        variances["refraction_ice"] = ice_moment / count + float(residual @ residual) / (count - 2)
     variances["refraction_by_azimuth"] = float(second_moment[last : last + params.refraction_knots].mean())
     kernels = tilt_correlations(scan_lines[0])
     components = start

@@ -81,7 +81,7 @@ class PoseErrorModel:
         y_m, z_m = _rotate(y_m, z_m, -east_rad)
         horizontal_m = np.hypot(x_m, y_m)
         moving = self.jacobian.pose[-1] != 0
-        refraction = refraction + by_name["refraction"] + by_name["refraction_moving"] * moving
+        refraction = refraction + by_name["refraction"] + by_name["refraction_ice"] * moving
         refraction_rad = refraction * horizontal_m / (2 * EARTH_RADIUS_M)
         bent_m, z_m = _rotate(horizontal_m, z_m, refraction_rad - sight_tilt_rad)
         x_m, y_m = x_m * bent_m / horizontal_m, y_m * bent_m / horizontal_m

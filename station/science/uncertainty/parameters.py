@@ -23,7 +23,7 @@ GLOBAL = (
     ("range_bias", "m"),
     ("range_scale", "1e-6"),
     ("refraction", "1"),
-    ("refraction_moving", "1"),  # of paths to ice and snow, in excess of those to rock
+    ("refraction_ice", "1"),  # of paths to ice and snow, in excess of those to rock
 )
 TILT_KNOT_RAD = math.radians(1.0)
 TILT_KNOTS_PER_REFRACTION = 5  # sight-tilt knots for each refraction knot

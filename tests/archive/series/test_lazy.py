@@ -86,7 +86,8 @@ def test_times_and_texts_are_decoded(stored):
         assert ds.time.values[0] == np.datetime64("2025-11-21T01:07:30")
         assert ds.scan_id.values.tolist() == [f"251121_{hour % 24:02d}0000" for hour in HOURS]
         assert ds.epoch_file.values[-1] == "hef_20251122T070000Z.nc"
-        assert ds.change_step.dtype == np.float64  # seconds and metres are not decoded as time differences
+        offset_s = ds.station.processing.log_offset
+        assert offset_s.dtype == np.float64  # seconds are not decoded as time differences
 
 
 def test_an_open_series_stays_readable_while_the_service_writes(copied):
@@ -152,7 +153,7 @@ def test_a_damaged_chunk_raises_an_error(copied):
 
 
 def test_read_column_equals_h5py(stored, tmp_path):
-    with h5py.File(stored.path) as file:
+    with h5py.File(stored.processing_path) as file:
         columns = [dataset for dataset in file.values() if dataset.chunks and len(dataset) == len(HOURS)]
         assert {"epoch_file", "time_bnds", "verdict", "point_total"} <= {
             column.name[1:] for column in columns

@@ -53,6 +53,15 @@ def test_xarray_refuses_a_lone_copy(lone, engine):
         station.open(lone)
 
 
+@pytest.mark.parametrize("engine", ENGINES)
+def test_a_lone_copy_of_how_scans_were_processed_is_refused_too(stored, engine, tmp_path_factory):
+    alone = shutil.copy(stored.with_name("processing.nc"), tmp_path_factory.mktemp("mail"))
+    with pytest.raises(ValueError, match="unable to decode time"):
+        xr.open_dataset(alone, engine=engine)
+    with xr.open_dataset(alone, engine=engine, decode_times=False) as ds:
+        assert "The results are in series.nc" in ds.comment
+
+
 def test_an_epoch_without_its_file_shows_itself(stored, series):
     (lost,) = series.folder.glob("epochs/*/*/*/*T020000Z.nc")
     lost.unlink()

@@ -51,8 +51,9 @@ def raw(path):
 
 @pytest.mark.parametrize("chunks", [None, "2,64,150", "5,7,11"])
 def test_every_variable_has_the_bits_of_the_series(stored, tmp_path, chunks):
-    (path,) = write(select(stored, ALWAYS, chunks=chunks), tmp_path / "all.nc")
+    (path,) = write(select(stored, ALWAYS, variables="all", chunks=chunks), tmp_path / "all.nc")
     (expected, series_attrs), (actual, attrs) = raw(stored.path), raw(path)
+    expected |= raw(stored.processing_path)[0]
     assert set(actual) == set(expected)
     assert {"sigma_geometry", "shared_parameter_covariance", "change_errors"} < set(actual)
     for name, values in expected.items():
@@ -165,7 +166,9 @@ def test_wrong_selections_say_what_there_is(stored, tmp_path):
         select(stored, Span.parse("2026-01-01", None))
     with pytest.raises(StationError, match="no cell of the grid, 632000,5184600,633500,5186000"):
         select(stored, ALWAYS, (0.0, 0.0, 1.0, 1.0))
-    with pytest.raises(StationError, match="'sigma_raster': not a variable of the series: choose from eleva"):
+    with pytest.raises(
+        StationError, match="'sigma_raster': not a variable of the series: choose all or from eleva"
+    ):
         select(stored, ALWAYS, variables="quality,sigma_raster")
     for chunks in ("1,2", "0,1,1", "a,b,c", "1,1.5,2"):
         with pytest.raises(StationError, match="not a chunk"):

@@ -131,7 +131,7 @@ def test_change_that_looks_like_tilt_widens_sigma():
 @pytest.mark.parametrize("change_m", [0.0, 0.1, -3.0])
 def test_melt_that_ends_at_the_edge_of_the_ice_is_no_refraction(change_m):
     """Neighbouring bare ground has not changed; k over ice does not differ."""
-    moving = PARAMS.names.index("refraction_moving")
+    moving = PARAMS.names.index("refraction_ice")
     standardised = []
     for seed in range(12):
         mixture = solve(seed, change_m, bare_share=0.4)[3].mixture()

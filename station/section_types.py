@@ -1,0 +1,62 @@
+"""What the tables of the site file are made of: their base class, and the types of their values."""
+
+from __future__ import annotations
+
+import re
+from datetime import UTC, datetime
+from typing import Annotated, Any
+
+from pydantic import AfterValidator, AwareDatetime, BaseModel, ConfigDict, Field
+
+Positive = Annotated[float, Field(gt=0)]
+NotNegative = Annotated[float, Field(ge=0)]
+Arm = Annotated[float, Field(ge=-2, le=2)]
+Place = Annotated[float, Field(ge=-1e8, le=1e8)]  # metres on a map; no map of the Earth is larger
+
+
+def without_required(schema: dict[str, Any]) -> None:
+    """Remove the required keys from a JSON Schema: those of a known instrument have values."""
+    schema.pop("required", None)
+
+
+def _in_utc(time: datetime) -> datetime:
+    return time.astimezone(UTC)
+
+
+def require_projected(crs: str) -> str:
+    """Return a CRS; raise ValueError unless it is known, projected, and in metres."""
+    from pyproj import CRS  # noqa: PLC0415 - a tenth of a second that not every command needs
+    from pyproj.exceptions import CRSError  # noqa: PLC0415
+
+    advice = "name a projected CRS in metres, such as EPSG:32632"
+    try:
+        parsed = CRS.from_user_input(crs)
+    except CRSError as error:
+        raise ValueError(f"unknown to PROJ: {advice}") from error
+    horizontal = parsed.sub_crs_list[0] if parsed.is_compound else parsed
+    if not horizontal.is_projected:
+        in_degrees = ", in degrees" if horizontal.is_geographic else ""
+        raise ValueError(f"is a {horizontal.type_name}{in_degrees}: {advice}")
+    units = {axis.unit_name for axis in horizontal.axis_info if axis.unit_conversion_factor != 1.0}
+    if units:
+        raise ValueError(f"is in {' and '.join(sorted(units))}: {advice}")
+    return crs
+
+
+def require_time_pattern(pattern: str) -> str:
+    """Return a pattern of scan names; raise ValueError unless times survive being written and read by it."""
+    time = datetime(2025, 7, 15, 13, 14, 15, tzinfo=UTC)
+    try:
+        datetime.strptime(time.strftime(pattern), pattern)  # noqa: DTZ007 - the pattern may contain a zone
+    except (ValueError, re.error, OverflowError) as error:
+        raise ValueError(f"not a pattern of times, such as %y%m%d_%H%M%S: {error}") from error
+    return pattern
+
+
+Utc = Annotated[AwareDatetime, AfterValidator(_in_utc)]
+
+
+class Section(BaseModel):
+    """A table of the site file: no unknown keys, immutable."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
