@@ -125,8 +125,8 @@ class Reprocessing:
     def _repair(self) -> None:
         """Reconcile journal and store and quarantine damaged files, so that their epochs count as missing."""
         with self._console.status(_VERIFYING):
-            self._worker.reconcile()
-            self._worker.verify_store()
+            self._worker.store.reconcile()
+            self._worker.store.verify_store()
 
     def _report_plan(self, span_s: tuple[float, float]) -> Plan:
         """Return the reprocessing plan and report it."""
@@ -160,7 +160,7 @@ class Reprocessing:
             else:
                 scans = self._scans_for(0, at_least=setting)
                 self._worker.run(build_reference_version, scans, version)
-        self._worker.add_checksums()
+        self._worker.store.add_checksums()
         self._report(
             f"reference {version} built from {len(scans)} scans, replaces {' '.join(plan.references)}"
         )
@@ -260,7 +260,7 @@ class Reprocessing:
         self._stop.clear()
         with self._console.status("publishing series.nc …"):
             self._worker.compact()
-            self._worker.reconcile()
+            self._worker.store.reconcile()
             self._worker.publish()
 
     def _progress_bar(self) -> Progress:

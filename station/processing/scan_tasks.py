@@ -26,7 +26,6 @@ from station.errors import ScanError
 from station.inbox.file_hash import hash_if_unchanged, sha256_file
 from station.inbox.inbox import ScanFile
 from station.inbox.journal import Journal
-from station.processing.isolation import trim_heap
 from station.processing.pipeline import (
     AdjustmentInputs,
     adjust_to_reference,
@@ -43,6 +42,7 @@ from station.processing.pipeline import (
 from station.processing.previews import PreviewRecorder
 from station.processing.scan_inputs import ScanInputs, load_scan_inputs
 from station.processing.usable_inputs import usable_site
+from station.processing.worker_process import trim_heap
 from station.products.overview import Overview
 from station.quantities import Bools, Measurement, Quality, Reference, ScanGeometry, VarianceComponents
 from station.queries.aggregates import LEVERAGE_VARIABLES
@@ -83,7 +83,7 @@ class StoredResult:
 
 @dataclass(frozen=True)
 class ScanHistory:
-    """What the journal knows about a scan from earlier processing."""
+    """What the journal knows about a scan from earlier processing and about other scans, and the time."""
 
     reference: str | None = None  # version the scan was processed with
     revision: int = 0
@@ -91,6 +91,7 @@ class ScanHistory:
     stored_scans: Mapping[str, str] = field(default_factory=dict)  # names of other stored scans by SHA-256
     wait_for_weather: bool = False  # if the weather log is not up to date yet
     waiting_before: str = ""  # name of an earlier scan that will be processed soon
+    now_s: float = field(default_factory=time.time)  # a scan that begins later is in the future
 
 
 @dataclass(frozen=True)
@@ -145,14 +146,7 @@ def reprocess_scan(
 ) -> StoredResult | Rejected:
     """Process a scan even if its content is known, with the reference version used before."""
     try:
-        return process(
-            site,
-            scan,
-            progress,
-            wait_for_weather=history.wait_for_weather,
-            history=history,
-            with_preview=with_preview,
-        )
+        return process(site, scan, progress, history=history, with_preview=with_preview)
     except ScanError as error:
         is_file = scan.path.is_file() and not scan.path.is_symlink()
         return Rejected(
@@ -165,32 +159,20 @@ def process(
     scan: ScanFile,
     progress: Progress,
     *,
-    wait_for_weather: bool = False,
-    history: ScanHistory = ScanHistory(),
+    history: ScanHistory | None = None,
     with_preview: bool = False,
 ) -> StoredResult:
     """Process a scan and store its epoch, unless an identical one is stored; record a preview if asked to.
 
     Raises ScanError if the scan cannot be used. Raises NotReadyError if it changes meanwhile, begins in the
-    future, or, with `wait_for_weather`, arrived recently and has no weather yet.
+    future, or has no weather yet and is to wait for it.
     """
-    began_s = time.monotonic()
+    began_s, history = time.monotonic(), history or ScanHistory()
     series = series_for(site)
     with hash_if_unchanged(scan.path) as scan_sha256:
         progress()
-        wait_s = site.weather.wait_s if wait_for_weather and site.weather else 0.0
-        is_recent = time.time() - scan.mtime_ns * 1e-9 < wait_s
         reference = load_reference(site, history.reference)
-        epoch = _compute_epoch(
-            site,
-            scan,
-            scan_sha256,
-            reference,
-            progress,
-            is_dry_run=False,
-            wait_for_weather=is_recent,
-            waiting_before=history.waiting_before,
-        )
+        epoch = _compute_epoch(site, scan, scan_sha256, reference, history, progress)
     if not history.revision:
         _require_new_start(site, epoch.start_s)
     version, epoch_file = epoch.provenance["reference_version"], _identical_epoch(series, epoch)
@@ -234,7 +216,7 @@ def dry_run(site: Site, scan: ScanFile, progress: Progress) -> tuple[str, str, d
     """Return verdict, reason and metrics of a scan; nothing is stored."""
     began_s, site = time.monotonic(), usable_site(site)
     reference = None if isinstance(site.reference.scans, Path) else load_reference(site)
-    epoch = _compute_epoch(site, scan, "", reference, progress, is_dry_run=True, wait_for_weather=False)
+    epoch = _compute_epoch(site, scan, "", reference, ScanHistory(), progress, is_dry_run=True)
     return epoch.verdict, epoch.verdict_reason, _log_metrics(epoch, time.monotonic() - began_s)
 
 
@@ -243,15 +225,14 @@ def _compute_epoch(
     scan: ScanFile,
     scan_sha256: str,
     reference: Reference | None,
+    history: ScanHistory,
     progress: Progress,
     *,
-    is_dry_run: bool,
-    wait_for_weather: bool,
-    waiting_before: str = "",
+    is_dry_run: bool = False,
 ) -> epochs.Epoch:
     with open_scan_for(site, scan.path) as reader:
         start, end, _ = utc_interval(reader, site.scans.name)
-        reject_future(start, time.time())
+        reject_future(start, history.now_s)
         inputs = load_scan_inputs(
             site,
             reader,
@@ -259,8 +240,8 @@ def _compute_epoch(
             start,
             end,
             save_tilt_offset=not is_dry_run,
-            wait_for_weather=wait_for_weather,
-            waiting_before=waiting_before,
+            wait_for_weather=history.wait_for_weather,
+            waiting_before=history.waiting_before,
         )
         viewing = load_viewing_geometry(site, inputs.geometry, reference) if reference else None
         progress()

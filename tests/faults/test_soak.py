@@ -74,7 +74,7 @@ def run_undisturbed(folder):
         while waiting := journal.waiting():
             worker.process(scan_file(site, site.scans.inbox / waiting[0].name))
         worker._should_stop = lambda: True
-        worker.reconcile()
+        worker.store.reconcile()
 
 
 class Limits:
