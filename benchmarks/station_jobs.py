@@ -29,10 +29,10 @@ from station.errors import StoreError
 from station.inbox.journal import Journal, State
 from station.inbox.scan_files import scan_file
 from station.processing import scan_tasks
-from station.processing.fork_server import PRELOAD
 from station.processing.pipeline import Pose
 from station.processing.reference_tasks import build_reference_version
 from station.processing.scan_inputs import load_scan_inputs
+from station.processing.workers.fork_server import PRELOAD
 from station.quantities import Shots
 from station.readers.las import LasScan
 from station.readers.scan import utc_interval

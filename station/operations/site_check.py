@@ -29,10 +29,10 @@ from station.operations.site_plausibility import (
     tilt_findings,
     weather_time_findings,
 )
-from station.processing import isolation
 from station.processing.integrity import check_store
 from station.processing.scan_inputs import map_position, pressure_fault, scanner_height_m, scanner_to_map
 from station.processing.scan_tasks import dry_run, load_areas, polygon_cells, series_for
+from station.processing.workers import isolation
 from station.readers.flags import read_flags
 from station.readers.inclination import read_inclination
 from station.readers.scan import suffixes

@@ -42,7 +42,7 @@ from station.processing.pipeline import (
 from station.processing.previews import PreviewRecorder
 from station.processing.scan_inputs import ScanInputs, load_scan_inputs
 from station.processing.usable_inputs import usable_site
-from station.processing.worker_process import trim_heap
+from station.processing.workers.worker_process import trim_heap
 from station.products.overview import Overview
 from station.quantities import Bools, Measurement, Quality, Reference, ScanGeometry, VarianceComponents
 from station.queries.aggregates import LEVERAGE_VARIABLES

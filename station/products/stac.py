@@ -19,10 +19,11 @@ from scipy.spatial.transform import Rotation
 
 from station.archive.epochs import EpochRef
 from station.archive.netcdf_layout import Series
+from station.archive.read_errors import read_errors
 from station.archive.reference_files import read_reference
 from station.archive.schema import FILL
 from station.config import Site
-from station.errors import StationError, StoreError
+from station.errors import StationError
 from station.products.epoch_table import EpochTable, read_epoch_table
 from station.products.geotiff import KINDS, export_geotiff, write_cog
 from station.quantities import Floats
@@ -203,15 +204,12 @@ def _adjustment(series: Series, row: int) -> Floats | None:
     It is the mean of the scan: inclination within the scan, refraction and range errors are not in it. None
     without an adjustment. Source: equations.md, 6.1.
     """
-    try:
-        with h5py.File(series.path, "r") as file:
-            if not {"shared_parameter", "parameter_name", "scanner_east"} <= set(file):
-                return None
-            names = [name.tobytes().rstrip(b"\0").decode() for name in file["parameter_name"][:]]
-            estimate = dict(zip(names, file["shared_parameter"][row].tolist(), strict=True))
-            position_m = np.array([file[f"scanner_{axis}"][row] for axis in ("east", "north", "height")])
-    except (OSError, RuntimeError, KeyError) as error:
-        raise StoreError(f"{series.path}: cannot be read: {error}") from error
+    with read_errors(series.path), h5py.File(series.path, "r") as file:
+        if not {"shared_parameter", "parameter_name", "scanner_east"} <= set(file):
+            return None
+        names = [name.tobytes().rstrip(b"\0").decode() for name in file["parameter_name"][:]]
+        estimate = dict(zip(names, file["shared_parameter"][row].tolist(), strict=True))
+        position_m = np.array([file[f"scanner_{axis}"][row] for axis in ("east", "north", "height")])
     values = np.array([estimate.get(name, FILL) for name in POSE])
     if np.any(np.abs([*values, *position_m]) > FILL / 2):
         return None
@@ -225,11 +223,8 @@ def _adjustment(series: Series, row: int) -> Floats | None:
 
 def _time_bounds(series: Series) -> Floats:
     """Return start and end of all epochs (t, 2) [s since 1970]."""
-    try:
-        with h5py.File(series.path, "r") as file:
-            return np.asarray(file["time_bnds"][:], dtype=np.float64)
-    except (OSError, RuntimeError, KeyError) as error:
-        raise StoreError(f"{series.path}: cannot be read: {error}") from error
+    with read_errors(series.path), h5py.File(series.path, "r") as file:
+        return np.asarray(file["time_bnds"][:], dtype=np.float64)
 
 
 def _utc(time_s: float) -> datetime:

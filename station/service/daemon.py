@@ -25,7 +25,7 @@ from station.inbox.lock import LockedFolder, exclusive_lock, require_known
 from station.logs import log_to_stderr, logfmt
 from station.monitoring.metrics import Metrics
 from station.monitoring.preconditions import EARLIEST_S, clock_problem, require_disk_space
-from station.processing import fork_server
+from station.processing.workers import fork_server
 from station.readers.scan import suffixes
 from station.service.host import Host
 from station.service.inbox_watcher import InboxWatcher

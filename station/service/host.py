@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 from queue import SimpleQueue
 
 from station.clock import Clock
-from station.processing.isolation import TaskRunner
+from station.processing.workers.isolation import TaskRunner
 from station.service.inbox_watcher import InboxWatcher
 from station.service.scheduler import JobScheduler, LoopEvent
 from station.service.systemd import SystemdNotifier

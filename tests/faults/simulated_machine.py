@@ -23,8 +23,8 @@ from hooks import boundaries
 
 from station.clock import Clock
 from station.errors import StationError
-from station.processing.isolation import TaskRunner
-from station.processing.worker_process import DIED
+from station.processing.workers.isolation import TaskRunner
+from station.processing.workers.worker_process import DIED
 from station.service.host import Host
 
 WATCHDOG_S = 180.0  # WatchdogSec= of the unit

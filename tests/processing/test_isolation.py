@@ -17,8 +17,8 @@ from pathlib import Path
 import pytest
 
 from station.errors import InconclusiveError, NotReadyError, ScanError, StationError, StoreError
-from station.processing import fork_server, isolation
-from station.processing.isolation import TaskRunner
+from station.processing.workers import fork_server, isolation
+from station.processing.workers.isolation import TaskRunner
 
 HERE = Path(__file__).parent
 
@@ -29,7 +29,7 @@ def tasks(monkeypatch):
     import isolated_tasks
 
     # pytest, because a worker imports the main module, which is that of pytest in a test run
-    fork_server.ensure_running(("station.processing.worker_process", "numpy", "pytest"))
+    fork_server.ensure_running(("station.processing.workers.worker_process", "numpy", "pytest"))
     return isolated_tasks
 
 
@@ -218,7 +218,7 @@ def test_seconds_without_worker_count_failed_starts(tasks, monkeypatch):
 
 SOCKET_FOLDER = """
 from multiprocessing import util
-from station.processing import fork_server
+from station.processing.workers import fork_server
 if __name__ == "__main__":
     fork_server.ensure_running(())
     print(util.get_temp_dir())
@@ -261,9 +261,9 @@ SERVICE = """
 import sys
 sys.path.insert(0, sys.argv[1])
 import isolated_tasks
-from station.processing import fork_server, isolation
+from station.processing.workers import fork_server, isolation
 if __name__ == "__main__":
-    fork_server.ensure_running(("station.processing.isolation",))
+    fork_server.ensure_running(("station.processing.workers.isolation",))
     isolation.run_isolated(isolated_tasks.hang_ignoring_signals, sys.argv[2], memory_gb=1, timeout_s=60)
 """
 
@@ -281,7 +281,7 @@ def test_worker_dies_with_its_killed_parent(tmp_path):
 
 ORPHAN = """
 import multiprocessing, os
-from station.processing import worker_process
+from station.processing.workers import worker_process
 read_end, write_end = os.pipe()
 os.close(write_end)
 class Parent:

@@ -19,8 +19,8 @@ from station.inbox.journal import MAX_FAILURES, Journal, State
 from station.inbox.lock import exclusive_lock
 from station.inbox.scan_files import scan_file
 from station.operations.retry import retry_scans
-from station.processing import fork_server
 from station.processing.scan_tasks import StoredResult
+from station.processing.workers import fork_server
 from station.service.host import Host
 from station.service.worker import Worker
 

@@ -74,7 +74,7 @@ def set_clock(offset_path):
 def shorten_delays(period_s=5.0):
     """Shorten the delays of the service from minutes to fractions of a second."""
     from station.inbox import journal
-    from station.processing import isolation
+    from station.processing.workers import isolation
     from station.service import daemon
 
     journal.FIRST_RETRY_S = journal.MAX_RETRY_S = 0.1

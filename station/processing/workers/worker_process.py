@@ -22,7 +22,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Protocol
 
 from station.errors import StationError
-from station.processing import fork_server
+from station.processing.workers import fork_server
 
 if TYPE_CHECKING:
     from collections.abc import Callable

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, TypeVar
 
 from station.clock import Clock
 from station.errors import InconclusiveError, NotReadyError, StationError
-from station.processing.worker_process import (
+from station.processing.workers.worker_process import (
     DIED,
     NOT_STARTED,
     POLL_S,
