@@ -100,7 +100,8 @@ class EntrySummary(NamedTuple):
     has_epoch: bool = False
 
 
-_COLUMNS = ", ".join(field.name for field in fields(Entry))
+_NAMES = [field.name for field in fields(Entry)]
+_COLUMNS = ", ".join(_NAMES)
 
 
 class Journal:
@@ -563,9 +564,9 @@ class Journal:
 
 
 def _entry_from_row(row: tuple[object, ...]) -> Entry:
-    values = dict(zip((field.name for field in fields(Entry)), row, strict=True))
+    values = dict(zip(_NAMES, row, strict=True))
     values["state"] = State(str(values["state"]))
     values["outcome"] = State(str(values["outcome"])) if values["outcome"] else None
-    values["metrics"] = json.loads(str(values["metrics"]))
+    values["metrics"] = json.loads(str(values["metrics"])) if values["metrics"] != "{}" else {}
     values["ahead"] = bool(values["ahead"])
     return Entry(**values)  # type: ignore[arg-type] # the schema is STRICT: each column has its type
