@@ -45,7 +45,8 @@ from station.inbox.file_hash import sha256_file
 from station.inbox.journal import Entry, Journal, State
 from station.processing.integrity import store_files
 from station.processing.previews import PreviewRecorder
-from station.processing.scan_tasks import StoredResult, load_areas, series_for
+from station.processing.scan_tasks import StoredResult
+from station.processing.site_files import load_areas, series_for
 from station.processing.store_tasks import update_series
 from station.quantities import Bools, Grid, Measurement, Reference, SharedParameters
 from station.queries.blocks import BlockQueries, update_boxes

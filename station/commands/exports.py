@@ -128,7 +128,7 @@ def _export_series(
     options: SeriesOptions,
 ) -> Iterator[Path]:
     """Yield each file of the series when it is written; files that are up to date are kept."""
-    from station.processing.scan_tasks import series_for
+    from station.processing.site_files import series_for
     from station.products.exports.formats import FORMATS
     from station.products.exports.selection import parse_box, pending, select, split
 

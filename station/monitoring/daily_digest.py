@@ -17,7 +17,7 @@ from station.inbox.journal import Entry, Journal, State
 from station.monitoring.alarm_rules import DAY_S
 from station.monitoring.alarm_state import active
 from station.monitoring.area_curves import AreaCurve, read_curves
-from station.processing.scan_tasks import Progress
+from station.processing.workers.worker_process import Progress
 from station.science.gridding.significance import SIGNIFICANT_SIGMAS
 
 MAX_BYTES = 10_000

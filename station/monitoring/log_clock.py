@@ -8,7 +8,7 @@ import numpy as np
 from station.archive.read_errors import read_errors
 from station.archive.schema import FILL
 from station.config import Site
-from station.processing.scan_tasks import series_for
+from station.processing.site_files import series_for
 
 MAX_SCANS = 24  # newest of the series
 MIN_SCANS = 6  # with an estimate

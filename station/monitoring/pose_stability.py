@@ -15,7 +15,7 @@ from station.archive.read_errors import read_errors
 from station.archive.reference_files import read_variance_components
 from station.archive.schema import VERDICTS
 from station.config import Site
-from station.processing.scan_tasks import series_for
+from station.processing.site_files import series_for
 from station.quantities import Bools, Floats
 from station.science.analysis.pose_steps import Step, detect_steps, pose_sigma
 from station.science.uncertainty.parameters import GLOBAL

@@ -16,7 +16,7 @@ from station.config import Site, read_site
 from station.inbox.journal import Entry, State
 from station.operations.batch import format_entry, process_scans
 from station.processing.previews import page_folder
-from station.processing.scan_tasks import series_for
+from station.processing.site_files import series_for
 from station.quantities import Quality
 from station.queries.aggregates import Aggregates
 from station.simulation.station import demo, simulate

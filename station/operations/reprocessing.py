@@ -27,8 +27,6 @@ from station.inbox.journal import Journal
 from station.inbox.lock import exclusive_lock
 from station.inbox.scan_files import find_scan
 from station.monitoring.preconditions import require_disk_space
-from station.processing.dask_executor import DaskExecutor
-from station.processing.executors import Executor, LocalExecutor
 from station.processing.integrity import missing_epochs, verify_checksums
 from station.processing.reference_tasks import (
     build_reference_version,
@@ -36,18 +34,15 @@ from station.processing.reference_tasks import (
     scans_for_version,
     update_reference_version,
 )
-from station.processing.scan_inputs import load_scan_inputs, sop_identity
-from station.processing.scan_tasks import Progress as Tick
-from station.processing.scan_tasks import (
-    Rejected,
-    ScanHistory,
-    StoredResult,
-    load_reference,
-    open_scan_for,
-    series_for,
-)
+from station.processing.scan_inputs import load_scan_inputs
+from station.processing.scan_tasks import Rejected, ScanHistory, StoredResult, load_reference
+from station.processing.scanner_pose import sop_identity
+from station.processing.site_files import open_scan_for, series_for
 from station.processing.staleness import Plan, Task, plan_reprocessing, usable_scans
 from station.processing.usable_inputs import usable_site
+from station.processing.workers.dask_executor import DaskExecutor
+from station.processing.workers.executors import Executor, LocalExecutor
+from station.processing.workers.worker_process import Progress as Tick
 from station.readers.scan import utc_interval
 from station.readers.sop import valid_sop
 from station.service.worker import Worker, record_result

@@ -30,8 +30,10 @@ from station.operations.site_plausibility import (
     weather_time_findings,
 )
 from station.processing.integrity import check_store
-from station.processing.scan_inputs import map_position, pressure_fault, scanner_height_m, scanner_to_map
-from station.processing.scan_tasks import dry_run, load_areas, polygon_cells, series_for
+from station.processing.scan_air import pressure_fault
+from station.processing.scan_tasks import dry_run
+from station.processing.scanner_pose import map_position, scanner_height_m, scanner_to_map
+from station.processing.site_files import load_areas, polygon_cells, series_for
 from station.processing.workers import isolation
 from station.readers.flags import read_flags
 from station.readers.inclination import read_inclination

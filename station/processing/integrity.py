@@ -42,7 +42,8 @@ from station.inbox.file_hash import sha256_file
 from station.inbox.journal import Entry, State
 from station.inbox.scan_files import find_scan
 from station.processing.provenance import StoredEpoch, stored_epochs
-from station.processing.scan_tasks import Progress, series_for
+from station.processing.site_files import series_for
+from station.processing.workers.worker_process import Progress
 from station.readers.scan import suffixes
 
 

@@ -16,7 +16,8 @@ from station.archive.series.virtual import build_series
 from station.config import Site
 from station.errors import StoreError
 from station.inbox.file_hash import sha256_file
-from station.processing.scan_tasks import Progress, load_area_polygons, load_areas, series_for
+from station.processing.site_files import load_area_polygons, load_areas, series_for
+from station.processing.workers.worker_process import Progress
 from station.queries.aggregates import Aggregates
 from station.queries.blocks import BlockQueries, update_boxes
 

@@ -13,7 +13,9 @@ from station.monitoring.log_clock import log_clock_offset
 from station.monitoring.pose_stability import step_shown_by
 from station.monitoring.status import queue_status
 from station.processing.previews import page_folder
-from station.processing.scan_tasks import Progress, StoredResult, series_for
+from station.processing.scan_tasks import StoredResult
+from station.processing.site_files import series_for
+from station.processing.workers.worker_process import Progress
 from station.products.export import export
 from station.products.page import PageContext, write_page
 

@@ -20,7 +20,7 @@ from station.processing.reference_tasks import (
     scans_needed,
     update_reference_version,
 )
-from station.processing.scan_tasks import series_for
+from station.processing.site_files import series_for
 from station.service.store_repair import RunTask, StoreRepair
 
 log = logging.getLogger("station")

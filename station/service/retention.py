@@ -16,7 +16,8 @@ from station.inbox.file_hash import file_identity, sha256_file
 from station.inbox.inbox import ScanFile
 from station.inbox.journal import Entry
 from station.inbox.scan_files import archive_path, scan_file
-from station.processing.scan_tasks import Progress, series_for, sha256_log
+from station.processing.site_files import series_for, sha256_log
+from station.processing.workers.worker_process import Progress
 
 MAX_PER_RUN = 50  # scans per maintenance run; there are four runs a day
 

@@ -24,7 +24,7 @@ from station.processing.integrity import (
     unreadable_files,
     verify_checksums,
 )
-from station.processing.scan_tasks import series_for
+from station.processing.site_files import series_for
 from station.processing.store_tasks import update_series
 from station.science.geometry.pose import horizontal_crs, is_same_map
 

@@ -15,14 +15,13 @@ from station.monitoring.daily_digest import write_digest, yesterday
 from station.processing.integrity import holds_epochs
 from station.processing.scan_tasks import (
     Duplicate,
-    Progress,
     Rejected,
     ScanHistory,
     StoredResult,
     check_header,
     process_new,
-    series_for,
 )
+from station.processing.site_files import series_for
 from station.processing.staleness import count_outdated, late_inputs
 from station.processing.store_tasks import (
     MAX_STORE_TASK_S,
@@ -33,6 +32,7 @@ from station.processing.store_tasks import (
     update_series,
 )
 from station.processing.usable_inputs import with_usable_inputs
+from station.processing.workers.worker_process import Progress
 from station.service.background_compaction import BackgroundCompaction
 from station.service.host import Host
 from station.service.publishing import publish

@@ -26,9 +26,9 @@ from station.operations import reprocessing
 from station.operations.batch import process_scans
 from station.operations.reprocessing import Reprocessing, reprocess
 from station.operations.site_check import store_findings
-from station.processing.dask_executor import require_secure
-from station.processing.scan_tasks import series_for
+from station.processing.site_files import series_for
 from station.processing.staleness import count_outdated
+from station.processing.workers.dask_executor import require_secure
 from station.service.worker import Worker
 from station.simulation.station import simulate, small
 

@@ -16,9 +16,10 @@ from station.config import read_site
 from station.errors import ConfigError, NotReadyError, ScanError
 from station.inbox.scan_files import scan_file
 from station.operations import site_check
-from station.processing import provenance, reference_tasks, scan_tasks
+from station.processing import provenance, reference_tasks, scan_tasks, site_files
 from station.processing.pipeline import to_map
-from station.processing.scan_inputs import load_scan_inputs, pressure_fault
+from station.processing.scan_air import pressure_fault
+from station.processing.scan_inputs import load_scan_inputs
 from station.processing.scan_tasks import ScanHistory
 from station.quantities import Air, Quality
 from station.readers.scan import utc_interval
@@ -99,7 +100,7 @@ def test_damaged_tilt_offset_is_restored_from_the_epochs(folder, content):
 def test_map_that_a_scan_declares_must_be_that_of_the_site(declared, is_same):
     wkt = CRS.from_user_input(declared).to_wkt()
     with nullcontext() if is_same else pytest.raises(ScanError, match=r"map\.crs is WGS 84 / UTM zone 32N"):
-        scan_tasks._require_same_map(wkt, "EPSG:32632")
+        site_files._require_same_map(wkt, "EPSG:32632")
 
 
 def test_line_times_match_the_shots(folder):

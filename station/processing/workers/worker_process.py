@@ -17,6 +17,7 @@ import resource
 import signal
 import time
 import traceback
+from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Protocol
@@ -25,10 +26,10 @@ from station.errors import StationError
 from station.processing.workers import fork_server
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
     from multiprocessing.connection import Connection
 
 Message = tuple[str, object]
+Progress = Callable[[], None]  # tells the parent of a worker process that it is alive
 
 DIED = ("died", None)  # in place of a report, if there will be none
 NOT_STARTED = ("not started", None)  # likewise, before the first message: the task is not the cause
