@@ -42,7 +42,8 @@ from station.archive.series.lazy import open_series
 from station.archive.series.virtual import build_series
 from station.config import Site, read_site
 from station.inbox.file_hash import sha256_file
-from station.inbox.journal import Entry, Journal, State
+from station.inbox.journal import Journal
+from station.inbox.journal_reader import Entry, State
 from station.processing.integrity import store_files
 from station.processing.previews import PreviewRecorder
 from station.processing.scan_tasks import StoredResult

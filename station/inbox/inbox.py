@@ -24,14 +24,16 @@ from typing import TYPE_CHECKING
 
 from station.errors import NotReadyError
 from station.inbox.file_hash import sample_file
-from station.inbox.journal import LONGEST_RETRY_S, UNFINISHED, State
+from station.inbox.journal import LONGEST_RETRY_S
+from station.inbox.journal_reader import UNFINISHED, State
 from station.logs import logfmt
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Mapping
 
     from station.config import Site
-    from station.inbox.journal import EntrySummary, Journal
+    from station.inbox.journal import Journal
+    from station.inbox.journal_reader import EntrySummary
 
 log = logging.getLogger("station")
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from station.errors import NotReadyError, StationError, StoreError
 from station.inbox.inbox import is_scan, list_folder, safe_name
-from station.inbox.journal import Entry, Journal, State
+from station.inbox.journal_reader import Entry, JournalReader, State
 from station.inbox.lock import is_locked, pause_reason
 from station.monitoring.alarm_state import active
 from station.monitoring.preconditions import clock_problem, format_utc, require_disk_space
@@ -32,7 +32,7 @@ def status(site: Site) -> Status:
     from station.processing.usable_inputs import usable_site  # noqa: PLC0415 - a second of imports
 
     site, data = usable_site(site), site.station.data
-    with Journal(data / "journal.sqlite", read_only=True) as journal:
+    with JournalReader(data / "journal.sqlite") as journal:
         waiting = journal.waiting()
         queue = _queue_status(site, journal, waiting)
         counts = journal.counts()
@@ -60,11 +60,11 @@ def queue_status(site: Site) -> Status:
 
     `input_faults` of the site are among the faults.
     """
-    with Journal(site.station.data / "journal.sqlite", read_only=True) as journal:
+    with JournalReader(site.station.data / "journal.sqlite") as journal:
         return _queue_status(site, journal, journal.waiting())
 
 
-def _queue_status(site: Site, journal: Journal, entries: list[Entry]) -> Status:
+def _queue_status(site: Site, journal: JournalReader, entries: list[Entry]) -> Status:
     waiting = [_waiting_scan(entry) for entry in entries]
     set_aside = [
         {"scan": entry.name, "reason": entry.reason, "since": format_utc(entry.changed_utc_s)}

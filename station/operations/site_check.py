@@ -15,7 +15,7 @@ from station.archive.reference_files import valid_versions
 from station.config import Site, read_site
 from station.errors import NotReadyError, ScanError, StationError
 from station.inbox.inbox import start_from_name
-from station.inbox.journal import Journal
+from station.inbox.journal_reader import JournalReader
 from station.inbox.lock import is_locked
 from station.inbox.scan_files import scan_file
 from station.monitoring.preconditions import EARLIEST_S
@@ -79,7 +79,7 @@ def store_findings(site_path: Path) -> list[Finding]:
 
 
 def _check_store_isolated(site: Site) -> list[tuple[str, str, str]]:
-    with Journal(site.station.data / "journal.sqlite", read_only=True) as journal:
+    with JournalReader(site.station.data / "journal.sqlite") as journal:
         entries, known = journal.rows(), journal.checksums()
     return isolation.run_isolated(
         check_store, site, entries, known, memory_gb=site.service.memory_gb, timeout_s=math.inf

@@ -24,7 +24,7 @@ from station.config import Site
 from station.errors import ConfigError, NotReadyError, ScanError
 from station.inbox.file_hash import sha256_file
 from station.inbox.inbox import ScanFile
-from station.inbox.journal import Entry
+from station.inbox.journal_reader import Entry
 from station.processing.scan_air import air_from_log
 from station.processing.scanner_pose import scanner_height_m, sop_identity
 from station.quantities import Air

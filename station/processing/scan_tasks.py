@@ -22,7 +22,7 @@ from station.config import Site
 from station.errors import ScanError
 from station.inbox.file_hash import hash_if_unchanged, sha256_file
 from station.inbox.inbox import ScanFile
-from station.inbox.journal import Journal
+from station.inbox.journal_reader import JournalReader
 from station.processing.epoch_scalars import air_key, log_metrics, scalar_variables
 from station.processing.pipeline import (
     AdjustmentInputs,
@@ -179,7 +179,7 @@ def process(
 
 def _require_new_start(site: Site, start_utc_s: float) -> None:
     """Raise ScanError if a scan of another name with the same start is stored: it would be replaced."""
-    with Journal(site.station.data / "journal.sqlite", read_only=True) as journal:
+    with JournalReader(site.station.data / "journal.sqlite") as journal:
         stored = journal.starting_at(start_utc_s)
     if stored:
         start = datetime.fromtimestamp(start_utc_s, UTC)

@@ -15,7 +15,7 @@ from station.archive.reference_files import valid_versions
 from station.archive.schema import VERDICTS
 from station.config import Site
 from station.inbox.inbox import ScanFile
-from station.inbox.journal import Entry, State
+from station.inbox.journal_reader import Entry, State
 from station.inbox.scan_files import find_scan
 from station.processing.provenance import CurrentConfig, ScanProvenance, StoredEpoch, stored_epochs
 from station.processing.site_files import file_version, series_for

@@ -20,7 +20,8 @@ from typing import TYPE_CHECKING, Protocol
 from station.config import Site, read_site
 from station.errors import ConfigError, NotReadyError, StationError
 from station.inbox.inbox import Inbox, ScanFile
-from station.inbox.journal import Journal, State
+from station.inbox.journal import Journal
+from station.inbox.journal_reader import State
 from station.inbox.lock import LockedFolder, exclusive_lock, require_known
 from station.logs import log_to_stderr, logfmt
 from station.monitoring.metrics import Metrics

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from station.config import Site
 from station.errors import StationError
-from station.inbox.journal import Journal
+from station.inbox.journal_reader import JournalReader
 from station.monitoring.log_clock import log_clock_offset
 from station.monitoring.pose_stability import step_shown_by
 from station.monitoring.status import queue_status
@@ -61,7 +61,7 @@ def _write_products(site: Site, result: StoredResult | None, faults: list[str], 
 
 def _page_context(site: Site, result: StoredResult | None, faults: list[str]) -> PageContext:
     backlog = queue_status(site)
-    with Journal(site.station.data / "journal.sqlite", read_only=True) as journal:
+    with JournalReader(site.station.data / "journal.sqlite") as journal:
         durations_s = journal.durations_s()
     return PageContext(
         name=site.station.name,

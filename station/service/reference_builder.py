@@ -10,7 +10,8 @@ from station.archive.reference_files import valid_versions
 from station.config import Site
 from station.errors import NotReadyError, ScanError
 from station.inbox.inbox import ScanFile, start_from_name
-from station.inbox.journal import Journal, State
+from station.inbox.journal import Journal
+from station.inbox.journal_reader import State
 from station.inbox.scan_files import find_scan
 from station.logs import logfmt
 from station.processing.reference_tasks import (

@@ -14,7 +14,7 @@ from station.config import Site
 from station.errors import NotReadyError, ScanError
 from station.inbox.file_hash import file_identity, sha256_file
 from station.inbox.inbox import ScanFile
-from station.inbox.journal import Entry
+from station.inbox.journal_reader import Entry
 from station.inbox.scan_files import archive_path, scan_file
 from station.processing.site_files import series_for, sha256_log
 from station.processing.workers.worker_process import Progress

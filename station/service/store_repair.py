@@ -11,7 +11,8 @@ from station.archive.series.index import stored_series
 from station.clock import Clock
 from station.config import Site
 from station.errors import ConfigError, StoreError
-from station.inbox.journal import Journal, State
+from station.inbox.journal import Journal
+from station.inbox.journal_reader import State
 from station.logs import logfmt
 from station.processing.integrity import (
     add_checksums,

@@ -9,7 +9,8 @@ from typing import TypeVar
 from station.config import Site
 from station.errors import InconclusiveError, NotReadyError, ScanError, StationError, StoreError
 from station.inbox.inbox import ScanFile
-from station.inbox.journal import Entry, Journal, State
+from station.inbox.journal import Journal
+from station.inbox.journal_reader import Entry, State
 from station.logs import logfmt
 from station.monitoring.daily_digest import write_digest, yesterday
 from station.processing.integrity import holds_epochs

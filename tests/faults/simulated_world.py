@@ -31,7 +31,7 @@ from support.tiny_station import PENDING, build, scan_name, values
 
 from station.config import read_site
 from station.errors import StationError
-from station.inbox.journal import Journal, State
+from station.inbox.journal_reader import JournalReader, State
 from station.inbox.lock import IDENTITY
 from station.processing import integrity
 from station.service.daemon import Daemon, LoopTiming
@@ -230,7 +230,7 @@ class World(Machine):
         path = self.data / self.rng.choice(["series.nc", "areas.nc"])
         if path.exists() and path.with_name("journal.sqlite").exists():
             self._damage(path)
-            with Journal(path.with_name("journal.sqlite"), read_only=True) as opened:
+            with JournalReader(path.with_name("journal.sqlite")) as opened:
                 site, rows, known = read_site(self.folder / "site.toml"), opened.rows(), opened.checksums()
             findings = integrity.check_store(site, rows, known, lambda: None)
             if not any(level != "ok" and path.name in message for level, _, message in findings):
@@ -369,7 +369,7 @@ class World(Machine):
         """Return the rows of the journal by scan."""
         if not (self.data / "journal.sqlite").exists():
             return {}
-        with Journal(self.data / "journal.sqlite", read_only=True) as opened:
+        with JournalReader(self.data / "journal.sqlite") as opened:
             return {row.name: row for row in opened.rows()}
 
     def defects(self, undisturbed: World) -> list[str]:

@@ -18,7 +18,8 @@ import station
 from station.archive.reference_files import read_reference_provenance
 from station.config import read_site
 from station.errors import ConfigError, NotReadyError
-from station.inbox.journal import Journal, State
+from station.inbox.journal import Journal
+from station.inbox.journal_reader import State
 from station.inbox.lock import exclusive_lock
 from station.inbox.scan_files import scan_file
 from station.monitoring.status import status as station_status

@@ -20,7 +20,7 @@ from support.fake_service import FakeWorker
 
 from station.clock import Clock
 from station.errors import ConfigError, NotReadyError, StoreError
-from station.inbox.journal import Journal, State
+from station.inbox.journal_reader import JournalReader, State
 from station.inbox.lock import is_locked, read_identity
 from station.monitoring.status import status
 from station.service import daemon
@@ -276,7 +276,7 @@ def test_sigterm_abandons_the_scan_after_the_grace_period(write_site, start):
     assert service.end() == 0
     assert 0.4 < time.monotonic() - start_s < 4.0
     assert stored(path) == []
-    with Journal(path.parent / "data" / "journal.sqlite", read_only=True) as journal:
+    with JournalReader(path.parent / "data" / "journal.sqlite") as journal:
         assert journal.entry("slow.laz").state is State.LATER
     assert "STOPPING=1" in service.notifications()
     assert service.log().splitlines()[-1].endswith("service=stopped")

@@ -7,7 +7,8 @@ import pytest
 from station.config import read_site
 from station.errors import ConfigError, NotReadyError, ScanError
 from station.inbox.file_hash import sha256_file
-from station.inbox.journal import Journal, State
+from station.inbox.journal import Journal
+from station.inbox.journal_reader import State
 from station.service import retention
 from station.service.retention import apply_retention, expired_scans
 

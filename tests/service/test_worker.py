@@ -15,7 +15,8 @@ from station.clock import Clock
 from station.config import read_site
 from station.errors import InconclusiveError, NotReadyError, ScanError, StationError
 from station.inbox.inbox import ScanFile
-from station.inbox.journal import MAX_FAILURES, Journal, State
+from station.inbox.journal import MAX_FAILURES, Journal
+from station.inbox.journal_reader import State
 from station.inbox.lock import exclusive_lock
 from station.inbox.scan_files import scan_file
 from station.operations.retry import retry_scans
