@@ -15,7 +15,7 @@ from typing import Any
 
 from benchmarks.peers import M3C2, PEERS, GridTask, Peer, peer_cost
 from benchmarks.process_cost import Cost, FailedError, Row, cost_of, job_cost, median_cost, print_rows
-from station.processing.fork_server import WORKER_ENV
+from station.processing.workers.fork_server import WORKER_ENV
 
 ROUNDS = 3  # scans, and start-ups: the median of each is taken
 PEAK_LIMIT_GB = 0.9

@@ -14,7 +14,7 @@ from scipy import stats
 
 from station.archive.series.lazy import open_series, open_virtual
 from station.config import Site
-from station.processing.scan_tasks import series_for
+from station.processing.site_files import series_for
 from station.quantities import Bools, Floats, Quality
 from station.queries.aggregates import Aggregates
 from station.science.analysis.calibration import z_statistics

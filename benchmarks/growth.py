@@ -42,10 +42,12 @@ from station.archive.series.lazy import open_series
 from station.archive.series.virtual import build_series
 from station.config import Site, read_site
 from station.inbox.file_hash import sha256_file
-from station.inbox.journal import Entry, Journal, State
+from station.inbox.journal import Journal
+from station.inbox.journal_reader import Entry, State
 from station.processing.epoch_recorder import EpochRecorder
 from station.processing.integrity import store_files
-from station.processing.scan_tasks import StoredResult, load_areas, series_for
+from station.processing.scan_tasks import StoredResult
+from station.processing.site_files import load_areas, series_for
 from station.processing.store_tasks import update_series
 from station.quantities import Bools, Grid, Measurement, Reference, SharedParameters
 from station.queries.blocks import BlockQueries, update_boxes

@@ -19,7 +19,7 @@ import laspy
 import numpy as np
 
 from benchmarks.process_cost import Cost, job_cost
-from station.processing.fork_server import WORKER_ENV
+from station.processing.workers.fork_server import WORKER_ENV
 from station.quantities import Floats, WeatherLog
 from station.simulation import files
 from station.simulation.instrument import motion

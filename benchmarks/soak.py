@@ -25,7 +25,7 @@ from rich.table import Table
 from benchmarks.process_cost import SERVICE_PROCESSES, cpu_of, family
 from station.config import Site, read_site
 from station.errors import StoreError
-from station.inbox.journal import Journal, State
+from station.inbox.journal_reader import JournalReader, State
 from station.simulation.files import NAME_FORMAT
 from station.simulation.scenario import small
 from station.simulation.station import simulate
@@ -119,7 +119,7 @@ def _deliver(scan: Path, start: datetime, inbox: Path) -> None:
 
 def _counts(site: Site) -> dict[str, int]:
     try:
-        with Journal(site.station.data / "journal.sqlite", read_only=True) as journal:
+        with JournalReader(site.station.data / "journal.sqlite") as journal:
             return journal.counts()
     except StoreError:  # not created yet
         return dict.fromkeys((state.value for state in State), 0)

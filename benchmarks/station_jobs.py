@@ -26,13 +26,13 @@ from benchmarks.process_cost import SERVICE_PROCESSES, cpu_of, end_startup, fami
 from station.archive import geometry_cache
 from station.config import Site, read_site
 from station.errors import StoreError
-from station.inbox.journal import Journal, State
+from station.inbox.journal_reader import JournalReader, State
 from station.inbox.scan_files import scan_file
 from station.processing import scan_tasks
-from station.processing.fork_server import PRELOAD
 from station.processing.pipeline import Pose
 from station.processing.reference_tasks import build_reference_version
 from station.processing.scan_inputs import load_scan_inputs
+from station.processing.workers.fork_server import PRELOAD
 from station.quantities import Shots
 from station.readers.las import LasScan
 from station.readers.scan import utc_interval
@@ -222,7 +222,7 @@ def _wait_until_idle(process: subprocess.Popen[bytes], settings: Site, stored: i
 
 def _stored_scans(settings: Site) -> int:
     try:
-        with Journal(settings.station.data / "journal.sqlite", read_only=True) as journal:
+        with JournalReader(settings.station.data / "journal.sqlite") as journal:
             return journal.counts()[State.STORED]
     except StoreError:  # not created yet
         return 0

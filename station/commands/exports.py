@@ -133,7 +133,7 @@ def _export_series(
     options: SeriesOptions,
 ) -> Iterator[Path]:
     """Yield each file of the series when it is written; files that are up to date are kept."""
-    from station.processing.scan_tasks import series_for
+    from station.processing.site_files import series_for
     from station.products.exports.formats import FORMATS
     from station.products.exports.selection import parse_box, pending, select, split
 
@@ -158,11 +158,11 @@ def _verifier(settings: Site) -> Callable[[Path], None]:
     """
     from station.errors import StoreError
     from station.inbox.file_hash import sha256_file
-    from station.inbox.journal import Journal
+    from station.inbox.journal_reader import JournalReader
 
     folder, checksums = settings.station.data, dict[str, str]()
     if (folder / "journal.sqlite").is_file():
-        with Journal(folder / "journal.sqlite", read_only=True) as journal:
+        with JournalReader(folder / "journal.sqlite") as journal:
             checksums = journal.checksums()
 
     @cache  # a month has one file and is read for each of its days

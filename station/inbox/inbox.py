@@ -23,14 +23,17 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from station.errors import NotReadyError
-from station.inbox.journal import LONGEST_RETRY_S, UNFINISHED, State
+from station.inbox.file_hash import sample_file
+from station.inbox.journal import LONGEST_RETRY_S
+from station.inbox.journal_reader import UNFINISHED, State
 from station.logs import logfmt
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Mapping
 
     from station.config import Site
-    from station.inbox.journal import EntrySummary, Journal
+    from station.inbox.journal import Journal
+    from station.inbox.journal_reader import EntrySummary
 
 log = logging.getLogger("station")
 
@@ -38,6 +41,7 @@ log = logging.getLogger("station")
 _SAFE_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._,+=@~()-]{0,99}")
 MAX_REJECTED = 1000  # per poll, so that thousands of odd files delay no scan and no sign of life
 MAX_LOGGED = 10  # of them, one line each
+WAITING_TO_SETTLE = "size and mtime to be stable"
 WAITING_FOR_LOG = "its inclination log"
 WAITING_TO_BE_CLOSED = "another process to close it"
 MAX_LIVE_INTERVALS = 2.0  # of the expected interval: a scan that began earlier is not live
@@ -109,6 +113,7 @@ class Inbox:
         self._file_states: dict[str, _FileState] = {}
         self._prechecked: set[tuple[int, ...]] = set()
         self._last_was_ahead = False
+        self._samples: dict[tuple[str, int, int], bytes] = {}  # by name, size and mtime
 
     def poll(self) -> InboxState:
         """Return the state of the inbox; record new, changed and removed scans in the journal.
@@ -167,8 +172,9 @@ class Inbox:
     ) -> ScanFile | None:
         """Return the newest of the scans that are ready if it is live and would be more than one scan late.
 
-        It began recently and has no epoch. One with the size or the start of another that waits takes its
-        turn: of two copies the earlier counts. Between two live scans one of the backlog is processed.
+        It began recently and has no epoch. One that may be a copy of another that waits, or has its start,
+        takes its turn: of two copies the earlier counts. Between two live scans one of the backlog is
+        processed.
         """
         if len(ready) <= 2 or self._last_was_ahead:
             return None
@@ -177,12 +183,33 @@ class Inbox:
         is_live = abs(self._now_s() - start.timestamp()) < self._max_live_s
         if not is_live or (summary is not None and summary.has_epoch) or _is_open_for_writing(scan):
             return None
-        may_be_copy = any(
-            size == scan.size or start_from_name(name, self._pattern) == start
-            for name, size, _, _ in waiting.values()
-            if name != scan.name
-        )
-        return None if may_be_copy else scan
+        others = [file for name, file in waiting.items() if name != scan.name]
+        if any(start_from_name(name, self._pattern) == start for name, *_ in others):
+            return None
+        same_size = [file for file in others if file[1] == scan.size]
+        return None if same_size and self._may_be_copy(scan, same_size) else scan
+
+    def _may_be_copy(self, scan: ScanFile, others: Iterable[tuple[str, int, int, str]]) -> bool:
+        """Return True unless a sample of the bytes shows that a scan differs from all others of its size.
+
+        Scans in a format without compression all have the same size.
+        """
+        try:
+            sample = self._sample(scan.name, scan.size, scan.mtime_ns)
+            return any(
+                reason.startswith((WAITING_TO_SETTLE, WAITING_TO_BE_CLOSED))  # its bytes may still change
+                or self._sample(name, size, mtime_ns) == sample
+                for name, size, mtime_ns, reason in others
+            )
+        except NotReadyError:
+            return True
+
+    def _sample(self, name: str, size: int, mtime_ns: int) -> bytes:
+        """Return the digest of a sample of a file, which is read once."""
+        key = name, size, mtime_ns
+        if key not in self._samples:
+            self._samples[key] = hashlib.sha256(sample_file(self._folder / name, size)).digest()
+        return self._samples[key]
 
     def _assess(
         self,
@@ -203,7 +230,7 @@ class Inbox:
         scan = ScanFile(name, self._folder / name, log_path, status.st_size, status.st_mtime_ns)
         stable_s = now_s - file_state.unchanged_since_s
         if stable_s < self._settle_s:
-            return scan, f"size and mtime to be stable for {self._settle_s:g} s", self._settle_s - stable_s
+            return scan, f"{WAITING_TO_SETTLE} for {self._settle_s:g} s", self._settle_s - stable_s
         if self._inclination and self._inclination.required and log_path is None:
             remaining_s = self._inclination.wait_s - stable_s
             if remaining_s > 0:
@@ -247,6 +274,8 @@ class Inbox:
                 log.warning(logfmt(scan=name, verdict="gone", reason="removed before it was processed"))
         for name in self._file_states.keys() - set(scans):
             del self._file_states[name]
+        for key in [key for key in self._samples if key[0] not in unfinished]:
+            del self._samples[key]
 
 
 def list_folder(folder: Path) -> dict[str, os.stat_result]:

@@ -16,7 +16,7 @@ import numpy as np
 from station.config import Site
 from station.errors import StationError, StoreError
 from station.inbox.inbox import is_scan, list_folder, safe_name
-from station.inbox.journal import Entry, Journal, State
+from station.inbox.journal_reader import Entry, JournalReader, State
 from station.inbox.lock import is_locked
 from station.logs import logfmt
 from station.monitoring.alarm_state import Alarm
@@ -75,7 +75,7 @@ def _service(site: Site, rules: AlarmsSection, since_utc_s: float, now_s: float)
     if not (site.station.data / "journal.sqlite").is_file():
         return
     span_s = max(DAY_S, rules.no_scan_h * 3600)
-    with Journal(site.station.data / "journal.sqlite", read_only=True) as journal:
+    with JournalReader(site.station.data / "journal.sqlite") as journal:
         recent = journal.changed_since(now_s - span_s)
         newest = journal.newest(CALIBRATION_SCANS)
     yield from _no_scan(rules, recent, since_utc_s, now_s)
@@ -100,7 +100,7 @@ def _no_scan(rules: AlarmsSection, recent: list[Entry], since_utc_s: float, now_
 def _stalled(site: Site, rules: AlarmsSection, now_s: float) -> Iterator[Alarm]:
     """Yield an alarm if scans wait unprocessed while no other scan is processed."""
     from_s = now_s - rules.stalled_h * 3600
-    with Journal(site.station.data / "journal.sqlite", read_only=True) as journal:
+    with JournalReader(site.station.data / "journal.sqlite") as journal:
         if not rules.stalled_h or journal.changed_since(from_s):
             return
         waiting = [entry for entry in journal.waiting() if entry.state is State.WAITING]

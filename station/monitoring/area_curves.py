@@ -8,10 +8,10 @@ import h5py
 import numpy as np
 
 from station.archive.netcdf_layout import decode_text
+from station.archive.read_errors import read_errors
 from station.archive.schema import FILL, VERDICTS
 from station.archive.series.epoch_reader import middle
 from station.config import Site
-from station.errors import StoreError
 from station.quantities import Floats
 
 
@@ -34,7 +34,7 @@ def read_curves(site: Site, from_utc_s: float) -> list[AreaCurve]:
     areas, series = (site.station.data / name for name in ("areas.nc", "series.nc"))
     if not (areas.is_file() and series.is_file()):
         return []
-    try:
+    with read_errors(areas):
         with h5py.File(series, "r") as file:
             rows = slice(int(np.searchsorted(middle(file["time_bnds"][:]), from_utc_s)), None)
             series_files = decode_text(file["epoch_file"][rows])
@@ -48,8 +48,6 @@ def read_curves(site: Site, from_utc_s: float) -> list[AreaCurve]:
                 np.asarray(file[name][rows], dtype=np.float64)
                 for name in ("mean_change", "mean_change_uncertainty")
             )
-    except (OSError, RuntimeError, KeyError, ValueError) as error:
-        raise StoreError(f"{areas}: cannot be read together with series.nc: {error}") from error
     usable_files = {name for name, is_usable_file in zip(series_files, usable, strict=True) if is_usable_file}
     is_usable = np.array([name in usable_files for name in epoch_files], dtype=bool)
     curves = []

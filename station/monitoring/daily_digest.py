@@ -13,11 +13,11 @@ import numpy as np
 
 from station.archive.atomic_files import atomic_write
 from station.config import Site
-from station.inbox.journal import Entry, Journal, State
+from station.inbox.journal_reader import Entry, JournalReader, State
 from station.monitoring.alarm_rules import DAY_S
 from station.monitoring.alarm_state import active
 from station.monitoring.area_curves import AreaCurve, read_curves
-from station.processing.scan_tasks import Progress
+from station.processing.workers.worker_process import Progress
 from station.science.gridding.significance import SIGNIFICANT_SIGMAS
 
 MAX_BYTES = 10_000
@@ -49,7 +49,7 @@ def format_digest(site: Site, day: date) -> str:
     """
     begin_s = datetime(day.year, day.month, day.day, tzinfo=UTC).timestamp()
     data = site.station.data
-    with Journal(data / "journal.sqlite", read_only=True) as journal:
+    with JournalReader(data / "journal.sqlite") as journal:
         entries = [
             entry for entry in journal.changed_since(begin_s) if entry.first_seen_utc_s < begin_s + DAY_S
         ]

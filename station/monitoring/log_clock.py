@@ -5,11 +5,11 @@ from __future__ import annotations
 import h5py
 import numpy as np
 
+from station.archive.read_errors import read_errors
 from station.archive.schema import FILL
 from station.archive.series.index import processing_file
 from station.config import Site
-from station.errors import StoreError
-from station.processing.scan_tasks import series_for
+from station.processing.site_files import series_for
 
 MAX_SCANS = 24  # newest of the series
 MIN_SCANS = 6  # with an estimate
@@ -25,13 +25,10 @@ def log_clock_offset(site: Site) -> str:
     """
     path = processing_file(series_for(site))
     names = ("log_clock_offset", "log_clock_offset_uncertainty")
-    try:
-        with h5py.File(path, "r") as file:
-            if any(name not in file for name in names):
-                return ""
-            offset_s, sigma_s = (file[name][-MAX_SCANS:].astype(np.float64) for name in names)
-    except (OSError, RuntimeError, IndexError, ValueError) as error:
-        raise StoreError(f"{path}: cannot be read: {error}") from error
+    with read_errors(path), h5py.File(path, "r") as file:
+        if any(name not in file for name in names):
+            return ""
+        offset_s, sigma_s = (file[name][-MAX_SCANS:].astype(np.float64) for name in names)
     estimated = np.isfinite(offset_s) & (offset_s < FILL / 2)
     if np.count_nonzero(estimated) < MIN_SCANS:
         return ""

@@ -16,7 +16,7 @@ from wsgiref.simple_server import WSGIRequestHandler, WSGIServer
 
 from station.config import Site
 from station.errors import ConfigError, StationError
-from station.inbox.journal import Journal
+from station.inbox.journal_reader import JournalReader
 from station.logs import logfmt
 from station.monitoring.alarm_state import active
 
@@ -154,7 +154,7 @@ class Metrics:
         site = self._site()
         data = site.station.data
         try:
-            with Journal(data / "journal.sqlite", read_only=True) as journal:
+            with JournalReader(data / "journal.sqlite") as journal:
                 counts, verdicts, last = journal.counts(), journal.verdicts(), journal.newest(1)
         except StationError:
             counts, verdicts, last = {}, {}, []

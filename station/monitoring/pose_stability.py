@@ -11,12 +11,12 @@ import h5py
 import numpy as np
 
 from station.archive.netcdf_layout import Series, decode_text
+from station.archive.read_errors import read_errors
 from station.archive.reference_files import read_variance_components
 from station.archive.schema import VERDICTS
 from station.archive.series.index import processing_file
 from station.config import Site
-from station.errors import StoreError
-from station.processing.scan_tasks import series_for
+from station.processing.site_files import series_for
 from station.quantities import Bools, Floats
 from station.science.analysis.pose_steps import Step, detect_steps, pose_sigma
 from station.science.uncertainty.parameters import GLOBAL
@@ -64,21 +64,16 @@ def step_shown_by(site: Site, start_utc_s: float | None) -> tuple[str, str]:
 def _read_poses(series: Series) -> tuple[Floats, Floats]:
     """Return start [s] (n,) and pose (n, 6) of the newest comparable scans."""
     path = processing_file(series)
-    try:
-        with h5py.File(path, "r") as file:
-            if "shared_parameter" not in file:
-                return np.empty(0), np.empty((0, len(POSE_PARAMETERS)))
-            rows = slice(-MAX_SCANS, None)
-            names = decode_text(file["parameter_name"][:])
-            columns = [names.index(name) for name in POSE_PARAMETERS]
-            pose = np.asarray(file["shared_parameter"][rows], dtype=np.float64)[:, columns]
-            start_s = np.asarray(file["time_bnds"][rows, 0], dtype=np.float64)
-            adjustment, sop = (np.array(decode_text(file[name][rows])) for name in ("adjustment", "sop_id"))
-            comparable: Bools = (adjustment == "joint") & (
-                file["verdict"][rows] != VERDICTS.index("unusable")
-            )
-    except (OSError, RuntimeError, IndexError, ValueError) as error:
-        raise StoreError(f"{path}: cannot be read: {error}") from error
+    with read_errors(path), h5py.File(path, "r") as file:
+        if "shared_parameter" not in file:
+            return np.empty(0), np.empty((0, len(POSE_PARAMETERS)))
+        rows = slice(-MAX_SCANS, None)
+        names = decode_text(file["parameter_name"][:])
+        columns = [names.index(name) for name in POSE_PARAMETERS]
+        pose = np.asarray(file["shared_parameter"][rows], dtype=np.float64)[:, columns]
+        start_s = np.asarray(file["time_bnds"][rows, 0], dtype=np.float64)
+        adjustment, sop = (np.array(decode_text(file[name][rows])) for name in ("adjustment", "sop_id"))
+        comparable: Bools = (adjustment == "joint") & (file["verdict"][rows] != VERDICTS.index("unusable"))
     comparable &= np.all(np.abs(pose) < 1e3, axis=1)  # excludes netCDF's fill value
     if comparable.any():
         comparable &= sop == sop[comparable][-1]

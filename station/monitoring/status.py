@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from station.errors import NotReadyError, StationError, StoreError
 from station.inbox.inbox import is_scan, list_folder, safe_name
-from station.inbox.journal import Entry, Journal, State
+from station.inbox.journal_reader import Entry, JournalReader, State
 from station.inbox.lock import is_locked, pause_reason
 from station.monitoring.alarm_state import active
 from station.monitoring.preconditions import clock_problem, format_utc, require_disk_space
@@ -33,11 +33,12 @@ def status(site: Site) -> Status:
     from station.processing.usable_inputs import usable_site  # noqa: PLC0415 - a second of imports
 
     site, data = usable_site(site), site.station.data
-    with Journal(data / "journal.sqlite", read_only=True) as journal:
-        queue = _queue_status(site, journal)
+    with JournalReader(data / "journal.sqlite") as journal:
+        waiting = journal.waiting()
+        queue = _queue_status(site, journal, waiting)
         counts = journal.counts()
         last = journal.last_stored()
-        queued = [entry.epoch for entry in journal.waiting() if entry.epoch]
+    queued = [entry.epoch for entry in waiting if entry.epoch]
     return {
         "station": site.station.id,
         "name": site.station.name,
@@ -60,19 +61,20 @@ def queue_status(site: Site) -> Status:
 
     `input_faults` of the site are among the faults.
     """
-    with Journal(site.station.data / "journal.sqlite", read_only=True) as journal:
-        return _queue_status(site, journal)
+    with JournalReader(site.station.data / "journal.sqlite") as journal:
+        return _queue_status(site, journal, journal.waiting())
 
 
-def _queue_status(site: Site, journal: Journal) -> Status:
-    waiting = [_waiting_scan(entry) for entry in journal.waiting()]
+def _queue_status(site: Site, journal: JournalReader, entries: list[Entry]) -> Status:
+    waiting = [_waiting_scan(entry) for entry in entries]
     set_aside = [
         {"scan": entry.name, "reason": entry.reason, "since": format_utc(entry.changed_utc_s)}
         for entry in journal.rows(State.SET_ASIDE)
     ]
     inbox_problem = ""
     try:
-        names = {safe_name(name) for name in list_folder(site.scans.inbox) if is_scan(name, suffixes())}
+        known = suffixes()
+        names = {safe_name(name) for name in list_folder(site.scans.inbox) if is_scan(name, known)}
     except NotReadyError as error:
         names, inbox_problem = set(), str(error)
     running = is_locked(site.station.data)
@@ -175,19 +177,23 @@ def _last_scan(entry: Entry) -> Status:
 
 
 def _last_pose_step(site: Site) -> str:
-    from station.monitoring.pose_stability import latest_step  # noqa: PLC0415 - not needed without a series
+    if not (site.station.data / "series.nc").is_file():
+        return ""
+    from station.monitoring.pose_stability import latest_step  # noqa: PLC0415 - a second of imports
 
     try:
-        return latest_step(site) if (site.station.data / "series.nc").is_file() else ""
+        return latest_step(site)
     except (StoreError, ValueError) as error:
         return str(error)
 
 
 def _log_clock_problem(site: Site) -> str:
+    if not (site.adjusts and (site.station.data / "series.nc").is_file()):
+        return ""
     from station.monitoring.log_clock import log_clock_offset  # noqa: PLC0415 - as above
 
     try:
-        return log_clock_offset(site) if site.adjusts and (site.station.data / "series.nc").is_file() else ""
+        return log_clock_offset(site)
     except (StoreError, ValueError) as error:  # of a text, if series.nc is damaged
         return str(error)
 

@@ -7,7 +7,8 @@ from pathlib import Path
 
 from station.config import Site
 from station.errors import NotReadyError, ScanError
-from station.inbox.journal import Entry, Journal, State
+from station.inbox.journal import Journal
+from station.inbox.journal_reader import Entry, State
 from station.inbox.lock import exclusive_lock
 from station.inbox.scan_files import scan_file
 from station.service.worker import Worker

@@ -14,8 +14,8 @@ import numpy as np
 from station.archive.atomic_files import atomic_write
 from station.config import Site
 from station.errors import ScanError, StoreError
-from station.processing import isolation
-from station.processing.scan_tasks import series_for
+from station.processing.site_files import series_for
+from station.processing.workers import isolation
 from station.quantities import Floats
 from station.queries.box_series import box_statistics
 from station.queries.stable_ground import validate_sigma

@@ -13,10 +13,10 @@ from rich.table import Table
 
 from station.archive.series.lazy import open_series
 from station.config import Site, read_site
-from station.inbox.journal import Entry, State
+from station.inbox.journal_reader import Entry, State
 from station.operations.batch import format_entry, process_scans
 from station.processing.epoch_recorder import page_folder
-from station.processing.scan_tasks import series_for
+from station.processing.site_files import series_for
 from station.quantities import Quality
 from station.queries.aggregates import Aggregates
 from station.simulation.station import demo, simulate

@@ -14,6 +14,7 @@ from concurrent.futures import FIRST_COMPLETED, Future, wait
 from contextlib import contextmanager, suppress
 from datetime import UTC, datetime
 from pathlib import Path
+from typing import TypeVar
 
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
@@ -24,11 +25,10 @@ from station.config import Site
 from station.errors import NotReadyError, ScanError
 from station.inbox.inbox import ScanFile
 from station.inbox.journal import Journal
+from station.inbox.journal_reader import JournalReader
 from station.inbox.lock import exclusive_lock
 from station.inbox.scan_files import find_scan
 from station.monitoring.preconditions import require_disk_space
-from station.processing.dask_executor import DaskExecutor
-from station.processing.executors import Executor, LocalExecutor
 from station.processing.integrity import missing_epochs, verify_checksums
 from station.processing.reference_tasks import (
     build_reference_version,
@@ -36,24 +36,24 @@ from station.processing.reference_tasks import (
     scans_for_version,
     update_reference_version,
 )
-from station.processing.scan_inputs import load_scan_inputs, sop_identity
-from station.processing.scan_tasks import Progress as Tick
-from station.processing.scan_tasks import (
-    Rejected,
-    ScanHistory,
-    StoredResult,
-    load_reference,
-    open_scan_for,
-    series_for,
-)
+from station.processing.scan_inputs import load_scan_inputs
+from station.processing.scan_tasks import Rejected, ScanHistory, StoredResult, load_reference
+from station.processing.scanner_pose import sop_identity
+from station.processing.site_files import open_scan_for, series_for
 from station.processing.staleness import Plan, Task, plan_reprocessing, usable_scans
+from station.processing.store_tasks import MAX_STORE_TASK_S
 from station.processing.usable_inputs import usable_site
+from station.processing.workers.dask_executor import DaskExecutor
+from station.processing.workers.executors import Executor, LocalExecutor
+from station.processing.workers.isolation import run_isolated
+from station.processing.workers.worker_process import Progress as Tick
 from station.readers.scan import utc_interval
 from station.readers.sop import valid_sop
 from station.service.worker import Worker, record_result
 
 _VERIFYING = "verifying the checksums of the store …"
 Report = Callable[[str], None]
+T = TypeVar("T")
 Span = tuple[datetime | None, datetime | None]
 
 
@@ -69,35 +69,63 @@ def reprocess(
     for fault in site.input_faults:
         report(f"fault: {fault}")
     if dry_run:
-        with Journal(data / "journal.sqlite", read_only=True) as journal:
-            return Reprocessing(site, journal, report, threading.Event()).dry_run(_seconds(span))
+        with JournalReader(data / "journal.sqlite") as journal:
+            return _Planning(site, journal, report).dry_run(_seconds(span))
     with exclusive_lock(data), Journal(data / "journal.sqlite") as journal, _stop_on_signals() as stop:
         return Reprocessing(site, journal, report, stop).run(_seconds(span), scheduler)
 
 
-class Reprocessing:
-    """The steps of one reprocessing run."""
+class _Planning:
+    """What is to be reprocessed; changes nothing."""
 
-    def __init__(self, site: Site, journal: Journal, report: Report, stop: threading.Event) -> None:
+    def __init__(self, site: Site, journal: JournalReader, report: Report) -> None:
         self._site = site
         self._series = series_for(site)
-        self._journal = journal
+        self._reader = journal
         self._report = report
-        self._stop = stop
-        self._worker = Worker(site, journal, should_stop=stop.is_set)
-        self._was_stopped = False
         self._console = Console(stderr=True)
 
     def dry_run(self, span_s: tuple[float, float]) -> int:
         """Report what would be reprocessed; return the exit status."""
         with self._console.status(_VERIFYING):
-            damaged = self._worker.run(verify_checksums, self._journal.checksums()).damaged
+            damaged = self._run_task(verify_checksums, self._reader.checksums()).damaged
         for name in damaged:
             self._report(f"{name}: damaged: its epochs will be reprocessed")
         if damaged:
             return 1
         plan = self._report_plan(span_s)
         return ScanError.exit_status if any(task.scan is None for task in plan.tasks) else 0
+
+    def _report_plan(self, span_s: tuple[float, float]) -> Plan:
+        """Return the reprocessing plan and report it."""
+        plan = self._plan(span_s)
+        self._report(f"{len(plan.tasks)} epochs to reprocess")
+        for reason, count in plan.reason_counts().items():
+            self._report(f"  {count} × {reason}")
+        for task in plan.tasks:
+            if task.scan is None:
+                self._report(f"  {task.name}: the scan is missing: its epoch is kept unchanged")
+        return plan
+
+    def _plan(self, span_s: tuple[float, float]) -> Plan:
+        entries = [entry for entry in self._reader.rows() if entry.epoch]
+        missing = set(self._run_task(missing_epochs, self._reader.epochs()))
+        return self._run_task(plan_reprocessing, entries, missing, span_s)
+
+    def _run_task(self, task: Callable[..., T], *args: object) -> T:
+        memory_gb = self._site.service.memory_gb
+        return run_isolated(task, self._site, *args, memory_gb=memory_gb, timeout_s=MAX_STORE_TASK_S)
+
+
+class Reprocessing(_Planning):
+    """The steps of one reprocessing run."""
+
+    def __init__(self, site: Site, journal: Journal, report: Report, stop: threading.Event) -> None:
+        super().__init__(site, journal, report)
+        self._journal = journal
+        self._stop = stop
+        self._worker = Worker(site, journal, should_stop=stop.is_set)
+        self._was_stopped = False
 
     def run(self, span_s: tuple[float, float], scheduler: str | None) -> int:
         """Reprocess the outdated epochs; return the exit status."""
@@ -125,24 +153,8 @@ class Reprocessing:
     def _repair(self) -> None:
         """Reconcile journal and store and quarantine damaged files, so that their epochs count as missing."""
         with self._console.status(_VERIFYING):
-            self._worker.reconcile()
-            self._worker.verify_store()
-
-    def _report_plan(self, span_s: tuple[float, float]) -> Plan:
-        """Return the reprocessing plan and report it."""
-        plan = self._plan(span_s)
-        self._report(f"{len(plan.tasks)} epochs to reprocess")
-        for reason, count in plan.reason_counts().items():
-            self._report(f"  {count} × {reason}")
-        for task in plan.tasks:
-            if task.scan is None:
-                self._report(f"  {task.name}: the scan is missing: its epoch is kept unchanged")
-        return plan
-
-    def _plan(self, span_s: tuple[float, float]) -> Plan:
-        entries = [entry for entry in self._journal.rows() if entry.epoch]
-        missing = set(self._worker.run(missing_epochs, self._journal.epochs()))
-        return self._worker.run(plan_reprocessing, entries, missing, span_s)
+            self._worker.store.reconcile()
+            self._worker.store.verify_store()
 
     def _rebuild_reference(self, plan: Plan, span_s: tuple[float, float]) -> Plan:
         """Rebuild the reference if it is outdated; return the plan after that."""
@@ -160,7 +172,7 @@ class Reprocessing:
             else:
                 scans = self._scans_for(0, at_least=setting)
                 self._worker.run(build_reference_version, scans, version)
-        self._worker.add_checksums()
+        self._worker.store.add_checksums()
         self._report(
             f"reference {version} built from {len(scans)} scans, replaces {' '.join(plan.references)}"
         )
@@ -260,7 +272,7 @@ class Reprocessing:
         self._stop.clear()
         with self._console.status("publishing series.nc …"):
             self._worker.compact()
-            self._worker.reconcile()
+            self._worker.store.reconcile()
             self._worker.publish()
 
     def _progress_bar(self) -> Progress:

@@ -6,7 +6,8 @@ from collections.abc import Sequence
 
 from station.config import Site
 from station.errors import StationError
-from station.inbox.journal import Entry, Journal, State
+from station.inbox.journal import Journal
+from station.inbox.journal_reader import Entry, State
 from station.inbox.lock import is_locked
 
 _FINAL = {State.SET_ASIDE, State.LATER}

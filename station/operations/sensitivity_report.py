@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 
 from station.config import Site
-from station.processing import isolation
-from station.processing.scan_tasks import load_areas, series_for
+from station.processing.site_files import load_areas, series_for
+from station.processing.workers import isolation
 from station.queries.aggregates import Aggregates
 from station.queries.variance_shares import compute_variance_shares
 from station.science.analysis.sensitivity import INPUTS

@@ -15,7 +15,7 @@ from station.archive.reference_files import valid_versions
 from station.config import Site, read_site
 from station.errors import NotReadyError, ScanError, StationError
 from station.inbox.inbox import start_from_name
-from station.inbox.journal import Journal
+from station.inbox.journal_reader import JournalReader
 from station.inbox.lock import is_locked
 from station.inbox.scan_files import scan_file
 from station.monitoring.preconditions import EARLIEST_S
@@ -29,10 +29,12 @@ from station.operations.site_plausibility import (
     tilt_findings,
     weather_time_findings,
 )
-from station.processing import isolation
 from station.processing.integrity import check_store
-from station.processing.scan_inputs import map_position, pressure_fault, scanner_height_m, scanner_to_map
-from station.processing.scan_tasks import dry_run, load_areas, polygon_cells, series_for
+from station.processing.scan_air import pressure_fault
+from station.processing.scan_tasks import dry_run
+from station.processing.scanner_pose import map_position, scanner_height_m, scanner_to_map
+from station.processing.site_files import load_areas, polygon_cells, series_for
+from station.processing.workers import isolation
 from station.readers.flags import read_flags
 from station.readers.inclination import read_inclination
 from station.readers.scan import suffixes
@@ -77,7 +79,7 @@ def store_findings(site_path: Path) -> list[Finding]:
 
 
 def _check_store_isolated(site: Site) -> list[tuple[str, str, str]]:
-    with Journal(site.station.data / "journal.sqlite", read_only=True) as journal:
+    with JournalReader(site.station.data / "journal.sqlite") as journal:
         entries, known = journal.rows(), journal.checksums()
     return isolation.run_isolated(
         check_store, site, entries, known, memory_gb=site.service.memory_gb, timeout_s=math.inf

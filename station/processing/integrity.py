@@ -39,10 +39,11 @@ from station.archive.tilt_offsets import (
 from station.config import Site
 from station.errors import StoreError
 from station.inbox.file_hash import sha256_file
-from station.inbox.journal import Entry, State
+from station.inbox.journal_reader import Entry, State
 from station.inbox.scan_files import find_scan
 from station.processing.provenance import StoredEpoch, stored_epochs
-from station.processing.scan_tasks import Progress, series_for
+from station.processing.site_files import series_for
+from station.processing.workers.worker_process import Progress
 from station.readers.scan import suffixes
 
 

@@ -24,12 +24,9 @@ from station.config import Site
 from station.errors import ConfigError, NotReadyError, ScanError
 from station.inbox.file_hash import sha256_file
 from station.inbox.inbox import ScanFile
-from station.inbox.journal import Entry
-from station.processing.scan_inputs import (
-    air_from_log,
-    scanner_height_m,
-    sop_identity,
-)
+from station.inbox.journal_reader import Entry
+from station.processing.scan_air import air_from_log
+from station.processing.scanner_pose import scanner_height_m, sop_identity
 from station.quantities import Air
 from station.readers.flags import read_flags, reasons_for
 from station.readers.sop import valid_sop

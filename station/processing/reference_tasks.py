@@ -21,6 +21,7 @@ from station.config import Site
 from station.errors import StoreError
 from station.inbox.file_hash import sha256_file
 from station.inbox.inbox import ScanFile
+from station.processing.epoch_scalars import air_key, air_scalars
 from station.processing.pipeline import (
     AdjustmentInputs,
     add_blocks,
@@ -32,18 +33,9 @@ from station.processing.pipeline import (
 )
 from station.processing.provenance import ScanProvenance
 from station.processing.scan_inputs import ScanInputs, load_scan_inputs
-from station.processing.scan_tasks import (
-    Progress,
-    adjust_scan,
-    air_key,
-    air_scalars,
-    exclusion_reason,
-    load_viewing_geometry,
-    open_scan_for,
-    series_for,
-    sha256_log,
-    stable_cells,
-)
+from station.processing.scan_tasks import adjust_scan, load_viewing_geometry, stable_cells
+from station.processing.site_files import exclusion_reason, open_scan_for, series_for, sha256_log
+from station.processing.workers.worker_process import Progress
 from station.quantities import Reference, ScanGeometry, VarianceComponents
 from station.readers.scan import utc_interval
 from station.science.adjustment.joint import Adjustment

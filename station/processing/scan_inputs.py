@@ -2,24 +2,23 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 import math
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
-from datetime import datetime, timedelta
+from datetime import datetime
 from functools import partial
 from pathlib import Path
 
 import numpy as np
-from pyproj import CRS, Transformer
 
 from station.archive.tilt_offsets import read_tilt_offset, stored_tilt_offsets, write_tilt_offset
 from station.config import Site
-from station.errors import ConfigError, NotReadyError, ScanError
+from station.errors import NotReadyError, ScanError
 from station.processing.pipeline import AdjustmentInputs, Pose
+from station.processing.scan_air import air_of_scan
+from station.processing.scanner_pose import map_position, scan_geometry, scanner_to_map, sop_identity
 from station.quantities import (
-    VERTICAL_AXIS,
     Air,
     AzimuthTrack,
     Floats,
@@ -30,19 +29,17 @@ from station.quantities import (
 )
 from station.readers.inclination import align_gps_week, read_inclination
 from station.readers.scan import ScanReader, open_scan
-from station.readers.sop import read_matrix, valid_sop
-from station.readers.weather import interpolate_air, read_weather
+from station.readers.sop import valid_sop
 from station.science.adjustment import prior
-from station.science.geometry import inclination, pose
-from station.science.geometry.air import air_correction, standard_air
+from station.science.geometry import inclination
+from station.science.geometry.air import air_correction
 from station.science.geometry.inclination import NO_CYCLIC_ERROR, CyclicError, TiltRecord
 from station.science.uncertainty import parameters
-from station.sections import Origin, SopSection, WeatherSection
+from station.sections import SopSection
 
 MIN_LOG_COVERAGE = 0.97  # of the scan duration that a complete log covers
 MIN_LOG_ROWS = 20  # a shorter log is not filtered
 MIN_ABSOLUTE_LOG_S = 60.0  # of a scan whose static tilt is known from its log alone
-MAX_PRESSURE_DEVIATION_HPA = 60.0  # from the standard atmosphere; weather amounts to 40 hPa
 MAX_SATURATED = 0.1  # of the rows of a log, at the limit of the sensor's range
 MIN_CLOCK_OFFSET_S = 4.0  # clock offset of a log, and its significance, that lead to a warning
 MIN_CLOCK_OFFSET_SIGMAS = 3.0
@@ -104,7 +101,7 @@ def load_scan_inputs(
         if save_tilt_offset and tilt_offset is not None and tilt_offset != NO_CYCLIC_ERROR:
             write_tilt_offset(site, sop_id, tilt_offset)
     tilt_record = _tilt_record(site, log, track, tilt_offset, warnings)
-    air, weather_known = _air(site, start + (end - start) / 2, transform.position_m[2], warnings)
+    air, weather_known = air_of_scan(site, start + (end - start) / 2, transform.position_m[2], warnings)
     axis = (float(rotation[0, 2]), float(rotation[1, 2]), float(rotation[2, 2]))
     geometry = scan_geometry(site, transform.position_m, axis)
     if wait_for_weather and site.weather is not None and not weather_known:
@@ -168,75 +165,6 @@ def _inputs_in_map_frame(site: Site, start_s: float) -> ScanInputs:
             weather_known=False,
         )
     return ScanInputs(geometry, Pose(None, None), log_only_covariance, adjustment_inputs, None, None, (), {})
-
-
-def scan_geometry(
-    site: Site,
-    position_m: tuple[float, float, float] | None,
-    axis: tuple[float, float, float] = VERTICAL_AXIS,
-) -> ScanGeometry:
-    """Return the geometry and settings that are the same for all scans under one SOP."""
-    return ScanGeometry(
-        scanner=site.instrument,
-        grid=site.grid_cells,
-        position_m=position_m,
-        axis=axis,
-        min_points=site.grid.min_points,
-        published_budget=site.uncertainty.model == "voordendag2023",
-        registration_sigma_m=site.uncertainty.registration_sigma_m,
-        store_terms=site.uncertainty.store_terms,
-    )
-
-
-def sop_identity(sop: SopSection) -> str:
-    """Return an identifier that changes with the content of the SOP file and with `sop.scan`."""
-    content = sop.file.read_bytes() + (f"\n{sop.scan}".encode() if sop.scan else b"")
-    return f"{sop.file.stem}-{hashlib.sha256(content).hexdigest()[:8]}"
-
-
-def scanner_to_map(site: Site, sop: SopSection) -> pose.ScannerToMap:
-    """Return the transformation from scanner to map under an SOP; raise ConfigError if there is none."""
-    matrix = read_matrix(sop.file)
-    radius_m = site.scanner.range_max_m
-    if site.map.crs is None:
-        return pose.scanner_to_local_map(matrix)
-    if site.map.pop is not None:
-        return pose.scanner_to_map_by_pop(matrix, read_matrix(site.map.pop), site.map.crs, radius_m)
-    if site.map.origin is not None:
-        return pose.scanner_to_map_by_origin(matrix, _degrees(site.map.origin), site.map.crs, radius_m)
-    _require_on_map(site.map.crs, matrix[:3, 3].tolist(), sop.file)
-    return pose.scanner_to_map_directly(matrix, site.map.crs, radius_m)
-
-
-def _degrees(origin: Origin) -> tuple[float, float, float]:
-    return origin.latitude_deg, origin.longitude_deg, origin.height_m
-
-
-def _require_on_map(crs: str, position_m: list[float], file: Path) -> None:
-    """Raise ConfigError if an SOP places the scanner off the map: it probably refers to a local frame."""
-    horizontal = pose.horizontal_crs(crs)
-    area = CRS.from_user_input(crs).area_of_use
-    to_degrees = Transformer.from_crs(horizontal, horizontal.geodetic_crs, always_xy=True)
-    longitude, latitude = to_degrees.transform(position_m[0], position_m[1])
-    if area is None:
-        return
-    inside = area.west - 1 <= longitude <= area.east + 1 and area.south - 1 <= latitude <= area.north + 1
-    if not inside:
-        raise ConfigError(
-            f"{file}: places the scanner at easting {position_m[0]:g}, northing {position_m[1]:g}, outside"
-            f" {crs} ({area.name}). If it refers to a local frame, set map.origin or map.pop, or omit"
-            " map.crs"
-        )
-
-
-def map_position(site: Site) -> tuple[float, float, float] | None:
-    """Return easting, northing and height of `map.origin` [m]; None without it."""
-    if site.map.origin is None or site.map.crs is None:
-        return None
-    to_map = Transformer.from_crs(pose.GEOGRAPHIC, pose.horizontal_crs(site.map.crs), always_xy=True)
-    latitude, longitude, height_m = _degrees(site.map.origin)
-    east_m, north_m, up_m = to_map.transform(longitude, latitude, height_m)
-    return float(east_m), float(north_m), float(up_m)
 
 
 def _load_log(
@@ -399,61 +327,3 @@ def _fit_tilt_offset(log: InclinationLog, track: AzimuthTrack | None, sigma_rad:
     if track is not None:
         return inclination.fit_cyclic_error(log, track, sigma_rad)
     return CyclicError((float(log.roll_rad.mean()), 0.0, 0.0), (float(log.pitch_rad.mean()), 0.0, 0.0))
-
-
-def air_from_log(section: WeatherSection, time_utc_s: float, height_m: float | None) -> Air | None:
-    """Return the air at a time, interpolated in the weather log; None if the log has a gap.
-
-    `height_m` is that of the scanner, None if it is unknown. Raises ScanError if the log or its pressure
-    cannot be used, NotReadyError if the log cannot be read.
-    """
-    log = read_weather(
-        section.file,
-        format=section.format,
-        columns=section.columns,
-        utc_offset_h=section.utc_offset_h,
-        window_utc_s=(time_utc_s - section.max_age_s, time_utc_s + section.max_age_s),
-    )
-    air = interpolate_air(log, time_utc_s, section.max_age_s)
-    if air is not None and (message := pressure_fault(air, height_m)):
-        raise ScanError(message)
-    return air
-
-
-def scanner_height_m(site: Site, sop: SopSection) -> float | None:
-    """Return the height of the scanner above the ellipsoid [m]; None without a map, whose zero is unknown."""
-    return None if site.map.crs is None else scanner_to_map(site, sop).position_m[2]
-
-
-def pressure_fault(air: Air, height_m: float | None) -> str:
-    """Return a message if the pressure cannot be that at a height [m], '' if it can or that is unknown."""
-    if height_m is None:
-        return ""
-    expected_hpa, sea_level_hpa = (standard_air(height).pressure_hpa for height in (height_m, 0.0))
-    if abs(air.pressure_hpa - expected_hpa) <= MAX_PRESSURE_DEVIATION_HPA:
-        return ""
-    message = (
-        f"pressure of {air.pressure_hpa:.1f} hPa, but at {height_m:,.0f} m the standard atmosphere has"
-        f" {expected_hpa:.0f} hPa: "
-    )
-    if abs(air.pressure_hpa - sea_level_hpa) <= MAX_PRESSURE_DEVIATION_HPA:
-        return message + "it is reduced to sea level; log the pressure at the station itself"
-    return message + "wrong column or unit, a failed sensor, or a wrong height of the SOP"
-
-
-def _air(site: Site, mid_scan: datetime, height_m: float, warnings: list[str]) -> tuple[Air, bool]:
-    """Return the air of the scan, and whether it was measured."""
-    if site.weather is not None:
-        section = site.weather
-        try:
-            air = air_from_log(section, mid_scan.timestamp(), None if site.map.crs is None else height_m)
-            age = timedelta(seconds=section.max_age_s)
-            message = f"weather missing within {age} of {mid_scan:%Y-%m-%d %H:%M} UTC"
-        except (ScanError, NotReadyError) as error:  # a scan does not wait for its weather indefinitely
-            air, message = None, f"weather unusable: {error}"
-        if air is not None:
-            return air, True
-        warnings.append(message)
-    if site.air is None or site.air.scanner_setting == "weather":
-        return standard_air(height_m), False
-    return site.air.scanner_setting.air, False

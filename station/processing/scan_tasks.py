@@ -5,16 +5,11 @@ The last argument of a task is `progress()`, which reports to the parent process
 
 from __future__ import annotations
 
-import math
 import time
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from pathlib import Path
-
-import numpy as np
-import shapely
 
 from station._version import __version__
 from station.archive import epochs
@@ -25,9 +20,9 @@ from station.config import Site
 from station.errors import ScanError
 from station.inbox.file_hash import hash_if_unchanged, sha256_file
 from station.inbox.inbox import ScanFile
-from station.inbox.journal import Journal
+from station.inbox.journal_reader import JournalReader
 from station.processing.epoch_recorder import EpochRecorder
-from station.processing.isolation import trim_heap
+from station.processing.epoch_scalars import air_key, log_metrics, scalar_variables
 from station.processing.pipeline import (
     AdjustmentInputs,
     adjust_to_reference,
@@ -42,25 +37,29 @@ from station.processing.pipeline import (
     variance_factors,
 )
 from station.processing.scan_inputs import ScanInputs, load_scan_inputs
+from station.processing.site_files import (
+    exclusion_reason,
+    file_version,
+    open_scan_for,
+    polygon_cells,
+    series_for,
+    sha256_log,
+)
 from station.processing.usable_inputs import usable_site
+from station.processing.workers.worker_process import Progress, trim_heap
 from station.products.overview import Overview
-from station.quantities import Bools, Measurement, Quality, Reference, ScanGeometry, VarianceComponents
+from station.quantities import Bools, Reference, ScanGeometry, VarianceComponents
 from station.queries.aggregates import LEVERAGE_VARIABLES
-from station.readers.flags import read_flags, reasons_for
-from station.readers.polygons import cells_inside, read_polygons
 from station.readers.raster import read_geotiff
-from station.readers.scan import ScanReader, open_scan, reject_future, utc_interval
+from station.readers.scan import reject_future, utc_interval
 from station.science.adjustment import ground_classes
 from station.science.adjustment.joint import Adjustment
 from station.science.analysis import inclination_check, verdict
-from station.science.geometry.pose import horizontal_crs, is_same_map
 from station.science.geometry.terrain import nodes_from_means
 from station.science.gridding.gridder import Gridder
 from station.science.gridding.viewing_geometry import ViewingGeometry
 from station.science.uncertainty.variance_factors import UNIT_FACTORS
 
-Progress = Callable[[], None]
-MAX_METRIC_CELLS = 100_000  # the metrics of larger scans are computed from a sample
 UNUSABLE_REJECTED_SHARE = 0.6  # of the stable ground; above it the filtered log alone is safer
 
 
@@ -83,7 +82,7 @@ class StoredResult:
 
 @dataclass(frozen=True)
 class ScanHistory:
-    """What the journal knows about a scan from earlier processing."""
+    """What the journal knows about a scan from earlier processing and about other scans, and the time."""
 
     reference: str | None = None  # version the scan was processed with
     revision: int = 0
@@ -91,6 +90,7 @@ class ScanHistory:
     stored_scans: Mapping[str, str] = field(default_factory=dict)  # names of other stored scans by SHA-256
     wait_for_weather: bool = False  # if the weather log is not up to date yet
     waiting_before: str = ""  # name of an earlier scan that will be processed soon
+    now_s: float = field(default_factory=time.time)  # a scan that begins later is in the future
 
 
 @dataclass(frozen=True)
@@ -108,23 +108,6 @@ class Rejected:
     reason: str
     sha256: str
     log_sha256: str
-
-
-def series_for(site: Site) -> Series:
-    """Return the series of a site."""
-    return Series(
-        folder=site.station.data,
-        station_id=site.station.id,
-        grid=site.grid_cells,
-        crs=site.map.crs,
-        vertical_datum=site.map.vertical_datum,
-        name=site.station.name,
-        institution=site.station.institution,
-        metadata=(
-            *site.metadata.attributes.items(),
-            ("time_coverage_resolution", f"PT{site.scans.expected_every_s:.0f}S"),
-        ),
-    )
 
 
 def process_new(
@@ -145,14 +128,7 @@ def reprocess_scan(
 ) -> StoredResult | Rejected:
     """Process a scan even if its content is known, with the reference version used before."""
     try:
-        return process(
-            site,
-            scan,
-            progress,
-            wait_for_weather=history.wait_for_weather,
-            history=history,
-            with_preview=with_preview,
-        )
+        return process(site, scan, progress, history=history, with_preview=with_preview)
     except ScanError as error:
         is_file = scan.path.is_file() and not scan.path.is_symlink()
         return Rejected(
@@ -165,32 +141,20 @@ def process(
     scan: ScanFile,
     progress: Progress,
     *,
-    wait_for_weather: bool = False,
-    history: ScanHistory = ScanHistory(),
+    history: ScanHistory | None = None,
     with_preview: bool = False,
 ) -> StoredResult:
     """Process a scan and store its epoch, unless an identical one is stored; record a preview if asked to.
 
     Raises ScanError if the scan cannot be used. Raises NotReadyError if it changes meanwhile, begins in the
-    future, or, with `wait_for_weather`, arrived recently and has no weather yet.
+    future, or has no weather yet and is to wait for it.
     """
-    began_s = time.monotonic()
+    began_s, history = time.monotonic(), history or ScanHistory()
     series = series_for(site)
     with hash_if_unchanged(scan.path) as scan_sha256:
         progress()
-        wait_s = site.weather.wait_s if wait_for_weather and site.weather else 0.0
-        is_recent = time.time() - scan.mtime_ns * 1e-9 < wait_s
         reference = load_reference(site, history.reference)
-        epoch = _compute_epoch(
-            site,
-            scan,
-            scan_sha256,
-            reference,
-            progress,
-            is_dry_run=False,
-            wait_for_weather=is_recent,
-            waiting_before=history.waiting_before,
-        )
+        epoch = _compute_epoch(site, scan, scan_sha256, reference, history, progress)
     if not history.revision:
         _require_new_start(site, epoch.start_s)
     version, epoch_file = epoch.provenance["reference_version"], _identical_epoch(series, epoch)
@@ -206,7 +170,7 @@ def process(
         verdict=epoch.verdict,
         reason=epoch.verdict_reason,
         reference=version or None,
-        metrics=_log_metrics(epoch, time.monotonic() - began_s),
+        metrics=log_metrics(epoch, time.monotonic() - began_s),
         log_sha256=epoch.provenance["log_sha256"],
         epoch_sha256=sha256_file(epoch_file.path),
         overview=recorder.overview,
@@ -215,7 +179,7 @@ def process(
 
 def _require_new_start(site: Site, start_utc_s: float) -> None:
     """Raise ScanError if a scan of another name with the same start is stored: it would be replaced."""
-    with Journal(site.station.data / "journal.sqlite", read_only=True) as journal:
+    with JournalReader(site.station.data / "journal.sqlite") as journal:
         stored = journal.starting_at(start_utc_s)
     if stored:
         start = datetime.fromtimestamp(start_utc_s, UTC)
@@ -236,8 +200,8 @@ def dry_run(site: Site, scan: ScanFile, progress: Progress) -> tuple[str, str, d
     """Return verdict, reason and metrics of a scan; nothing is stored."""
     began_s, site = time.monotonic(), usable_site(site)
     reference = None if isinstance(site.reference.scans, Path) else load_reference(site)
-    epoch = _compute_epoch(site, scan, "", reference, progress, is_dry_run=True, wait_for_weather=False)
-    return epoch.verdict, epoch.verdict_reason, _log_metrics(epoch, time.monotonic() - began_s)
+    epoch = _compute_epoch(site, scan, "", reference, ScanHistory(), progress, is_dry_run=True)
+    return epoch.verdict, epoch.verdict_reason, log_metrics(epoch, time.monotonic() - began_s)
 
 
 def _compute_epoch(
@@ -245,15 +209,14 @@ def _compute_epoch(
     scan: ScanFile,
     scan_sha256: str,
     reference: Reference | None,
+    history: ScanHistory,
     progress: Progress,
     *,
-    is_dry_run: bool,
-    wait_for_weather: bool,
-    waiting_before: str = "",
+    is_dry_run: bool = False,
 ) -> epochs.Epoch:
     with open_scan_for(site, scan.path) as reader:
         start, end, _ = utc_interval(reader, site.scans.name)
-        reject_future(start, time.time())
+        reject_future(start, history.now_s)
         inputs = load_scan_inputs(
             site,
             reader,
@@ -261,8 +224,8 @@ def _compute_epoch(
             start,
             end,
             save_tilt_offset=not is_dry_run,
-            wait_for_weather=wait_for_weather,
-            waiting_before=waiting_before,
+            wait_for_weather=history.wait_for_weather,
+            waiting_before=history.waiting_before,
         )
         viewing = load_viewing_geometry(site, inputs.geometry, reference) if reference else None
         progress()
@@ -290,7 +253,7 @@ def _compute_epoch(
     log_warnings, clock_scalars = _check_log(adjustment, reference)
     measurement = measure(gridder, inputs.geometry, shared, viewing, adjustment, factors)
     progress()
-    scalars = _scalar_variables(measurement, inputs, *point_counts)
+    scalars = scalar_variables(measurement, inputs, *point_counts)
     scalars["rejected_echo_share"] = gridder.rejected_echo_share
     scalars["airborne_echo_share"] = gridder.airborne_echo_share
     if adjustment is not None and viewing is not None:
@@ -387,14 +350,6 @@ def stable_cells(site: Site, reference: Reference) -> Bools:
     return polygon_cells(setting, site) if isinstance(setting, Path) else reference.stable
 
 
-def polygon_cells(file: Path, site: Site) -> Bools:
-    """Return the cells (ny, nx) inside any of the polygons of a file."""
-    inside = np.zeros(site.grid_cells.shape, bool)
-    for polygon in read_polygons(file, site.map.crs).values():
-        inside |= cells_inside(polygon, site.grid_cells)
-    return inside
-
-
 def _identical_epoch(series: Series, epoch: epochs.Epoch) -> epochs.EpochFile | None:
     """Return the stored epoch of this start if it has the same inputs and settings, else None.
 
@@ -416,18 +371,6 @@ def _identical_epoch(series: Series, epoch: epochs.Epoch) -> epochs.EpochFile | 
     )
 
 
-def air_key(scalars: Mapping[str, float]) -> tuple[float, ...]:
-    """Return temperature, pressure and humidity of an epoch [°C, hPa, %]; () if they are unknown."""
-    air = tuple(scalars[name] for name in epochs.AIR_VARIABLES if name in scalars)
-    return air if len(air) == len(epochs.AIR_VARIABLES) else ()
-
-
-def exclusion_reason(site: Site, start_utc_s: float, end_utc_s: float) -> str:
-    """Return the reasons in the flag file for excluding a scan, as stored; '' if there are none."""
-    reason = reasons_for(read_flags(site.flags.file), start_utc_s, end_utc_s) if site.flags else ""
-    return roundtrip_text(reason, "sentence")
-
-
 def load_reference(site: Site, version: str | None = None) -> Reference | None:
     """Return the reference surface: `version` if it is still valid, else the newest.
 
@@ -447,108 +390,3 @@ def load_reference(site: Site, version: str | None = None) -> Reference | None:
         write_reference(series, Reference.from_elevation(series.grid, version, elevation_m, snow_free))
         reference = open_reference(series)
     return reference
-
-
-def file_version(file: Path) -> str:
-    """Return the version name of a reference surface given as a file."""
-    return f"{file.stem}-{sha256_file(file)[:8]}"
-
-
-def load_area_polygons(site: Site) -> dict[str, shapely.Geometry]:
-    """Return the outlines of the areas of a site by name, in map coordinates."""
-    return {} if site.areas is None else read_polygons(site.areas.file, site.map.crs)
-
-
-def load_areas(site: Site) -> dict[str, Bools]:
-    """Return the cells (ny, nx) of the areas of a site by name."""
-    polygons = load_area_polygons(site)
-    return {name: cells_inside(polygon, site.grid_cells) for name, polygon in polygons.items()}
-
-
-@contextmanager
-def open_scan_for(site: Site, path: Path) -> Iterator[ScanReader]:
-    """Yield a reader of a scan with the settings of the site; raises ScanError or NotReadyError."""
-    range_max_m = site.scanner.range_max_m if site.scans.frame == "scanner" else None
-    with open_scan(path, range_max_m=range_max_m) as reader:
-        if site.scans.frame == "map" and site.map.crs and reader.header.crs_wkt:
-            _require_same_map(reader.header.crs_wkt, site.map.crs)
-        yield reader
-
-
-def _require_same_map(declared_wkt: str, crs: str) -> None:
-    """Raise ScanError if a scan declares another projected or geographic CRS than the site."""
-    declared, expected = horizontal_crs(declared_wkt), horizontal_crs(crs)
-    if (declared.is_projected or declared.is_geographic) and not is_same_map(declared, expected):
-        raise ScanError(f"the file is in {declared.name}, map.crs is {expected.name}: export it to that map")
-
-
-def sha256_log(scan: ScanFile) -> str:
-    """Return the SHA-256 of a scan's inclination log, '' if there is none."""
-    return sha256_file(scan.log) if scan.log else ""
-
-
-def _scalar_variables(
-    measurement: Measurement, inputs: ScanInputs, point_total: int, ground_total: int
-) -> dict[str, float]:
-    """Return the scalar variables of an epoch by their name in the store.
-
-    The scan has `point_total` points, `ground_total` of which were used.
-    """
-    tilt_record, geometry = inputs.tilt_record, inputs.geometry
-    scalars = {
-        "point_total": float(point_total),
-        "discarded_share": 1.0 - ground_total / point_total,
-        "coverage": float(np.count_nonzero(measurement.count) / measurement.cell_index.size),
-    }
-    if geometry.position_m is not None:
-        scalars |= dict(
-            zip(("scanner_east", "scanner_north", "scanner_height"), geometry.position_m, strict=True)
-        )
-        scalars |= {"scanner_axis_east": geometry.axis[0], "scanner_axis_north": geometry.axis[1]}
-    if tilt_record is not None:
-        scalars["platform_roll"] = math.degrees(tilt_record.mean_roll_rad)
-        scalars["platform_pitch"] = math.degrees(tilt_record.mean_pitch_rad)
-        scalars["tilt_residual"] = math.degrees(tilt_record.noise_rad)
-        scalars["log_offset"] = tilt_record.offset_s
-    return scalars | air_scalars(inputs)
-
-
-def air_scalars(inputs: ScanInputs) -> dict[str, float]:
-    """Return the air of a scan by variable name [°C, hPa, %]; empty if it is unknown."""
-    air = inputs.air
-    if air is None:
-        return {}
-    return dict(
-        zip(epochs.AIR_VARIABLES, (air.temperature_c, air.pressure_hpa, air.humidity_pct), strict=True)
-    )
-
-
-def _log_metrics(epoch: epochs.Epoch, seconds: float) -> dict[str, float | str]:
-    """Return the metrics of a scan for the log line and the status."""
-    measurement = epoch.measurement
-    metrics: dict[str, float | str] = {
-        "points": int(epoch.scalars["point_total"]),
-        "cells": round(epoch.scalars["coverage"] * measurement.cell_index.size),
-    }
-    if epoch.scalars["discarded_share"]:
-        metrics["discarded_pct"] = round(100 * epoch.scalars["discarded_share"], 2)
-    if epoch.scalars["rejected_echo_share"]:
-        metrics["rejected_echo_pct"] = round(100 * epoch.scalars["rejected_echo_share"], 3)
-    sample = slice(None, None, 1 + len(measurement.cells) // MAX_METRIC_CELLS)
-    change_m, sigma_m = measurement.change_m[sample], measurement.cells["uncertainty_m"][sample]
-    valid = np.isfinite(sigma_m)
-    if valid.any():
-        metrics["sigma_median_m"] = round(float(np.median(sigma_m[valid])), 4)
-    valid = np.isfinite(change_m)
-    if valid.any():
-        metrics["change_median_m"] = round(float(np.median(change_m[valid])), 4)
-        significant = measurement.quality[sample][valid] & np.uint8(Quality.CHANGE_SIGNIFICANT)
-        metrics["significant_pct"] = round(100 * float(np.mean(significant > 0)), 1)
-    for variable in ("stable_nmad", "stable_z_std"):
-        if np.isfinite(epoch.scalars.get(variable, np.nan)):
-            metrics[variable] = round(epoch.scalars[variable], 3)
-    for variable, name in (("platform_roll", "roll_deg"), ("platform_pitch", "pitch_deg")):
-        if variable in epoch.scalars:
-            metrics[name] = round(epoch.scalars[variable], 4)
-    metrics["seconds"] = round(seconds, 2)
-    return metrics

@@ -15,10 +15,11 @@ from station.archive.reference_files import valid_versions
 from station.archive.schema import VERDICTS
 from station.config import Site
 from station.inbox.inbox import ScanFile
-from station.inbox.journal import Entry, State
+from station.inbox.journal_reader import Entry, State
 from station.inbox.scan_files import find_scan
 from station.processing.provenance import CurrentConfig, ScanProvenance, StoredEpoch, stored_epochs
-from station.processing.scan_tasks import Progress, file_version, series_for
+from station.processing.site_files import file_version, series_for
+from station.processing.workers.worker_process import Progress
 
 LATE_INPUTS = {"inclination log arrived later", "weather arrived later"}  # the service reprocesses these
 EPOCH_MISSING = "epoch damaged or missing"

@@ -16,7 +16,8 @@ from station.archive.series.virtual import build_series
 from station.config import Site
 from station.errors import StoreError
 from station.inbox.file_hash import sha256_file
-from station.processing.scan_tasks import Progress, load_area_polygons, load_areas, series_for
+from station.processing.site_files import load_area_polygons, load_areas, series_for
+from station.processing.workers.worker_process import Progress
 from station.queries.aggregates import Aggregates
 from station.queries.blocks import BlockQueries, update_boxes
 
@@ -49,12 +50,12 @@ def update_series(site: Site, progress: Progress) -> int:
 
 
 def compact_epochs(
-    site: Site, checksums: Mapping[str, str], progress: Progress, *, in_backlog: bool = False
+    site: Site, checksums: Mapping[str, str], now_s: float | None, progress: Progress
 ) -> Checksums:
-    """Compact closed days and months; return the checksums of the files written.
+    """Compact the days and months that are closed at `now_s`; return the checksums of the files written.
 
-    `checksums` are those of the files of the store. With `in_backlog`, the newest epoch decides which days
-    and months are closed, not the clock. Raises StoreError if a file to be compacted fails its checksum.
+    `checksums` are those of the files of the store. Without `now_s`, as in a backlog, the newest epoch
+    decides which are closed. Raises StoreError if a file to be compacted fails its checksum.
     """
     series = series_for(site)
 
@@ -64,7 +65,7 @@ def compact_epochs(
         if name in checksums and sha256_file(path) != checksums[name]:
             raise StoreError(f"{path}: damaged: its checksum does not match")
 
-    now = compaction.latest_start(series) if in_backlog else datetime.now(UTC)
+    now = compaction.latest_start(series) if now_s is None else datetime.fromtimestamp(now_s, UTC)
     written = compaction.compact(series, now, progress, verify) if epochs.list_files(series) else []
     new_checksums = {}
     for path in written:
@@ -74,21 +75,17 @@ def compact_epochs(
 
 
 def compact_low_priority(
-    site: Site,
-    checksums: Mapping[str, str],
-    in_backlog: bool,  # noqa: FBT001 - a task has no keywords
-    progress: Progress,
+    site: Site, checksums: Mapping[str, str], now_s: float | None, progress: Progress
 ) -> Checksums:
     """Do as `compact_epochs` at low priority, so that scans processed meanwhile come first."""
     with suppress(OSError):  # without permission it runs at normal priority
         os.nice(LOWEST_PRIORITY)
-    return compact_epochs(site, checksums, progress, in_backlog=in_backlog)
+    return compact_epochs(site, checksums, now_s, progress)
 
 
-def delete_expired(site: Site, progress: Progress) -> list[str]:
+def delete_expired(site: Site, now_s: float, progress: Progress) -> list[str]:
     """Delete files unused by the series for two days; return them, relative to the data folder."""
     progress()
     series = series_for(site)
-    return [
-        str(path.relative_to(series.folder)) for path in compaction.delete_expired(series, datetime.now(UTC))
-    ]
+    expired = compaction.delete_expired(series, datetime.fromtimestamp(now_s, UTC))
+    return [str(path.relative_to(series.folder)) for path in expired]

@@ -16,7 +16,8 @@ from typing import TypeVar
 from station.archive.atomic_files import atomic_write
 from station.config import Site
 from station.errors import NotReadyError, ScanError, StationError, StoreError
-from station.processing.scan_inputs import air_from_log, scanner_height_m
+from station.processing.scan_air import air_from_log
+from station.processing.scanner_pose import scanner_height_m
 from station.readers.flags import read_flags
 from station.readers.polygons import read_polygons
 from station.readers.regular_file import open_regular

@@ -8,14 +8,13 @@ from typing import Any
 
 import h5py
 import numpy as np
-from isal.igzip_lib import IsalError
 
 from station.archive.areas import AREA_VARIABLES
 from station.archive.chunk_codec import read_column
 from station.archive.netcdf_layout import Series, decode_text
+from station.archive.read_errors import read_errors
 from station.archive.schema import FILL, VERDICTS
 from station.archive.series.index import processing_file
-from station.errors import StoreError
 from station.quantities import Floats
 
 SCALAR_VARIABLES = (
@@ -54,18 +53,15 @@ class AreaSeries:
 def read_epoch_table(series: Series) -> EpochTable:
     """Return the epoch table of `processing.nc`; raise StoreError if it cannot be read."""
     path = processing_file(series)
-    try:
-        with h5py.File(path, "r") as file:
-            bounds_s = np.asarray(file["time_bnds"][:], dtype=np.float64)
-            return EpochTable(
-                start_s=bounds_s[:, 0],
-                end_s=bounds_s[:, 1],
-                verdict=[VERDICTS[code] for code in file["verdict"][:].tolist()],
-                scalars={name: _nan_where_missing(file[name][:]) for name in SCALAR_VARIABLES},
-                texts={name: decode_text(read_column(file[name])) for name in TEXT_VARIABLES},
-            )
-    except (OSError, RuntimeError, KeyError, IndexError, ValueError, IsalError) as error:  # type: ignore[misc] # the stub has no class
-        raise StoreError(f"{path}: cannot be read: {error}") from error
+    with read_errors(path), h5py.File(path, "r") as file:
+        bounds_s = np.asarray(file["time_bnds"][:], dtype=np.float64)
+        return EpochTable(
+            start_s=bounds_s[:, 0],
+            end_s=bounds_s[:, 1],
+            verdict=[VERDICTS[code] for code in file["verdict"][:].tolist()],
+            scalars={name: _nan_where_missing(file[name][:]) for name in SCALAR_VARIABLES},
+            texts={name: decode_text(read_column(file[name])) for name in TEXT_VARIABLES},
+        )
 
 
 def read_area_series(series: Series) -> list[AreaSeries]:
@@ -73,17 +69,14 @@ def read_area_series(series: Series) -> list[AreaSeries]:
     path = series.folder / "areas.nc"
     if not path.is_file():
         return []
-    try:
-        with h5py.File(path, "r") as file:
-            over_time = [variable.name for variable in AREA_VARIABLES if variable.dims == ("time", "area")]
-            if not set(over_time) <= set(file):
-                return []
-            start_s, end_s = np.asarray(file["time_bnds"][:], dtype=np.float64).T
-            names = [name.tobytes().rstrip(b"\0").decode() for name in file["area_name"][:]]
-            size_m2 = file["area_size"][:]
-            columns = {name: _nan_where_missing(read_column(file[name])) for name in over_time}
-    except (OSError, RuntimeError, KeyError, IndexError, ValueError, IsalError) as error:  # type: ignore[misc] # the stub has no class
-        raise StoreError(f"{path}: cannot be read: {error}") from error
+    with read_errors(path), h5py.File(path, "r") as file:
+        over_time = [variable.name for variable in AREA_VARIABLES if variable.dims == ("time", "area")]
+        if not set(over_time) <= set(file):
+            return []
+        start_s, end_s = np.asarray(file["time_bnds"][:], dtype=np.float64).T
+        names = [name.tobytes().rstrip(b"\0").decode() for name in file["area_name"][:]]
+        size_m2 = file["area_size"][:]
+        columns = {name: _nan_where_missing(read_column(file[name])) for name in over_time}
     return [
         AreaSeries(
             name,

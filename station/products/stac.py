@@ -19,11 +19,12 @@ from scipy.spatial.transform import Rotation
 
 from station.archive.epochs import EpochRef
 from station.archive.netcdf_layout import Series
+from station.archive.read_errors import read_errors
 from station.archive.reference_files import read_reference
 from station.archive.schema import FILL
 from station.archive.series.index import processing_file
 from station.config import Site
-from station.errors import StationError, StoreError
+from station.errors import StationError
 from station.products.epoch_table import EpochTable, read_epoch_table
 from station.products.geotiff import KINDS, export_geotiff, write_cog
 from station.quantities import Floats
@@ -205,15 +206,12 @@ def _adjustment(series: Series, row: int) -> Floats | None:
     without an adjustment. Source: equations.md, 6.1.
     """
     path = processing_file(series)
-    try:
-        with h5py.File(path, "r") as file:
-            if not {"shared_parameter", "parameter_name", "scanner_east"} <= set(file):
-                return None
-            names = [name.tobytes().rstrip(b"\0").decode() for name in file["parameter_name"][:]]
-            estimate = dict(zip(names, file["shared_parameter"][row].tolist(), strict=True))
-            position_m = np.array([file[f"scanner_{axis}"][row] for axis in ("east", "north", "height")])
-    except (OSError, RuntimeError, KeyError) as error:
-        raise StoreError(f"{path}: cannot be read: {error}") from error
+    with read_errors(path), h5py.File(path, "r") as file:
+        if not {"shared_parameter", "parameter_name", "scanner_east"} <= set(file):
+            return None
+        names = [name.tobytes().rstrip(b"\0").decode() for name in file["parameter_name"][:]]
+        estimate = dict(zip(names, file["shared_parameter"][row].tolist(), strict=True))
+        position_m = np.array([file[f"scanner_{axis}"][row] for axis in ("east", "north", "height")])
     values = np.array([estimate.get(name, FILL) for name in POSE])
     if np.any(np.abs([*values, *position_m]) > FILL / 2):
         return None
@@ -228,11 +226,8 @@ def _adjustment(series: Series, row: int) -> Floats | None:
 def _time_bounds(series: Series) -> Floats:
     """Return start and end of all epochs (t, 2) [s since 1970]."""
     path = processing_file(series)
-    try:
-        with h5py.File(path, "r") as file:
-            return np.asarray(file["time_bnds"][:], dtype=np.float64)
-    except (OSError, RuntimeError, KeyError) as error:
-        raise StoreError(f"{path}: cannot be read: {error}") from error
+    with read_errors(path), h5py.File(path, "r") as file:
+        return np.asarray(file["time_bnds"][:], dtype=np.float64)
 
 
 def _utc(time_s: float) -> datetime:

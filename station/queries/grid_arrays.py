@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from datetime import UTC, datetime
-from typing import TYPE_CHECKING, cast
+from typing import TYPE_CHECKING, TypeAlias, TypeGuard
 
 import numpy as np
 import numpy.typing as npt
@@ -14,12 +14,11 @@ from station.archive.netcdf_layout import Series
 from station.errors import StationError
 from station.quantities import Bools, Floats, Grid
 
-if TYPE_CHECKING:  # workers query without xarray, whose import takes 70 MB of memory
-    import xarray as xr
-
-    Epoch = int | str | np.datetime64 | datetime | xr.DataArray
+if TYPE_CHECKING:
+    import xarray as xr  # half a second that the service does not need
 
 ALIGNED_CELLS = 0.01  # of a cell: coordinates that differ less are the same
+Epoch: TypeAlias = "int | str | np.datetime64 | datetime | xr.DataArray"
 
 
 def to_grid(values: npt.ArrayLike | xr.DataArray, grid: Grid) -> Floats | Bools:
@@ -28,7 +27,7 @@ def to_grid(values: npt.ArrayLike | xr.DataArray, grid: Grid) -> Floats | Bools:
     A DataArray is aligned by its coordinates, whatever its order; cells outside it are zero. Raises
     ValueError if it does not fit the grid or contains NaN.
     """
-    aligned = _align(cast("xr.DataArray", values), grid) if hasattr(values, "dims") else np.asarray(values)
+    aligned = _align(values, grid) if _is_data_array(values) else np.asarray(values)
     if aligned.shape != grid.shape:
         raise ValueError(f"the array has shape {aligned.shape}, the grid {grid.shape}")
     if aligned.dtype == np.bool_:
@@ -38,6 +37,10 @@ def to_grid(values: npt.ArrayLike | xr.DataArray, grid: Grid) -> Floats | Bools:
     if unknown:
         raise ValueError(f"{unknown} weights are NaN: give 0 to cells outside, as weights.fillna(0) does")
     return weights
+
+
+def _is_data_array(value: object) -> TypeGuard[xr.DataArray]:
+    return hasattr(value, "dims") and hasattr(value, "values")
 
 
 def _align(array: xr.DataArray, grid: Grid) -> npt.NDArray[np.generic]:
@@ -85,7 +88,7 @@ def to_mask(area: str | npt.ArrayLike | xr.DataArray | shapely.Geometry, series:
 
 def to_index_or_time(epoch: Epoch) -> int | np.datetime64:
     """Return an epoch given by a user as an index or a time in UTC; raise ValueError for anything else."""
-    value: object = np.asarray(epoch)[()] if hasattr(epoch, "dims") else epoch
+    value: object = epoch.values[()] if _is_data_array(epoch) else epoch
     if isinstance(value, (int, np.integer)) and not isinstance(value, np.timedelta64):
         return int(value)
     try:

@@ -7,29 +7,30 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable, Mapping
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import Future
 
 from station.config import Site
 from station.errors import NotReadyError
-from station.processing import isolation
 from station.processing.store_tasks import MAX_STORE_TASK_S, Checksums, compact_low_priority
+from station.service.host import Host
 
 
 class BackgroundCompaction:
     """A thread that waits for the compaction process; it touches neither journal nor series."""
 
-    def __init__(self, site: Site, on_done: Callable[[], None]) -> None:
+    def __init__(self, site: Site, on_done: Callable[[], None], host: Host) -> None:
         """`on_done` is called, in another thread, when `result` has something to return."""
         self._site = site
         self._on_done = on_done
         self._stop = threading.Event()
-        self._executor = ThreadPoolExecutor(max_workers=1)
+        self._tasks = host.tasks
+        self._executor = host.make_executor()
         self._future: Future[Checksums] | None = None
 
-    def start(self, checksums: Mapping[str, str], *, in_backlog: bool) -> None:
+    def start(self, checksums: Mapping[str, str], now_s: float | None) -> None:
         """Start a compaction unless one is running; see `store_tasks.compact_epochs`."""
         if self._future is None:
-            self._future = self._executor.submit(self._run, dict(checksums), in_backlog)
+            self._future = self._executor.submit(self._run, dict(checksums), now_s)
             self._future.add_done_callback(lambda _: self._on_done())
 
     def result(self) -> Checksums | None:
@@ -50,12 +51,12 @@ class BackgroundCompaction:
         self._stop.set()
         self._executor.shutdown()
 
-    def _run(self, checksums: Mapping[str, str], in_backlog: bool) -> Checksums:  # noqa: FBT001
-        return isolation.run_isolated(
+    def _run(self, checksums: Mapping[str, str], now_s: float | None) -> Checksums:
+        return self._tasks.run(
             compact_low_priority,
             self._site,
             checksums,
-            in_backlog,
+            now_s,
             memory_gb=self._site.service.memory_gb,
             timeout_s=MAX_STORE_TASK_S,
             should_stop=self._stop.is_set,

@@ -11,26 +11,26 @@ import logging
 import math
 import os
 import signal
-import time
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass
 from pathlib import Path
-from queue import Empty, SimpleQueue
+from queue import Empty
 from typing import TYPE_CHECKING, Protocol
 
 from station.config import Site, read_site
 from station.errors import ConfigError, NotReadyError, StationError
 from station.inbox.inbox import Inbox, ScanFile
-from station.inbox.journal import Journal, State
+from station.inbox.journal import Journal
+from station.inbox.journal_reader import State
 from station.inbox.lock import LockedFolder, exclusive_lock, require_known
 from station.logs import log_to_stderr, logfmt
 from station.monitoring.metrics import Metrics
 from station.monitoring.preconditions import EARLIEST_S, clock_problem, require_disk_space
-from station.processing import fork_server, isolation
+from station.processing.workers import fork_server
 from station.readers.scan import suffixes
+from station.service.host import Host
 from station.service.inbox_watcher import InboxWatcher
 from station.service.scheduler import JobScheduler, LoopEvent
-from station.service.systemd import SystemdNotifier
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -68,6 +68,7 @@ def run(
     *,
     make_worker: Callable[..., ScanProcessor] | None = None,
     timing: LoopTiming | None = None,
+    host: Host | None = None,
 ) -> int:
     """Run the service until a signal stops it; return the exit status.
 
@@ -82,7 +83,7 @@ def run(
 
         make_worker = Worker
     faulthandler.enable()  # the watchdog's SIGABRT then prints where the loop hung
-    daemon = Daemon(site_path, make_worker, timing or LoopTiming())
+    daemon = Daemon(site_path, make_worker, timing or LoopTiming(), host or Host())
     signal.signal(signal.SIGTERM, lambda *_: daemon.stop())
     signal.signal(signal.SIGINT, lambda *_: daemon.stop())
     signal.signal(signal.SIGHUP, lambda *_: daemon.post(LoopEvent.RELOAD))
@@ -94,21 +95,26 @@ class Daemon:
     """The loop of the service and its state between two iterations."""
 
     def __init__(
-        self, site_path: Path, make_worker: Callable[..., ScanProcessor], timing: LoopTiming
+        self,
+        site_path: Path,
+        make_worker: Callable[..., ScanProcessor],
+        timing: LoopTiming,
+        host: Host,
     ) -> None:
         self._site_path = site_path
         self._site = read_site(site_path)
         self._make_worker = make_worker
         self._timing = timing
-        self._systemd = SystemdNotifier()
-        # SimpleQueue: its put() may be called from a signal handler while get() waits.
-        self._events: SimpleQueue[LoopEvent] = SimpleQueue()
+        self._host = host
+        self._clock = host.clock
+        self._systemd = host.systemd
+        self._events = host.events
         # Housekeeping is due at start: some stations never run at night.
         self._due = {LoopEvent.OVERDUE_CHECK, LoopEvent.COMPACT, LoopEvent.MAINTENANCE}
         self._stop_deadline_s = math.inf  # monotonic time at which the running scan is abandoned
         self._consecutive_faults = 0
         self._last_poll_s = -math.inf
-        self._last_arrival_s = time.monotonic()
+        self._last_arrival_s = self._clock.monotonic_s()
         self._is_overdue = False
         self._site_file_fault = ""  # why the last reload was rejected
         self._exit_stack = ExitStack()
@@ -124,7 +130,7 @@ class Daemon:
 
     def stop(self) -> None:
         """End the loop after the running scan, or after `grace_s`; a second call ends it at once."""
-        now_s = time.monotonic()
+        now_s = self._clock.monotonic_s()
         self._stop_deadline_s = now_s if self._is_stopping() else now_s + self._timing.grace_s
         self._systemd.stopping()
         self._events.put(LoopEvent.STOP)
@@ -173,7 +179,7 @@ class Daemon:
         if LoopEvent.COMPACTED in self._due:
             self._due.discard(LoopEvent.COMPACTED)
             self._guarded(LoopEvent.COMPACTED, worker.publish_compacted)
-        self._last_poll_s = time.monotonic()
+        self._last_poll_s = self._clock.monotonic_s()
         state = inbox.poll()
         self._record_arrivals(state.new)
         if state.first is None and state.to_precheck is not None:
@@ -241,20 +247,27 @@ class Daemon:
             journal,
             on_progress=self._systemd.watchdog,
             before_task=self._folder.require_same,
-            should_stop=lambda: time.monotonic() > self._stop_deadline_s,
+            should_stop=lambda: self._clock.monotonic_s() > self._stop_deadline_s,
             on_compacted=lambda: self.post(LoopEvent.COMPACTED),
             in_service=True,
+            host=self._host,
         )
-        inbox = Inbox(site, journal, suffixes())
-        watcher = InboxWatcher(
+        inbox = Inbox(site, journal, suffixes(), monotonic_s=self._clock.monotonic_s, now_s=self._clock.now_s)
+        watcher = self._host.make_watcher(
             site.scans.inbox, lambda: self.post(LoopEvent.INBOX_CHANGED), polling=site.scans.polling
         )
-        return worker, inbox, watcher, JobScheduler(self.post, expected_every_s=site.scans.expected_every_s)
+        scheduler = self._host.make_scheduler(
+            self.post,
+            expected_every_s=site.scans.expected_every_s,
+            monotonic_s=self._clock.monotonic_s,
+            now_s=self._clock.now_s,
+        )
+        return worker, inbox, watcher, scheduler
 
     def _open_journal(self) -> Journal:
         if self._journal is None:
             self._journal = self._exit_stack.enter_context(
-                Journal(self._site.station.data / "journal.sqlite")
+                Journal(self._site.station.data / "journal.sqlite", now_s=self._clock.now_s)
             )
         return self._journal
 
@@ -291,7 +304,7 @@ class Daemon:
         """Raise NotReadyError if only a restart by systemd helps."""
         if self._is_stopping():
             return
-        lost_s = isolation.seconds_without_worker()
+        lost_s = self._host.tasks.seconds_without_worker()
         if lost_s > self._timing.give_up_s:
             raise NotReadyError(f"no worker process could be started for {lost_s:.0f} s: restart the service")
         if self._folder.is_remounted():
@@ -315,14 +328,14 @@ class Daemon:
 
     def _wait(self, wait_s: float) -> None:
         """Wait until something is due; inbox events shorten the wait, except after a fault."""
-        deadline_s = time.monotonic() + wait_s
+        deadline_s = self._clock.monotonic_s() + wait_s
         while True:
-            remaining_s = max(0.0, deadline_s - time.monotonic())
+            remaining_s = max(0.0, deadline_s - self._clock.monotonic_s())
             try:
                 event = self._events.get(timeout=min(remaining_s, self._systemd.max_wait_s))
             except Empty:
                 self._systemd.watchdog()
-                if deadline_s <= time.monotonic():
+                if deadline_s <= self._clock.monotonic_s():
                     return
                 continue
             if event is LoopEvent.INBOX_CHANGED:
@@ -335,9 +348,10 @@ class Daemon:
 
     def _wait_for_clock(self) -> None:
         """Wait until the clock is plausible (service.md, 4)."""
-        deadline_s = time.monotonic() + self._timing.clock_wait_s
-        while (problem := clock_problem(self._site.station.data, time.time())) and not self._is_stopping():
-            if time.time() > EARLIEST_S and time.monotonic() > deadline_s:
+        deadline_s = self._clock.monotonic_s() + self._timing.clock_wait_s
+        data, now_s = self._site.station.data, self._clock.now_s
+        while (problem := clock_problem(data, now_s())) and not self._is_stopping():
+            if now_s() > EARLIEST_S and self._clock.monotonic_s() > deadline_s:
                 log.warning(logfmt(clock="doubtful", reason=problem, does="starting anyway"))
                 return
             self._systemd.status(f"waiting: {problem}")
@@ -356,7 +370,7 @@ class Daemon:
 
     def _record_arrivals(self, count: int) -> None:
         if count:
-            self._last_arrival_s = time.monotonic()
+            self._last_arrival_s = self._clock.monotonic_s()
             if self._is_overdue:
                 log.info(logfmt(scans="arriving again", new=count))
             self._is_overdue = False
@@ -364,7 +378,7 @@ class Daemon:
     def _warn_if_overdue(self) -> None:
         """Log one warning when a scan is overdue."""
         interval_s = self._site.scans.expected_every_s
-        silent_s = time.monotonic() - self._last_arrival_s
+        silent_s = self._clock.monotonic_s() - self._last_arrival_s
         if silent_s > 1.5 * interval_s and not self._is_overdue:
             self._is_overdue = True
             log.warning(

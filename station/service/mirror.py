@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import threading
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import Future
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
@@ -13,12 +13,13 @@ from station.archive.atomic_files import atomic_write
 from station.config import Site
 from station.errors import NotReadyError, StationError
 from station.monitoring.status import MIRROR_FAULT
-from station.processing import isolation
-from station.processing.scan_tasks import Progress, series_for
+from station.processing.site_files import series_for
 from station.processing.store_tasks import LOWEST_PRIORITY, MAX_STORE_TASK_S
+from station.processing.workers.worker_process import Progress
 from station.products.area_tables import Span
 from station.products.exports.formats import FORMATS
 from station.products.exports.selection import pending, select, split
+from station.service.host import Host
 
 PERIODS = {"references": "1D"}  # of each file: one for all days would be written anew with each epoch
 
@@ -57,10 +58,11 @@ def _renew(site: Site, kind: str, progress: Progress) -> None:
 class BackgroundMirror:
     """A thread that waits for the process that renews the mirror; a folder that hangs delays no scan."""
 
-    def __init__(self, site: Site) -> None:
+    def __init__(self, site: Site, host: Host) -> None:
         self._site = site
         self._stop = threading.Event()
-        self._executor = ThreadPoolExecutor(max_workers=1)
+        self._tasks = host.tasks
+        self._executor = host.make_executor()
         self._future: Future[str] | None = None
 
     def start(self) -> bool:
@@ -86,7 +88,7 @@ class BackgroundMirror:
         self._executor.shutdown()
 
     def _run(self) -> str:
-        return isolation.run_isolated(
+        return self._tasks.run(
             update_mirror,
             self._site,
             memory_gb=self._site.service.memory_gb,

@@ -8,12 +8,14 @@ from pathlib import Path
 
 from station.config import Site
 from station.errors import StationError
-from station.inbox.journal import Journal
+from station.inbox.journal_reader import JournalReader
 from station.monitoring.log_clock import log_clock_offset
 from station.monitoring.pose_stability import step_shown_by
 from station.monitoring.status import queue_status
 from station.processing.epoch_recorder import page_folder
-from station.processing.scan_tasks import Progress, StoredResult, series_for
+from station.processing.scan_tasks import StoredResult
+from station.processing.site_files import series_for
+from station.processing.workers.worker_process import Progress
 from station.products.export import export
 from station.products.page import PageContext, write_page
 
@@ -59,7 +61,7 @@ def _write_products(site: Site, result: StoredResult | None, faults: list[str], 
 
 def _page_context(site: Site, result: StoredResult | None, faults: list[str]) -> PageContext:
     backlog = queue_status(site)
-    with Journal(site.station.data / "journal.sqlite", read_only=True) as journal:
+    with JournalReader(site.station.data / "journal.sqlite") as journal:
         durations_s = journal.durations_s()
     return PageContext(
         name=site.station.name,

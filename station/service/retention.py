@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import shutil
-import time
 from collections.abc import Iterable, Mapping
 from datetime import UTC, datetime
 from pathlib import Path
@@ -15,14 +14,15 @@ from station.config import Site
 from station.errors import NotReadyError, ScanError
 from station.inbox.file_hash import file_identity, sha256_file
 from station.inbox.inbox import ScanFile
-from station.inbox.journal import Entry
+from station.inbox.journal_reader import Entry
 from station.inbox.scan_files import archive_path, scan_file
-from station.processing.scan_tasks import Progress, series_for, sha256_log
+from station.processing.site_files import series_for, sha256_log
+from station.processing.workers.worker_process import Progress
 
 MAX_PER_RUN = 50  # scans per maintenance run; there are four runs a day
 
 
-def expired_scans(site: Site, entries: Iterable[Entry], reserved: set[str]) -> list[str]:
+def expired_scans(site: Site, entries: Iterable[Entry], reserved: set[str], now_s: float) -> list[str]:
     """Return the names of stored scans older than `keep_days`, oldest first, except those in `reserved`.
 
     Moved scans can still be read, so `reserved` applies only to deletion.
@@ -33,7 +33,7 @@ def expired_scans(site: Site, entries: Iterable[Entry], reserved: set[str]) -> l
     sop_scans = {sop.scan for sop in site.sop}  # their logs are searched for in the inbox
     all_entries = list(entries)
     newest_s = max((entry.start_utc_s or 0.0 for entry in all_entries), default=0.0)
-    cutoff_s = min(time.time(), newest_s) - settings.keep_days * 86_400  # a clock far ahead expires nothing
+    cutoff_s = min(now_s, newest_s) - settings.keep_days * 86_400  # a clock far ahead expires nothing
     candidates = [
         (entry.start_utc_s, entry.name)
         for entry in all_entries

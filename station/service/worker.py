@@ -3,57 +3,26 @@
 from __future__ import annotations
 
 import logging
-import math
-import time
-from collections.abc import Callable, Iterable
-from pathlib import Path
+from collections.abc import Callable
 from typing import TypeVar
 
-from station.archive.reference_files import valid_versions
-from station.archive.series.index import stored_series
 from station.config import Site
-from station.errors import (
-    ConfigError,
-    InconclusiveError,
-    NotReadyError,
-    ScanError,
-    StationError,
-    StoreError,
-)
-from station.inbox.inbox import ScanFile, start_from_name
-from station.inbox.journal import Entry, Journal, State
-from station.inbox.scan_files import find_scan
+from station.errors import InconclusiveError, NotReadyError, ScanError, StationError, StoreError
+from station.inbox.inbox import ScanFile
+from station.inbox.journal import Journal
+from station.inbox.journal_reader import Entry, State
 from station.logs import logfmt
 from station.monitoring.daily_digest import write_digest, yesterday
-from station.processing import isolation
-from station.processing.integrity import (
-    add_checksums,
-    holds_epochs,
-    is_reference,
-    missing_epochs,
-    quarantine,
-    restore_tilt_offsets,
-    unjournaled_epochs,
-    unreadable_files,
-    verify_checksums,
-)
-from station.processing.reference_tasks import (
-    build_reference_version,
-    next_version,
-    scans_for_version,
-    scans_needed,
-    update_reference_version,
-)
+from station.processing.integrity import holds_epochs
 from station.processing.scan_tasks import (
     Duplicate,
-    Progress,
     Rejected,
     ScanHistory,
     StoredResult,
     check_header,
     process_new,
-    series_for,
 )
+from station.processing.site_files import series_for
 from station.processing.staleness import count_outdated, late_inputs
 from station.processing.store_tasks import (
     MAX_STORE_TASK_S,
@@ -64,19 +33,24 @@ from station.processing.store_tasks import (
     update_series,
 )
 from station.processing.usable_inputs import with_usable_inputs
-from station.science.geometry.pose import horizontal_crs, is_same_map
+from station.processing.workers.worker_process import Progress
 from station.service.background_compaction import BackgroundCompaction
+from station.service.host import Host
 from station.service.mirror import BackgroundMirror, record_mirror_fault
 from station.service.publishing import publish
+from station.service.reference_builder import ReferenceBuilder
 from station.service.retention import apply_retention, expired_scans
+from station.service.store_repair import StoreRepair, require_same_map
 
 log = logging.getLogger("station")
 T = TypeVar("T")
-VERIFY_INTERVAL_S = 3600.0  # minimum interval between full checksum runs after store errors
 
 
 class Worker:
-    """Processes scans one by one: worker process, journal, series, reference."""
+    """Processes scans one by one: worker process, journal, series, reference.
+
+    `store` repairs what is damaged or missing in the store.
+    """
 
     def __init__(
         self,
@@ -88,6 +62,7 @@ class Worker:
         on_compacted: Callable[[], None] = lambda: None,
         before_task: Callable[[], None] = lambda: None,
         in_service: bool = False,
+        host: Host | None = None,
     ) -> None:
         """`on_compacted` is called, in another thread, when `publish_compacted` has something to do.
 
@@ -98,7 +73,7 @@ class Worker:
 
         Raises ConfigError if the stored series has another map or grid.
         """
-        _require_same_map(site)
+        require_same_map(site)
         self._site = site
         self._series = series_for(site)
         self._journal = journal
@@ -106,12 +81,14 @@ class Worker:
         self._should_stop = should_stop
         self._before_task = before_task
         self._in_service = in_service
+        self._host = host or Host()
         self._processed: dict[str, ScanFile] = {}
-        self._last_verified_s = -math.inf
         self._reported_outdated = 0
         self._reported_faults: tuple[str, ...] = ()
-        self._compaction = BackgroundCompaction(site, on_compacted)
-        self._mirror = BackgroundMirror(site)
+        self.store = StoreRepair(site, journal, self.run, self._host.clock)
+        self._reference = ReferenceBuilder(site, journal, self.run, self.store, self._processed)
+        self._compaction = BackgroundCompaction(site, on_compacted, self._host)
+        self._mirror = BackgroundMirror(site, self._host)
         self._mirror_is_due, self._mirror_fault = site.mirror is not None, ""
 
     def process(self, scan: ScanFile, *, ahead: bool = False) -> bool:
@@ -125,22 +102,24 @@ class Worker:
         if ahead:
             self._journal.mark_ahead(scan.name)
         is_stored = self._process(scan, ahead=ahead)
-        self._build_reference_if_due()  # also if the scan is not stored: the reference may have waited for it
+        self._reference.build_if_due()  # also if the scan is not stored: the reference may have waited for it
         return is_stored
 
     def _process(self, scan: ScanFile, *, ahead: bool) -> bool:
         self._processed[scan.name] = scan
         entry = self._journal.entry(scan.name)
+        now_s = self._host.clock.now_s()
         history = ScanHistory(
             reference=entry.reference if entry and not entry.ahead else None,
             revision=(entry.revision if entry else None) or 0,
             last_content=_assessed_content(entry) if self._in_service else None,
             stored_scans=self._journal.others_stored(scan.name, scan.size),
-            wait_for_weather=self._in_service,
-            waiting_before=self._unsettled_before(self._start_s(scan.name)) if self._in_service else "",
+            wait_for_weather=self._in_service and self._is_recent(scan, now_s),
+            waiting_before=self._reference.earlier_unsettled(scan.name) if self._in_service else "",
+            now_s=now_s,
         )
         try:
-            result = self._with_repair(process_new, scan, history)
+            result = self.store.with_repair(process_new, scan, history)
         except ScanError as error:
             return self._set_aside(scan, str(error))
         except InconclusiveError as error:
@@ -153,7 +132,7 @@ class Worker:
             return self._set_aside(scan, result.reason, result.sha256, result.log_sha256)
         if isinstance(result, Duplicate):
             return self._record_duplicate(scan, result)
-        uncompacted = self._with_repair(update_series)
+        uncompacted = self.store.with_repair(update_series)
         self._mirror_is_due = self._site.mirror is not None
         record_result(self._journal, scan.name, result, ahead=ahead)
         _log_result(scan.name, result)
@@ -162,13 +141,18 @@ class Worker:
             self.start_compaction(in_backlog=True)
         return True
 
+    def _is_recent(self, scan: ScanFile, now_s: float) -> bool:
+        """Return True if the weather log may not be up to date yet for a scan."""
+        weather = self._site.weather
+        return weather is not None and now_s - scan.mtime_ns * 1e-9 < weather.wait_s
+
     def precheck(self, scan: ScanFile) -> None:
         """Set a scan with broken headers aside at once, without waiting for its log."""
         try:
             self.run(check_header, scan)
         except ScanError as error:
             self._set_aside(scan, str(error))
-            self._build_reference_if_due()  # it may have waited for this scan
+            self._reference.build_if_due()  # it may have waited for this scan
         except NotReadyError:
             return
 
@@ -177,50 +161,26 @@ class Worker:
 
         The next scan is then measured from it, as without the interruption.
         """
-        self.reconcile()
-        self._build_reference_if_due()
-
-    def reconcile(self) -> None:
-        """Reconcile journal and files: add missing checksums and journal entries, rebuild the series.
-
-        Lost or damaged epochs are reprocessed if their scan is still in the inbox. `scan_tasks.process`
-        recognises an epoch written just before a power cut and does not store it twice.
-        """
-        self._quarantine(self.run(unreadable_files))
-        self.add_checksums()
-        self._import_unjournaled()
-        self._requeue_missing()
-        if holds_epochs(self._series):
-            self._with_repair(update_series)
-
-    def add_checksums(self) -> None:
-        """Record the checksums of files that have none; quarantine files that cannot be read."""
-        result = self.run(add_checksums, self._journal.checksums())
-        self._quarantine(result.damaged)
-        self._journal.add_checksums(result.new_checksums)
-
-    def verify_store(self) -> None:
-        """Verify every file against its checksum; quarantine damaged ones."""
-        damaged = self.run(verify_checksums, self._journal.checksums()).damaged
-        self._quarantine(damaged)
-        for name in filter(is_reference, damaged):  # a new version replaces it
-            quarantine(self._series, [name])
-            self._journal.drop_checksums([name])
+        self.store.reconcile()
+        self._reference.build_if_due()
 
     def compact(self) -> None:
         """Compact closed days and months; write the digest of yesterday."""
-        self._record_compacted(self._with_repair(compact_epochs, self._journal.checksums()))
+        self._record_compacted(
+            self.store.with_repair(compact_epochs, self._journal.checksums(), self._host.clock.now_s())
+        )
 
     def start_compaction(self, *, in_backlog: bool = False) -> None:
         """Start compaction in the background; `publish_compacted` completes it."""
-        self._compaction.start(self._journal.checksums(), in_backlog=in_backlog)
+        now_s = None if in_backlog else self._host.clock.now_s()
+        self._compaction.start(self._journal.checksums(), now_s)
 
     def publish_compacted(self) -> None:
         """Publish the files of a finished compaction and write the digest of yesterday; else do nothing."""
         try:
             checksums = self._compaction.result()
         except StoreError:
-            if not self._repair():
+            if not self.store.repair():
                 raise
             return  # the next scheduled compaction tries again
         if checksums is not None:
@@ -248,14 +208,14 @@ class Worker:
     def _record_compacted(self, checksums: Checksums) -> None:
         if checksums:
             self._journal.add_checksums(checksums)
-            self._with_repair(update_series)
+            self.store.with_repair(update_series)
             self._mirror_is_due = self._site.mirror is not None
         self._write_digest()
 
     def _write_digest(self) -> None:
         """Write the digest of yesterday; a failure is only logged, so that it never blocks scans."""
         try:
-            if self.run(write_digest, yesterday(time.time())):
+            if self.run(write_digest, yesterday(self._host.clock.now_s())):
                 log.info("%s", logfmt(digest="written"))
         except (StationError, RuntimeError) as error:
             log.warning("%s", logfmt(digest="failed", reason=error))
@@ -265,68 +225,20 @@ class Worker:
 
         Then report outdated epochs and apply retention.
         """
+        now_s = self._host.clock.now_s()
         if holds_epochs(self._series):
-            self._with_repair(update_series)
+            self.store.with_repair(update_series)
             self._mirror_is_due = self._site.mirror is not None  # a fault may have gone
-        self._journal.drop_checksums(self._with_repair(delete_expired))
-        affected = self._with_repair(late_inputs, self._journal.rows(State.STORED))
+        self._journal.drop_checksums(self.store.with_repair(delete_expired, now_s))
+        affected = self.store.with_repair(late_inputs, self._journal.rows(State.STORED))
         names = [name for name in affected if (self._site.scans.inbox / name).is_file()]
         for name in names:
             log.info("%s", logfmt(scan=name, reason="its log or weather arrived late: reprocessing"))
         self._journal.requeue(names)
         self._judge_again()
-        self._build_reference_if_due()  # what it waits for may have taken too long, and no scan come since
+        self._reference.build_if_due()  # what it waits for may have taken too long, and no scan come since
         self._report_outdated()
-        self._apply_retention()
-
-    def _with_repair(self, task: Callable[..., T], *args: object) -> T:
-        """Run a task; if it finds the store damaged, quarantine the damaged files and run it once more."""
-        try:
-            return self.run(task, *args)
-        except StoreError:
-            if not self._repair():
-                raise
-            return self.run(task, *args)
-
-    def _repair(self) -> bool:
-        """Quarantine damaged files and requeue their epochs; return True if any holds epochs."""
-        damaged = self.run(unreadable_files)
-        if not damaged and time.monotonic() > self._last_verified_s + VERIFY_INTERVAL_S:
-            self._last_verified_s = time.monotonic()
-            damaged = self.run(verify_checksums, self._journal.checksums()).damaged
-        self._quarantine(damaged)
-        if damaged:
-            self._requeue_missing()
-        return not all(map(is_reference, damaged))
-
-    def _quarantine(self, damaged: Iterable[str]) -> None:
-        for name in damaged:
-            if is_reference(name):
-                log.error("%s", logfmt(file=name, reason="damaged: restore it, or run station reprocess"))
-                continue
-            quarantine(self._series, [name])
-            self._journal.drop_checksums([name])
-            log.error(
-                "%s",
-                logfmt(file=name, reason="damaged: excluded from the series, kept as *.damaged"),
-            )
-
-    def _import_unjournaled(self) -> None:
-        """Import epochs that the journal lacks because it was lost or is older than the store."""
-        missing = self._with_repair(unjournaled_epochs, self._journal.epochs())
-        if missing:
-            log.warning("%s", logfmt(journal="completed", epochs=len(missing), reason="missing in it"))
-        self._journal.import_entries(missing)
-        self.run(restore_tilt_offsets)
-
-    def _requeue_missing(self) -> None:
-        for name in self.run(missing_epochs, self._journal.epochs(State.STORED)):
-            if (self._site.scans.inbox / name).is_file():
-                log.warning("%s", logfmt(scan=name, reason="epoch missing from the store: reprocessing"))
-                self._journal.requeue([name])
-            else:
-                reason = "epoch missing from the store, scan missing from the inbox: run station reprocess"
-                log.error("%s", logfmt(scan=name, reason=reason))
+        self._apply_retention(now_s)
 
     def _set_aside(
         self, scan: ScanFile, reason: str, sha256: str | None = None, log_sha256: str = ""
@@ -392,9 +304,9 @@ class Worker:
             log.warning("%s", logfmt(epochs=count, reason=reason))
         self._reported_outdated = count
 
-    def _apply_retention(self) -> None:
+    def _apply_retention(self, now_s: float) -> None:
         """Move or delete raw scans as configured in `[retention]`."""
-        due = expired_scans(self._site, self._journal.rows(State.STORED), self._reserved_for_reference())
+        due = expired_scans(self._site, self._journal.rows(State.STORED), self._reference.reserved(), now_s)
         entries = [entry for entry in map(self._journal.entry, due) if entry is not None]
         if not entries or self._should_stop():
             return
@@ -411,100 +323,12 @@ class Worker:
                 logfmt(scan=name, retention=action, **extra),
             )
 
-    def _reserved_for_reference(self) -> set[str]:
-        return set(scans_for_version(self._site, self._usable_scans(), len(valid_versions(self._series))))
-
-    def _usable_scans(self) -> list[str]:
-        """Return the names of the scans that a reference may be built from, by time."""
-        return self._journal.usable()
-
-    def _build_reference_if_due(self) -> None:
-        """Build the reference surface once enough usable scans are stored; update it as more arrive."""
-        setting, usable = self._site.reference.scans, self._usable_scans()
-        versions = valid_versions(self._series)
-        if versions and not isinstance(setting, Path):
-            self._requeue_without_reference()
-        chosen = scans_for_version(self._site, usable, len(versions))
-        needed = scans_needed(self._site, len(versions))
-        if isinstance(setting, Path) or not chosen or len(usable) < needed:
-            return
-        last_s = self._start_s(usable[needed - 1])
-        if self._unsettled_before(last_s, however_often_failed=True):  # it may belong to the reference
-            return
-        scans = [self._find_scan(name) for name in chosen]
-        available = [scan for scan in scans if scan is not None]
-        if len(available) < (setting if versions else len(chosen)):
-            missing = [name for name, scan in zip(chosen, scans, strict=True) if scan is None]
-            if not versions:
-                log.warning("%s", logfmt(reference="waiting", reason=f"missing scans: {', '.join(missing)}"))
-            return
-        try:
-            version = next_version(self._series, (row.reference for row in self._journal.rows()))
-            if versions:
-                self.run(update_reference_version, available, version, list(versions)[-1], ())
-            else:
-                self.run(build_reference_version, available, version)
-        except (ScanError, NotReadyError) as error:
-            log.warning("%s", logfmt(reference="failed", reason=error))
-            return
-        self.add_checksums()
-        log.info("%s", logfmt(reference=version, scans=len(available)))
-        self._requeue_for_version(version, last_s if versions else None)
-
-    def _requeue_for_version(self, version: str, update_s: float | None) -> None:
-        """Requeue epochs that were not measured from a version of the reference, but should have been.
-
-        These are all epochs of a first version; of an update, to the scans before `update_s`, those of later
-        scans that were processed while the update waited for an earlier one, if they are still in the inbox.
-        """
-        outdated = (
-            row.name
-            for row in self._journal.rows()
-            if row.epoch and row.outcome is not State.SET_ASIDE and row.reference != version
-            if update_s is None
-            or ((row.start_utc_s or 0.0) > update_s and (self._site.scans.inbox / row.name).is_file())
-        )
-        self._journal.requeue(outdated, keep_reference=False)
-
-    def _unsettled_before(self, start_utc_s: float, *, however_often_failed: bool = False) -> str:
-        """Return the name of an earlier scan that will be judged soon, '' if there is none."""
-        unsettled = self._journal.unsettled(however_often_failed=however_often_failed)
-        for name, known_s in unsettled.items():
-            if (known_s or start_from_name(name, self._site.scans.name).timestamp()) < start_utc_s:
-                return name
-        return ""
-
-    def _start_s(self, name: str) -> float:
-        """Return the start of a scan, from its epoch or else its name; the year 9999 if neither tells it."""
-        entry = self._journal.entry(name)
-        if entry is not None and entry.start_utc_s is not None:
-            return entry.start_utc_s
-        return start_from_name(name, self._site.scans.name).timestamp()
-
-    def _requeue_without_reference(self) -> None:
-        """Requeue epochs without change: power failed between building the reference and its first use."""
-        inbox = self._site.scans.inbox
-        names = [
-            name
-            for name in self._journal.without_reference()
-            if name in self._processed or (inbox / name).is_file()
-        ]
-        self._journal.requeue(names)
-
-    def _find_scan(self, name: str) -> ScanFile | None:
-        """Return a scan file from where it was processed, the inbox or the archive; None if it is gone."""
-        scan = self._processed.get(name)
-        if scan is not None and scan.path.is_file():
-            return scan
-        entry = self._journal.entry(name)
-        return find_scan(self._site, name, entry.start_utc_s if entry else None)
-
     def run(self, task: Callable[..., T], *args: object) -> T:
         """Run a task in a worker process, limited to `timeout_s` per scan; without scans, to hours."""
         items = [item for arg in args for item in (arg if isinstance(arg, list) else [arg])]
         self._before_task()
         scan_count = sum(isinstance(item, ScanFile) for item in items)
-        result: T = isolation.run_isolated(
+        result: T = self._host.tasks.run(
             with_usable_inputs,
             task,
             self._site,
@@ -548,38 +372,6 @@ def record_result(journal: Journal, name: str, result: StoredResult, *, ahead: b
         epoch_sha256=result.epoch_sha256,
         ahead=ahead,
     )
-
-
-def _require_same_map(site: Site) -> None:
-    """Raise ConfigError if the stored series has another map or grid: a series has only one."""
-    series = stored_series(series_for(site))
-    if series is None:
-        return
-    crs = site.map.crs
-    if (crs is None) != (series.crs is None) or (
-        crs and series.crs and not is_same_map(horizontal_crs(series.crs), horizontal_crs(crs))
-    ):
-        stored_name = horizontal_crs(series.crs).name if series.crs else "a local frame, without map.crs"
-        raise ConfigError(
-            f"map.crs = {crs!r} differs from that of {site.station.data}, {stored_name}: restore it, or give"
-            " station.data a new folder"
-        )
-    stored = series.grid
-    configured = site.grid_cells
-    deviation_m = max(
-        abs(stored_m - configured_m)
-        for stored_m, configured_m in (
-            (stored.west_m, configured.west_m),
-            (stored.north_m, configured.north_m),
-            (stored.cell_m * stored.nx, configured.cell_m * configured.nx),
-        )
-    )
-    if stored.shape != configured.shape or deviation_m > 1e-3 * configured.cell_m:
-        raise ConfigError(
-            f"[grid] differs from that of {site.station.data}: {stored.nx} x {stored.ny} cells of"
-            f" {stored.cell_m:.6g} m from west {stored.west_m:.10g}, north {stored.north_m:.10g}: restore it,"
-            " or give station.data a new folder"
-        )
 
 
 def _count_outdated(site: Site, queued: list[str], progress: Progress) -> int:

@@ -21,7 +21,7 @@ import pytest
 from support.tiny_station import PENDING, SCANS, assert_same_values, build, scan_name  # noqa: F401 - for tests
 
 from benchmarks.process_cost import family
-from station.inbox.journal import Journal, State
+from station.inbox.journal_reader import JournalReader, State
 
 FOLDER = Path(__file__).parent
 HOOKS = FOLDER / "hooks"
@@ -195,7 +195,7 @@ class Station:
 
     def rows(self):
         """Return the rows of the journal by scan."""
-        with Journal(self.data / "journal.sqlite", read_only=True) as journal:
+        with JournalReader(self.data / "journal.sqlite") as journal:
             return {row.name: row for row in journal.rows()}
 
     def is_done(self, *hours):

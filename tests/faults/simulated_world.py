@@ -1,11 +1,7 @@
-"""Years of a station's faults in minutes: the service's own loop in one process, on a simulated clock.
+"""Years of a station's faults in minutes: the service on a simulated machine, and all that happens to it.
 
-Everything is the production code but for what a `World` stands for: the clock (nobody waits for it), the
-process of a task (it runs here, and may die or never start), the disk (any change of a file in the data
-folder may fail, or be the last of the service), the network folder with the inbox, and the events of file
-watcher and scheduler. A year has nine bursts of four hourly scans, a change of the SOP, and two faults around
-each scan; what happens follows from the seed. Deaths here run `finally` blocks, and nothing is synced to any
-disk; `test_kills.py` kills real processes.
+A year has nine bursts of four hourly scans, a change of the SOP, and two faults around each scan; what
+happens follows from the seed. Everything but the machine (`simulated_machine.py`) is the production code.
 
     python tests/faults/simulated_world.py --seed 0 --years 100
 """
@@ -16,33 +12,31 @@ import argparse
 import errno
 import logging
 import os
-import random
 import shutil
-import sqlite3
 import sys
 import tempfile
-import time
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import contextmanager
 from datetime import UTC, datetime
 from pathlib import Path
 from unittest import mock
 
 if __name__ == "__main__":
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # as in worker processes; more threads are slower
     sys.path[:0] = [str(Path(__file__).parents[1]), str(Path(__file__).parents[2])]
 
 import laspy
 import numpy as np
-from hooks import boundaries
+from simulated_machine import DiedError, Machine
 from support.tiny_station import PENDING, build, scan_name, values
 
-from station.errors import InconclusiveError, StationError
-from station.inbox import inbox, journal
-from station.inbox.journal import Journal, State
+from station.config import read_site
+from station.errors import StationError
+from station.inbox.journal_reader import JournalReader, State
 from station.inbox.lock import IDENTITY
-from station.processing import isolation
-from station.service import background_compaction, worker
+from station.processing import integrity
 from station.service.daemon import Daemon, LoopTiming
 from station.service.scheduler import LoopEvent
+from station.service.worker import Worker
 
 START_S = datetime(2035, 7, 15, tzinfo=UTC).timestamp()  # later than the real clock, which stamps the files
 BASE_SCANS = 12  # simulated ones, of which all others are copies with bytes of their own
@@ -57,27 +51,18 @@ MAX_RECOVERY_S = 40 * DAY_S  # after the last fault; the longest pause of a scan
 TIMING = LoopTiming(period_s=6 * HOUR_S, first_pause_s=5.0)
 
 
-class _DiedError(BaseException):
-    """The service or the process of a task is killed: nothing handles it."""
-
-
-class World:
-    """A station's folder and all that happens to it."""
+class World(Machine):
+    """A station's folder on a machine and all that happens to both."""
 
     def __init__(self, folder: Path, seed: int, scans: int = SCANS_PER_YEAR) -> None:
-        self.folder, self.seed = folder, seed
-        self.rng = random.Random(seed)  # noqa: S311 - no secret
-        self.elapsed_s = self.clock_error_s = 0.0
-        self.timeline: list[tuple[float, int, object]] = []
+        super().__init__(START_S, seed)
+        self.folder = folder
         self.names: list[str] = []  # of the good scans
         self.daemon: Daemon | None = None
-        self.starts = self.deaths = self.faults = 0
-        self.in_child = self.is_acting = False
-        self.countdown: dict[str, int] = {}  # boundaries until the death of "child" or "service"
-        self.is_disk_full = self.is_out_of_space = False
-        self.child_fault: Exception | None = None
+        self.starts = self.faults = 0
         self.version = "1.0"
         self.log: list[str] = []
+        self.unreported: list[str] = []  # damaged files that `station check --store` did not report
         self.data, self.inbox = folder / "data", folder / "inbox"
         self.last_fault_s = 0.0
         for number in range(scans):
@@ -86,11 +71,6 @@ class World:
             self.at(number * HOUSEKEEPING_S, self._housekeeping)
 
     # ---- what will happen
-
-    def at(self, elapsed_s: float, action: object) -> None:
-        """Plan an action."""
-        self.timeline.append((elapsed_s, len(self.timeline), action))
-        self.timeline.sort(key=lambda planned: planned[:2], reverse=True)
 
     def plan_faults(self, *kinds: str) -> None:
         """Plan two faults, of any kind or one of these, around each scan."""
@@ -157,16 +137,20 @@ class World:
     def fault_child_killed(self) -> None:
         self.countdown["child"] = self.rng.randint(1, 40)
 
+    def fault_child_hangs(self) -> None:
+        self.countdown["hang"] = self.rng.randint(1, 40)
+
+    def fault_socket_deleted(self) -> None:
+        """Delete the socket of the fork server, as programs do that clean a folder of temporary files."""
+        self.is_socket_deleted = True
+
     def fault_no_tasks(self) -> object:
-        self.child_fault = isolation._WorkerLostError("the worker process could not be started")
-        return self._end_child_fault
+        self.start_error = BlockingIOError(errno.EAGAIN, os.strerror(errno.EAGAIN))
+        return lambda: setattr(self, "start_error", None)
 
     def fault_no_memory(self) -> object:
-        self.child_fault = InconclusiveError("needs more than 2 GB")
-        return self._end_child_fault
-
-    def _end_child_fault(self) -> None:
-        self.child_fault = None
+        self.is_out_of_memory = True
+        return lambda: setattr(self, "is_out_of_memory", False)
 
     def fault_disk_full(self) -> object:
         self.is_disk_full = True
@@ -242,8 +226,15 @@ class World:
             self._damage(self.rng.choice(sorted(files)))
 
     def fault_series_damaged(self) -> None:
-        if (self.data / "series.nc").exists():
-            self._damage(self.data / "series.nc")
+        """Damage a file that people open; `station check --store` must report it."""
+        path = self.data / self.rng.choice(["series.nc", "areas.nc"])
+        if path.exists() and path.with_name("journal.sqlite").exists():
+            self._damage(path)
+            with JournalReader(path.with_name("journal.sqlite")) as opened:
+                site, rows, known = read_site(self.folder / "site.toml"), opened.rows(), opened.checksums()
+            findings = integrity.check_store(site, rows, known, lambda: None)
+            if not any(level != "ok" and path.name in message for level, _, message in findings):
+                self.unreported.append(f"{path.name}: its damage was not reported at {self.elapsed_s:.0f} s")
 
     def fault_tilt_offset_damaged(self) -> None:
         for path in sorted(self.data.glob("sop_tilt_offset/*")):
@@ -323,110 +314,25 @@ class World:
         scans = [self.inbox / name for name in self.names if name in stored]
         return self.rng.choice(scans) if scans else None
 
-    # ---- the seam: clock, disk, child
-
-    def now_s(self) -> float:
-        """Wall clock of the station."""
-        return START_S + self.elapsed_s + self.clock_error_s
-
-    def monotonic_s(self) -> float:
-        """Clock that nobody sets."""
-        return 1000.0 + self.elapsed_s
-
-    def advance(self, duration_s: float) -> None:
-        """Let time pass, and happen what is planned for it."""
-        until_s = self.elapsed_s + duration_s
-        while self.timeline and self.timeline[-1][0] <= until_s:
-            at_s, _, action = self.timeline.pop()
-            self.elapsed_s = max(self.elapsed_s, at_s)
-            self.is_acting = True  # what the world changes on disk is no boundary
-            try:
-                action()
-            finally:
-                self.is_acting = False
-        self.elapsed_s = until_s
-
-    def next_s(self) -> float:
-        """Time until the next planned action [s]."""
-        return max(self.timeline[-1][0] - self.elapsed_s, 0.0) if self.timeline else TIMING.period_s
-
-    def cross(self, label: str, full: Exception | None = None) -> None:
-        """Pass a boundary of the disk: a death, a full disk, or nothing."""
-        if self.is_acting:
-            return
-        victims = ("child", "service") if self.in_child else ("service",)
-        for victim in victims:
-            if victim in self.countdown:
-                self.countdown[victim] -= 1
-                if self.countdown[victim] <= 0:
-                    del self.countdown[victim]
-                    raise _DiedError(victim)
-        if self.is_disk_full and self.rng.random() < 0.3:
-            raise full or OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), label)
-
-    def run_once(self, task, args, memory_gb, timeout_s, on_progress, should_stop):  # noqa: ARG002
-        """Run a task here, as `isolation._run_once` does in a process of its own."""
-        if self.child_fault is not None:
-            raise self.child_fault
-        was_in_child, self.in_child = self.in_child, True
-        try:
-            return task(*args, on_progress)
-        except _DiedError as death:
-            if str(death) == "service":
-                raise
-            self.deaths += 1
-            raise isolation._WorkerLostError("killed") from None
-        except StationError:
-            raise
-        except Exception as bug:
-            raise RuntimeError(f"a bug in {task.__name__}, in the worker process:\n{bug!r}") from bug
-        finally:
-            self.in_child = was_in_child
-
-    def statvfs(self, folder: object) -> os.statvfs_result:
-        """Free space of the disk."""
-        disk = self._statvfs(folder)
-        return os.statvfs_result((*disk[:3], 0, 0, *disk[5:])) if self.is_out_of_space else disk
+    # ---- running
 
     @contextmanager
     def installed(self):
-        """Replace clock, disk and processes of this interpreter by those of the world."""
-        self._statvfs = os.statvfs
+        """Let this process run on the machine, and collect the log of the service."""
         handler = logging.Handler()
         handler.emit = lambda record: self.log.append(record.getMessage())
         logger = logging.getLogger("station")
-        with ExitStack() as stack:
-            replace = lambda target, name, value: stack.enter_context(mock.patch.object(target, name, value))  # noqa: E731
-            replace(time, "time", self.now_s)
-            replace(time, "monotonic", self.monotonic_s)
-            replace(time, "sleep", self.advance)
-            for clocked in (inbox.Inbox, journal.Journal):
-                clocks = {"now_s": self.now_s, "monotonic_s": self.monotonic_s}
-                defaults = clocked.__init__.__kwdefaults__
-                stack.enter_context(
-                    mock.patch.dict(
-                        defaults, {name: clocks[name] for name in clocks.keys() & defaults.keys()}
-                    )
-                )
-            replace(os, "statvfs", self.statvfs)
-            replace(boundaries, "_cross", self.cross)
-            for name in ("replace", "rename", "link", "unlink", "mkdir"):
-                replace(os, name, boundaries._watched(name, getattr(os, name)))
-            connect = sqlite3.connect
-            replace(
-                sqlite3,
-                "connect",
-                lambda *args, **kw: connect(*args, **{"factory": boundaries._Connection} | kw),
-            )
-            replace(os, "fsync", boundaries._watched("fsync", lambda _: None))
-            replace(isolation, "_run_once", self.run_once)
-            replace(worker, "BackgroundCompaction", _Compaction)
-            stack.enter_context(mock.patch.dict(os.environ, {"STATE_DIRECTORY": str(self.folder / "state")}))
+        environment = {"STATE_DIRECTORY": str(self.folder / "state")}
+        with self.disk(), mock.patch.dict(os.environ, environment):
             logger.addHandler(handler)
-            stack.callback(logger.removeHandler, handler)
-            yield
+            try:
+                yield
+            finally:
+                logger.removeHandler(handler)
 
-    # ---- running
+    def stop_service(self) -> None:
+        """Stop the service as systemd does."""
+        self.daemon.stop()
 
     def run(self) -> None:
         """Run the service through all that is planned, and restart it whenever it dies, as systemd does."""
@@ -435,11 +341,12 @@ class World:
             while not self.is_over():
                 self.starts += 1
                 self.daemon = None
+                self.stop()  # a new service has a fork server of its own
                 try:
                     with mock.patch("station.config.__version__", self.version):
-                        self.daemon = _Daemon(self)
+                        self.daemon = Daemon(self.folder / "site.toml", Worker, TIMING, self.host())
                         self.daemon.serve()
-                except _DiedError:
+                except DiedError:
                     self.deaths += 1
                 except StationError as error:
                     self.log.append(f"service ended: {error}")
@@ -462,7 +369,7 @@ class World:
         """Return the rows of the journal by scan."""
         if not (self.data / "journal.sqlite").exists():
             return {}
-        with Journal(self.data / "journal.sqlite", read_only=True) as opened:
+        with JournalReader(self.data / "journal.sqlite") as opened:
             return {row.name: row for row in opened.rows()}
 
     def defects(self, undisturbed: World) -> list[str]:
@@ -480,6 +387,7 @@ class World:
             if row.state is State.STORED and name not in self.names
         ]
         defects += [line for line in self.log if "a bug" in line]
+        defects += self.unreported
         for file in ("series.nc", "processing.nc", "areas.nc"):
             try:
                 actual, expected = values(self.data / file), values(undisturbed.data / file)
@@ -509,75 +417,6 @@ def _start_s(number: int) -> float:
     """Return when a scan begins [s since the start]."""
     burst, hour = divmod(number, SCANS_PER_BURST)
     return burst * BURST_INTERVAL_S + hour * HOUR_S
-
-
-class _Compaction:
-    """Compaction at once instead of in another thread."""
-
-    def __init__(self, site: object, on_done: object) -> None:
-        self._site, self._on_done, self._checksums = site, on_done, None
-
-    def start(self, checksums: object, *, in_backlog: bool) -> None:
-        with suppress(isolation.NotReadyError):
-            self._checksums = isolation.run_isolated(
-                background_compaction.compact_low_priority, self._site, dict(checksums), in_backlog,
-                memory_gb=1.0, timeout_s=1e9,
-            )  # fmt: skip
-            self._on_done()
-
-    def result(self) -> object:
-        checksums, self._checksums = self._checksums, None
-        return checksums
-
-    def close(self) -> None:
-        pass
-
-
-class _Nothing:
-    """File watcher and scheduler: their events come from the world."""
-
-    def __init__(self, *_: object, **__: object) -> None:
-        pass
-
-    def ensure_watching(self) -> None:
-        pass
-
-    def resync_clock(self) -> float:
-        return 0.0
-
-    def close(self) -> None:
-        pass
-
-    def stop(self) -> None:
-        pass
-
-
-class _Daemon(Daemon):
-    """The service, which waits by letting the time of its world pass."""
-
-    def __init__(self, world: World) -> None:
-        self._world = world
-        super().__init__(world.folder / "site.toml", worker.Worker, TIMING)
-
-    def _create_components(self, site):
-        components = dict.fromkeys(("InboxWatcher", "JobScheduler"), _Nothing)
-        with mock.patch.multiple("station.service.daemon", **components):
-            return super()._create_components(site)
-
-    def _wait(self, wait_s: float) -> None:
-        until_s = self._world.elapsed_s + wait_s
-        while True:
-            while not self._events.empty():
-                event = self._events.get()
-                if event not in {LoopEvent.STOP, LoopEvent.INBOX_CHANGED}:
-                    self._due.add(event)
-                if event is not LoopEvent.INBOX_CHANGED or not self._consecutive_faults:
-                    until_s = self._world.elapsed_s
-            if self._world.elapsed_s >= until_s:
-                break
-            self._world.advance(min(self._world.next_s() + 1e-3, until_s - self._world.elapsed_s))
-        if self._world.is_over():
-            self.stop()
 
 
 def make_world(folder: Path, template: Path, seed: int, scans: int = SCANS_PER_YEAR) -> World:
@@ -626,7 +465,8 @@ def main() -> int:
             world.run()
             defects = world.defects(undisturbed)
             failed += bool(defects)
-            print(f"seed {seed}: {world.faults} faults, {world.deaths} deaths, {world.starts} starts,"
+            print(f"seed {seed}: {world.faults} faults, {world.deaths} deaths, {world.hangs} hangs,"
+                  f" {world.starts} starts,"
                   f" {len(defects)} defects", flush=True)  # fmt: skip
             print(*(world.log if options.log else []), *defects, sep="\n", end="\n" if defects else "")
             shutil.rmtree(world.folder)

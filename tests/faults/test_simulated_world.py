@@ -3,15 +3,19 @@
 from __future__ import annotations
 
 import json
+import math
 
 import pytest
+import simulated_machine
 import simulated_world
 from simulated_world import SCANS_PER_BURST
 
 from station.archive import tilt_offsets
 from station.archive.series import manifest
 from station.inbox import journal, lock
-from station.processing import scan_tasks, usable_inputs
+from station.processing import integrity, scan_tasks, usable_inputs
+from station.processing.workers import isolation
+from station.service import worker
 
 pytestmark = pytest.mark.slow
 
@@ -54,6 +58,13 @@ def _read_unchecked(path):
 
 OPTIONAL_INPUTS = ("areas_broken",)  # of which no fault may stop the service
 REMEDIES = {  # by number of the finding: faults that show it, and what takes the remedy out
+    "B1 a fork server without its socket is kept for ever": (
+        ("socket_deleted",),
+        [
+            (simulated_machine.Machine, "stop", lambda _: None),
+            (isolation.TaskRunner, "seconds_without_worker", lambda _: 0.0),
+        ],
+    ),
     "B2 a damaged series.nc blocks all": (
         ("series_damaged",),
         [(manifest, "matches_fingerprint", lambda *_: True)],
@@ -69,6 +80,13 @@ REMEDIES = {  # by number of the finding: faults that show it, and what takes th
         ("scan_touched",),
         [(journal.Journal, "unsettled", lambda *_, **__: {})],
     ),
+    "S2 waiting for a process that hangs feeds the watchdog": (
+        ("child_hangs",),
+        [
+            (simulated_machine._Process, "cpu_ticks", lambda process: process._machine.monotonic_s()),
+            (worker, "MAX_STORE_TASK_S", math.inf),
+        ],
+    ),
     "S3 a second series is begun in another folder": (
         ("other_disk_mounted",),
         [
@@ -79,6 +97,13 @@ REMEDIES = {  # by number of the finding: faults that show it, and what takes th
     "S4 a damaged tilt offset stops all": (
         ("tilt_offset_damaged",),
         [(tilt_offsets, "read_checked_json", _read_unchecked)],
+    ),
+    "S5 damage of the files that people open is not reported": (
+        ("series_damaged",),
+        [
+            (integrity, "_check_series", lambda *_, **__: []),
+            (integrity, "_check_derived", lambda *_: []),
+        ],
     ),
     "S6 two scans of one start": (
         ("other_scan_of_a_start",),

@@ -14,7 +14,8 @@ import laspy
 import pytest
 
 from station.config import read_site
-from station.inbox.journal import Journal, State
+from station.inbox.journal import Journal
+from station.inbox.journal_reader import State
 from station.inbox.scan_files import scan_file
 from station.processing.usable_inputs import with_usable_inputs
 from station.service.worker import Worker
@@ -74,7 +75,7 @@ def run_undisturbed(folder):
         while waiting := journal.waiting():
             worker.process(scan_file(site, site.scans.inbox / waiting[0].name))
         worker._should_stop = lambda: True
-        worker.reconcile()
+        worker.store.reconcile()
 
 
 class Limits:

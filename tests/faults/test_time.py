@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from station.config import read_site
-from station.inbox.journal import State
+from station.inbox.journal_reader import State
 from station.operations.batch import scan_file
 from station.processing import scan_tasks
 from station.readers.scan import gps_seconds

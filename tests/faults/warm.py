@@ -42,8 +42,8 @@ def run_service(order):
 
 
 def start_fork_server():
-    """Start the fork server of `station.processing.fork_server`, itself by a fork."""
-    from station.processing.fork_server import ensure_running
+    """Start the fork server of `station.processing.workers.fork_server`, itself by a fork."""
+    from station.processing.workers.fork_server import ensure_running
 
     spawn = multiprocessing.util.spawnv_passfds
     multiprocessing.util.spawnv_passfds = fork_server

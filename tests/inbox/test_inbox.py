@@ -16,7 +16,8 @@ import pytest
 from station.errors import NotReadyError
 from station.inbox import inbox as inbox_module
 from station.inbox.inbox import Inbox, safe_name
-from station.inbox.journal import Journal, State
+from station.inbox.journal import Journal
+from station.inbox.journal_reader import State
 
 FIRST, SECOND = "261121_010000.laz", "261121_020000.laz"
 LOG = """
@@ -182,14 +183,44 @@ def test_scan_takes_its_turn_if_it_is(make_inbox, drop, clock, monkeypatch, case
     assert (inbox.poll().first.name, inbox.poll().ahead) == ("261101_000000.laz", False)
 
 
+@pytest.mark.parametrize("differing_byte", [0, 50_000, 99_999])
+def test_live_scan_of_the_size_of_others_is_measured_ahead(make_inbox, drop, clock, differing_byte):
+    """Without compression all scans have one size: a sample of the bytes shows that it is no copy of them."""
+    inbox = make_inbox(settle_s=60)
+    content = "x" * 100_000
+    for number in range(3):
+        drop(f"261101_{number:02d}0000.laz", content)
+    inbox.poll()
+    drop(LIVE, f"{content[:differing_byte]}y{content[differing_byte + 1 :]}")
+    inbox.poll()
+    clock.advance(61)
+    state = inbox.poll()
+    assert (state.first.name, state.ahead) == (LIVE, True)
+
+
+def test_live_scan_takes_its_turn_while_a_file_of_its_size_changes(make_inbox, drop, clock):
+    inbox = make_inbox(settle_s=60)
+    backlog(drop)
+    drop(LIVE, "the live scan")
+    inbox.poll()
+    clock.advance(61)
+    drop("261105_000000.laz", "a space of 13")  # which may become the same
+    assert not inbox.poll().ahead
+    clock.advance(61)
+    assert inbox.poll().ahead
+
+
 def test_backlog_of_ten_thousand_scans_is_polled_in_a_second(make_inbox, drop, tmp_path, journal):
-    """So long the live scan waits, besides the one that is being processed when it arrives."""
+    """So long the live scan waits, besides the one that is being processed when it arrives.
+
+    All have the same size, as without compression.
+    """
     inbox = make_inbox(settle_s=0)
     for number in range(10_000):
         at = datetime(2025, 1, 1, tzinfo=UTC) + timedelta(hours=number)
-        (tmp_path / "inbox" / f"{at:%y%m%d_%H%M%S}.laz").write_bytes(bytes(number))
+        (tmp_path / "inbox" / f"{at:%y%m%d_%H%M%S}.laz").write_bytes(number.to_bytes(100, "big"))
     inbox.poll()
-    drop(LIVE, "x" * 20_000)
+    drop(LIVE, "x" * 100)
     began_s = time.process_time()
     state = inbox.poll()
     assert time.process_time() - began_s < 1.0

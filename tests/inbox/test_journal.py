@@ -15,7 +15,8 @@ from dataclasses import replace
 import pytest
 
 from station.errors import NotReadyError, StoreError
-from station.inbox.journal import MAX_FAILURES, Journal, State
+from station.inbox.journal import MAX_FAILURES, Journal
+from station.inbox.journal_reader import JournalReader, State
 from station.inbox.lock import exclusive_lock, is_locked
 
 NAME = "261121_030512.laz"
@@ -180,7 +181,7 @@ def test_older_journal_is_read_and_completed(tmp_path):
         journal.set_aside("short.laz", "cut off", judged_under="0.1 a")
     with closing(sqlite3.connect(path)) as connection:
         connection.execute("ALTER TABLE scan DROP COLUMN judged_under")
-    with Journal(path, read_only=True) as journal:
+    with JournalReader(path) as journal:
         assert [row.name for row in journal.rows()] == [NAME, "short.laz"]
     with Journal(path) as journal:
         assert journal.judged_otherwise("0.2 a") == ["short.laz"]
@@ -210,21 +211,21 @@ def test_reader_of_a_closed_journal_creates_no_file(tmp_path):
     with Journal(tmp_path / "journal.sqlite") as journal:
         store(journal)
     before = sorted(path.name for path in tmp_path.iterdir())
-    with Journal(tmp_path / "journal.sqlite", read_only=True) as reader:
+    with JournalReader(tmp_path / "journal.sqlite") as reader:
         assert reader.counts()["stored"] == 1
     assert sorted(path.name for path in tmp_path.iterdir()) == before == ["journal.sqlite"]
 
 
 def test_reader_of_an_open_journal_sees_changes_and_cannot_write(journal, tmp_path):
     store(journal)
-    with Journal(tmp_path / "journal.sqlite", read_only=True) as reader:
+    with JournalReader(tmp_path / "journal.sqlite") as reader:
         assert reader.counts()["stored"] == 1
         with pytest.raises(StoreError, match="readonly"):
             reader.requeue([NAME])
 
 
 def test_missing_journal_reads_as_empty(tmp_path):
-    with Journal(tmp_path / "journal.sqlite", read_only=True) as reader:
+    with JournalReader(tmp_path / "journal.sqlite") as reader:
         assert reader.rows() == []
     assert list(tmp_path.iterdir()) == []
 
@@ -302,6 +303,7 @@ WRITER = """
 import sys
 from pathlib import Path
 from station.inbox.journal import Journal
+from station.inbox.journal_reader import JournalReader
 with Journal(Path(sys.argv[1])) as journal:
     for i in range(int(sys.argv[2]), 1_000_000):
         name = f"{i:06d}.laz"
@@ -324,7 +326,7 @@ def test_acknowledged_rows_survive_twenty_kills(tmp_path):
             time.sleep(rng.random() * 0.05)
             writer.send_signal(signal.SIGKILL)
             lines = writer.stdout.read().splitlines()
-        with Journal(path, read_only=True) as reader:
+        with JournalReader(path) as reader:
             stored = [entry.start_utc_s for entry in reader.rows(State.STORED)]
             acknowledged = int(lines[-1]) + 1 if lines else stored_count + 1
             assert stored == list(range(len(stored)))
@@ -346,5 +348,5 @@ def test_journal_without_tables_reads_as_empty(tmp_path, content):
         connection.close()
     else:
         path.write_bytes(content)
-    with Journal(path, read_only=True) as reader:
+    with JournalReader(path) as reader:
         assert reader.rows() == []

@@ -15,7 +15,7 @@ from station.monitoring import alarms
 from station.monitoring.alarm_rules import change_alarms
 from station.monitoring.area_curves import AreaCurve
 from station.operations.batch import process_scans
-from station.processing.scan_tasks import load_areas, series_for
+from station.processing.site_files import load_areas, series_for
 from station.queries.aggregates import Aggregates
 from station.simulation.station import simulate, small
 

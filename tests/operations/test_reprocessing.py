@@ -17,7 +17,8 @@ from support.series import open_with_processing, without_dates
 from station.archive.reference_files import read_reference_provenance
 from station.config import read_site
 from station.errors import ConfigError, NotReadyError
-from station.inbox.journal import Journal, State
+from station.inbox.journal import Journal
+from station.inbox.journal_reader import State
 from station.inbox.lock import exclusive_lock
 from station.inbox.scan_files import scan_file
 from station.monitoring.status import status as station_status
@@ -25,9 +26,9 @@ from station.operations import reprocessing
 from station.operations.batch import process_scans
 from station.operations.reprocessing import Reprocessing, reprocess
 from station.operations.site_check import store_findings
-from station.processing.dask_executor import require_secure
-from station.processing.scan_tasks import series_for
+from station.processing.site_files import series_for
 from station.processing.staleness import count_outdated
+from station.processing.workers.dask_executor import require_secure
 from station.service.worker import Worker
 from station.simulation.station import simulate, small
 

@@ -10,7 +10,7 @@ from station.config import read_site
 from station.errors import ConfigError, NotReadyError
 from station.operations.batch import process_scans
 from station.operations.reprocessing import reprocess
-from station.processing import dask_executor
+from station.processing.workers import dask_executor
 from station.simulation.station import simulate, small
 
 distributed = pytest.importorskip("distributed")

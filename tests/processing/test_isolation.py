@@ -17,7 +17,8 @@ from pathlib import Path
 import pytest
 
 from station.errors import InconclusiveError, NotReadyError, ScanError, StationError, StoreError
-from station.processing import fork_server, isolation
+from station.processing.workers import fork_server, isolation
+from station.processing.workers.isolation import TaskRunner
 
 HERE = Path(__file__).parent
 
@@ -28,7 +29,7 @@ def tasks(monkeypatch):
     import isolated_tasks
 
     # pytest, because a worker imports the main module, which is that of pytest in a test run
-    fork_server.ensure_running(("station.processing.isolation", "numpy", "pytest"))
+    fork_server.ensure_running(("station.processing.workers.worker_process", "numpy", "pytest"))
     return isolated_tasks
 
 
@@ -37,8 +38,8 @@ def short_retry_delays(monkeypatch):
     monkeypatch.setattr(isolation, "RETRY_DELAYS_S", (0.01, 0.01))
 
 
-def run(task, *args, memory_gb=1.0, timeout_s=20.0, **hooks):
-    return isolation.run_isolated(task, *args, memory_gb=memory_gb, timeout_s=timeout_s, **hooks)
+def run(task, *args, memory_gb=1.0, timeout_s=20.0, runner=None, **hooks):
+    return (runner or TaskRunner()).run(task, *args, memory_gb=memory_gb, timeout_s=timeout_s, **hooks)
 
 
 def test_result_is_returned_and_progress_is_reported(tasks):
@@ -177,10 +178,11 @@ def test_silent_work_counts_as_progress(tasks, monkeypatch):
 
 def test_fork_server_is_restarted_when_its_socket_was_deleted(tasks):
     """Programs that clean /tmp delete it after some days."""
-    assert run(tasks.add, 2, 3) == 5
+    runner = TaskRunner()
+    assert run(tasks.add, 2, 3, runner=runner) == 5
     shutil.rmtree(util.get_temp_dir())
-    assert run(tasks.add, 2, 3) == 5
-    assert isolation.seconds_without_worker() == 0.0
+    assert run(tasks.add, 2, 3, runner=runner) == 5
+    assert runner.seconds_without_worker() == 0.0
 
 
 @pytest.mark.integration
@@ -204,18 +206,19 @@ def test_seconds_without_worker_count_failed_starts(tasks, monkeypatch):
     def fail(*_):
         raise BlockingIOError("no more tasks")
 
+    runner = TaskRunner()
     with monkeypatch.context() as patch:
         patch.setattr(fork_server, "ensure_running", fail)
         with pytest.raises(NotReadyError, match="could not be started: no more tasks"):
-            run(tasks.add, 2, 3)
-    assert isolation.seconds_without_worker() > 0.0
-    assert run(tasks.add, 2, 3) == 5
-    assert isolation.seconds_without_worker() == 0.0
+            run(tasks.add, 2, 3, runner=runner)
+    assert runner.seconds_without_worker() > 0.0
+    assert run(tasks.add, 2, 3, runner=runner) == 5
+    assert runner.seconds_without_worker() == 0.0
 
 
 SOCKET_FOLDER = """
 from multiprocessing import util
-from station.processing import fork_server
+from station.processing.workers import fork_server
 if __name__ == "__main__":
     fork_server.ensure_running(())
     print(util.get_temp_dir())
@@ -258,9 +261,9 @@ SERVICE = """
 import sys
 sys.path.insert(0, sys.argv[1])
 import isolated_tasks
-from station.processing import fork_server, isolation
+from station.processing.workers import fork_server, isolation
 if __name__ == "__main__":
-    fork_server.ensure_running(("station.processing.isolation",))
+    fork_server.ensure_running(("station.processing.workers.isolation",))
     isolation.run_isolated(isolated_tasks.hang_ignoring_signals, sys.argv[2], memory_gb=1, timeout_s=60)
 """
 
@@ -278,7 +281,7 @@ def test_worker_dies_with_its_killed_parent(tmp_path):
 
 ORPHAN = """
 import multiprocessing, os
-from station.processing import isolation
+from station.processing.workers import worker_process
 read_end, write_end = os.pipe()
 os.close(write_end)
 class Parent:
@@ -293,7 +296,7 @@ parent_conn.close()
 def test_orphaned_worker_exits_without_a_traceback(step):
     """A traceback in the system's log after every power cut would look like a bug."""
     process = subprocess.run(
-        [sys.executable, "-c", f"{ORPHAN}isolation.{step}\nprint('still running')"],
+        [sys.executable, "-c", f"{ORPHAN}worker_process.{step}\nprint('still running')"],
         capture_output=True,
         text=True,
         check=False,

@@ -9,7 +9,7 @@ import textwrap
 import numpy as np
 import pytest
 
-from station.processing.fork_server import WORKER_ENV
+from station.processing.workers.fork_server import WORKER_ENV
 from station.readers.las import LasScan
 
 # In a process of its own: only a process without other threads forks.

@@ -13,24 +13,27 @@ import threading
 import time
 from contextlib import suppress
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 from support.fake_service import FakeWorker
 
+from station.clock import Clock
 from station.errors import ConfigError, NotReadyError, StoreError
-from station.inbox.journal import Journal, State
+from station.inbox.journal_reader import JournalReader, State
 from station.inbox.lock import is_locked, read_identity
 from station.monitoring.status import status
 from station.service import daemon
+from station.service.host import Host
 
 FAKE = Path(__file__).parents[1] / "support" / "fake_service.py"
 FIRST, SECOND, THIRD = "261121_010000.laz", "261121_020000.laz", "261121_030000.laz"
 
 
-def test_service_without_worker_processes_ends_for_systemd(write_site, monkeypatch):
+def test_service_without_worker_processes_ends_for_systemd(write_site):
     """A restart gives it a new fork server and a new place in its control group."""
-    monkeypatch.setattr(daemon.isolation, "seconds_without_worker", lambda: 301.0)
-    service = daemon.Daemon(write_site(), FakeWorker, daemon.LoopTiming())
+    tasks = SimpleNamespace(seconds_without_worker=lambda: 301.0)
+    service = daemon.Daemon(write_site(), FakeWorker, daemon.LoopTiming(), Host(tasks=tasks))
     with pytest.raises(NotReadyError, match="no worker process could be started for 301 s"):
         service.serve()
 
@@ -43,14 +46,14 @@ def test_folder_that_the_first_start_creates_is_remembered_at_once(write_site, m
     state = tmp_path / "state"
     state.mkdir()
     monkeypatch.setenv("STATE_DIRECTORY", str(state))
-    service = daemon.Daemon(site_path, FakeWorker, daemon.LoopTiming())
+    service = daemon.Daemon(site_path, FakeWorker, daemon.LoopTiming(), Host())
     service.stop()
     service.serve()
     assert (state / "data_folder").read_text() == f"{data}\n{read_identity(data)}\n"
     data.rename(tmp_path / "right")
     data.mkdir()
     with pytest.raises(StoreError, match="is not the folder of the stored series"):
-        daemon.Daemon(site_path, FakeWorker, daemon.LoopTiming()).serve()
+        daemon.Daemon(site_path, FakeWorker, daemon.LoopTiming(), Host()).serve()
 
 
 class Service:
@@ -273,7 +276,7 @@ def test_sigterm_abandons_the_scan_after_the_grace_period(write_site, start):
     assert service.end() == 0
     assert 0.4 < time.monotonic() - start_s < 4.0
     assert stored(path) == []
-    with Journal(path.parent / "data" / "journal.sqlite", read_only=True) as journal:
+    with JournalReader(path.parent / "data" / "journal.sqlite") as journal:
         assert journal.entry("slow.laz").state is State.LATER
     assert "STOPPING=1" in service.notifications()
     assert service.log().splitlines()[-1].endswith("service=stopped")
@@ -428,19 +431,19 @@ def test_invalid_site_file_is_rejected_at_start(tmp_path):
     assert caught.value.exit_status == 78
 
 
-def test_doubtful_clock_is_waited_for_then_accepted(write_site, monkeypatch, caplog):
+def test_doubtful_clock_is_waited_for_then_accepted(write_site, caplog):
     path = write_site()
     series = path.parent / "data" / "series.nc"
     series.touch()
     in_two_days_s = time.time() + 2 * 86400
     os.utime(series, (in_two_days_s, in_two_days_s))
     timing = daemon.LoopTiming(first_pause_s=0.05, clock_wait_s=0.2)
-    doubtful = daemon.Daemon(path, lambda *_, **__: None, timing)
+    doubtful = daemon.Daemon(path, lambda *_, **__: None, timing, Host())
     start_s = time.monotonic()
     doubtful._wait_for_clock()
     assert 0.2 <= time.monotonic() - start_s < 2.0
     assert "clock=doubtful" in caplog.text
-    monkeypatch.setattr(time, "time", lambda: 1000.0)
-    impossible = daemon.Daemon(path, lambda *_, **__: None, timing)
+    host = Host(clock=Clock(now_s=lambda: 1000.0))
+    impossible = daemon.Daemon(path, lambda *_, **__: None, timing, host)
     impossible.stop()
     impossible.serve()

@@ -7,7 +7,8 @@ import pytest
 from station.config import read_site
 from station.errors import ConfigError, NotReadyError, ScanError
 from station.inbox.file_hash import sha256_file
-from station.inbox.journal import Journal, State
+from station.inbox.journal import Journal
+from station.inbox.journal_reader import State
 from station.service import retention
 from station.service.retention import apply_retention, expired_scans
 
@@ -157,27 +158,25 @@ def test_compacted_file_is_hashed_once(station, monkeypatch):
     assert read.count(EPOCH.rpartition("/")[2]) == 1
 
 
-def test_expiry_by_age_action_and_reservation(station, write_site, monkeypatch):
+def test_expiry_by_age_action_and_reservation(station, write_site):
     site, journal = station
     store = {"sha256": "bb", "verdict": "good", "epoch": "epochs/b.nc", "revision": 1}
     journal.record_stored("b.laz", start_utc_s=START_S + 3.5 * 86_400, **store)
     stored = journal.rows(State.STORED)
-    monkeypatch.setattr("time.time", lambda: START_S + 3 * 86_400 - 1)
-    assert expired_scans(site, stored, set()) == []
-    monkeypatch.setattr("time.time", lambda: START_S + 3 * 86_400 + 1)
-    assert expired_scans(site, stored, {NAME}) == [NAME]  # moved scans can still be read
+    assert expired_scans(site, stored, set(), START_S + 3 * 86_400 - 1) == []
+    now_s = START_S + 3 * 86_400 + 1
+    assert expired_scans(site, stored, {NAME}, now_s) == [NAME]  # moved scans can still be read
     delete = read_site(write_site(more='[retention]\nraw = "delete"\nkeep_days = 3\n'))
-    assert expired_scans(delete, stored, {NAME}) == []
-    assert expired_scans(delete, stored, set()) == [NAME]
-    assert expired_scans(read_site(write_site()), stored, set()) == []
+    assert expired_scans(delete, stored, {NAME}, now_s) == []
+    assert expired_scans(delete, stored, set(), now_s) == [NAME]
+    assert expired_scans(read_site(write_site()), stored, set(), now_s) == []
     journal.requeue([NAME])
-    assert expired_scans(site, journal.rows(), set()) == []
+    assert expired_scans(site, journal.rows(), set(), now_s) == []
 
 
-def test_clock_far_ahead_expires_nothing(station, monkeypatch):
+def test_clock_far_ahead_expires_nothing(station):
     site, journal = station
-    monkeypatch.setattr("time.time", lambda: START_S + 1e9)
-    assert expired_scans(site, journal.rows(), set()) == []
+    assert expired_scans(site, journal.rows(), set(), START_S + 1e9) == []
 
 
 def test_moving_requires_an_archive_folder(write_site):

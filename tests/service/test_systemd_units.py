@@ -9,7 +9,7 @@ import subprocess
 import pytest
 
 from station.monitoring.notifiers import SEND_TIMEOUT_S
-from station.processing.isolation import STALL_S
+from station.processing.workers.isolation import STALL_S
 from station.service.daemon import LoopTiming
 
 UNIT = "systemd/station@.service"

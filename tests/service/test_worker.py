@@ -5,24 +5,33 @@ from __future__ import annotations
 import os
 import shutil
 import time
+from dataclasses import replace
 from types import SimpleNamespace
 
 import pytest
 from support.tiny_station import PENDING, assert_same_values, build, scan_name
 
+from station.clock import Clock
 from station.config import read_site
 from station.errors import InconclusiveError, NotReadyError, ScanError, StationError
 from station.inbox.inbox import ScanFile
-from station.inbox.journal import MAX_FAILURES, Journal, State
+from station.inbox.journal import MAX_FAILURES, Journal
+from station.inbox.journal_reader import State
 from station.inbox.lock import exclusive_lock
 from station.inbox.scan_files import scan_file
 from station.operations.retry import retry_scans
-from station.processing import fork_server
 from station.processing.scan_tasks import StoredResult
+from station.processing.workers import fork_server
+from station.service.host import Host
 from station.service.worker import Worker
 
 NAME = f"{scan_name(1)}.laz"
 MIDNIGHT_S = 1_752_537_600.0  # 2025-07-15
+WEATHER = """[weather]
+file = "weather.dat"
+wait_s = 600
+columns = { temperature_c = "T", humidity_pct = "RH", pressure_hpa = "P" }
+"""
 
 # ---- decisions, with tasks that only pretend
 
@@ -34,6 +43,7 @@ class PretendingWorker(Worker):
         super().__init__(*args, **options)
         self.errors = {}  # by scan
         self.references = []  # the scans of each version built
+        self.histories = {}  # of the last attempt, by scan
 
     def run(self, task, *args):
         if task.__name__ == "process_new":
@@ -45,6 +55,7 @@ class PretendingWorker(Worker):
         return results.get(task.__name__, nothing)
 
     def measure(self, scan, history):
+        self.histories[scan.name] = history
         if scan.name in self.errors:
             raise self.errors[scan.name]
         start_s = MIDNIGHT_S + 3600 * float(scan.name[7:9])
@@ -58,10 +69,10 @@ def pretend(write_site):
     """Return a function that returns site, journal and worker with these settings."""
     journals = []
 
-    def make(more=""):
+    def make(more="", **options):
         site = read_site(write_site(more=more))
         journals.append(Journal(site.station.data / "journal.sqlite"))
-        return site, journals[-1], PretendingWorker(site, journals[-1], in_service=True)
+        return site, journals[-1], PretendingWorker(site, journals[-1], in_service=True, **options)
 
     yield make
     for journal in journals:
@@ -138,6 +149,16 @@ def test_scan_rejected_for_now_gets_one_attempt_a_week(pretend, monkeypatch):
             assert journal.entry(NAME).state is State.SET_ASIDE  # at once
     worker.errors = {}
     assert worker.process(scan(site, 1))
+
+
+@pytest.mark.parametrize(("age_s", "waits"), [(599.0, True), (601.0, False)])
+def test_only_a_scan_that_has_just_arrived_waits_for_its_weather(pretend, age_s, waits):
+    host = Host(clock=Clock(now_s=lambda: MIDNIGHT_S + age_s))
+    site, _, worker = pretend(WEATHER, host=host)
+    arrived = replace(scan(site, 1), mtime_ns=int(MIDNIGHT_S * 1e9))
+    worker.process(arrived)
+    assert worker.histories[arrived.name].wait_for_weather == waits
+    assert worker.histories[arrived.name].now_s == MIDNIGHT_S + age_s
 
 
 def test_failure_that_is_surely_not_the_scans_is_never_given_up(pretend):

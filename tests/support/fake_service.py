@@ -18,8 +18,10 @@ from station.service.daemon import LoopTiming, run
 class FakeWorker:
     """Appends a line to `<data>/calls` for each call."""
 
-    def __init__(self, site, journal, *, on_progress, should_stop, on_compacted, before_task, in_service):
-        self.site, self.journal, self.in_service = site, journal, in_service
+    def __init__(
+        self, site, journal, *, on_progress, should_stop, on_compacted, before_task, in_service, host
+    ):
+        self.site, self.journal, self.in_service, self.host = site, journal, in_service, host
         self.before_task = before_task
         self.on_progress, self.should_stop, self.on_compacted = on_progress, should_stop, on_compacted
         self.folder = site.station.data / "stored"

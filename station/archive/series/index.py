@@ -11,7 +11,6 @@ from typing import overload
 import h5py
 import netCDF4
 import numpy as np
-from isal.igzip_lib import IsalError
 
 from station.archive.chunk_codec import read_column
 from station.archive.epochs import (
@@ -25,6 +24,7 @@ from station.archive.epochs import (
     parse_epoch_filename,
 )
 from station.archive.netcdf_layout import Series
+from station.archive.read_errors import read_errors
 from station.archive.schema import TEXT_LENGTH
 from station.archive.series.epoch_reader import middle
 from station.errors import StationError, StoreError
@@ -103,18 +103,15 @@ class SeriesIndex(Sequence[EpochRef]):
         self._locations: list[tuple[Path, int]] = []
         if not series.path.is_file():
             return
-        try:
-            with h5py.File(series.path, "r") as file:
-                bounds_s = np.asarray(file["time_bnds"][:], dtype=np.float64)
-                self.time_s, self.start_s = middle(bounds_s), bounds_s[:, 0]
-                self.epoch_file = read_column(file["epoch_file"]).view(self.epoch_file.dtype)[:, 0]
-                for source in file["elevation"].virtual_sources():
-                    is_whole_file = source.src_space.get_select_type() == h5py.h5s.SEL_ALL
-                    file_start = 0 if is_whole_file else source.src_space.get_select_bounds()[0][0]
-                    self._file_starts.append(source.vspace.get_select_bounds()[0][0])
-                    self._locations.append((series.folder / source.file_name, file_start))
-        except (OSError, RuntimeError, KeyError, ValueError, IsalError) as error:  # type: ignore[misc] # the stub has no class
-            raise StoreError(f"{series.path}: damaged, cannot be read: {error}") from error
+        with read_errors(series.path), h5py.File(series.path, "r") as file:
+            bounds_s = np.asarray(file["time_bnds"][:], dtype=np.float64)
+            self.time_s, self.start_s = middle(bounds_s), bounds_s[:, 0]
+            self.epoch_file = read_column(file["epoch_file"]).view(self.epoch_file.dtype)[:, 0]
+            for source in file["elevation"].virtual_sources():
+                is_whole_file = source.src_space.get_select_type() == h5py.h5s.SEL_ALL
+                file_start = 0 if is_whole_file else source.src_space.get_select_bounds()[0][0]
+                self._file_starts.append(source.vspace.get_select_bounds()[0][0])
+                self._locations.append((series.folder / source.file_name, file_start))
 
     @property
     def files(self) -> set[Path]:
@@ -157,12 +154,9 @@ def source_files(series_path: Path) -> set[Path]:
     """Return the files that a `series.nc` or `processing.nc` refers to; empty if there is no such file."""
     if not series_path.is_file():
         return set()
-    try:
-        with h5py.File(series_path, "r") as file:
-            linked = file["elevation" if "elevation" in file else "time"]
-            return {series_path.parent / source.file_name for source in linked.virtual_sources()}
-    except (OSError, RuntimeError, KeyError) as error:
-        raise StoreError(f"{series_path}: damaged, cannot be read: {error}") from error
+    with read_errors(series_path), h5py.File(series_path, "r") as file:
+        linked = file["elevation" if "elevation" in file else "time"]
+        return {series_path.parent / source.file_name for source in linked.virtual_sources()}
 
 
 def data_folder(site_or_folder: str | Path) -> Path:
@@ -201,13 +195,10 @@ def stored_series(series: Series) -> Series | None:
 
 def _read_header(folder: Path, path: Path) -> Series:
     """Return the store in a folder as one of its files describes it; raise StoreError if that is damaged."""
-    try:
-        with netCDF4.Dataset(path) as file:
-            x_m, y_m = (np.asarray(file[axis][:], dtype=np.float64) for axis in "xy")
-            x_bounds, y_bounds = (file[f"{axis}_bnds"][0] for axis in "xy")
-            west_m, north_m = float(x_bounds.min()), float(y_bounds.max())
-            grid = Grid(west_m, north_m, float(np.ptp(x_bounds)), len(x_m), len(y_m))
-            crs = str(file["crs"].crs_wkt) if "crs" in file.variables else None
-            return Series(folder, str(file.station_id), grid, crs)
-    except (OSError, RuntimeError, KeyError, IndexError, AttributeError) as error:
-        raise StoreError(f"{path}: cannot be read: {error}") from error
+    with read_errors(path), netCDF4.Dataset(path) as file:
+        x_m, y_m = (np.asarray(file[axis][:], dtype=np.float64) for axis in "xy")
+        x_bounds, y_bounds = (file[f"{axis}_bnds"][0] for axis in "xy")
+        west_m, north_m = float(x_bounds.min()), float(y_bounds.max())
+        grid = Grid(west_m, north_m, float(np.ptp(x_bounds)), len(x_m), len(y_m))
+        crs = str(file["crs"].crs_wkt) if "crs" in file.variables else None
+        return Series(folder, str(file.station_id), grid, crs)

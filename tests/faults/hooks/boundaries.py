@@ -27,7 +27,6 @@ import sqlite3
 import threading
 import time
 from contextlib import suppress
-from datetime import datetime
 from pathlib import Path
 
 RECORD = 96
@@ -50,31 +49,22 @@ def install():
 
 def set_clock(offset_path):
     """Offset the wall clock of the service by the content of a file [s]."""
-    from station.inbox import inbox, journal
-    from station.processing import store_tasks
-    from station.service import daemon, scheduler
+    from station.clock import Clock
 
     true_s = time.time
 
     def now_s():
         return true_s() + float(Path(offset_path).read_text(encoding="ascii"))
 
-    class Clock(datetime):
-        @classmethod
-        def now(cls, tz=None):
-            return cls.fromtimestamp(now_s(), tz)
-
     time.time = now_s
-    store_tasks.datetime = Clock
-    for clocked in (inbox.Inbox, journal.Journal, scheduler.JobScheduler):
-        clocked.__init__.__kwdefaults__["now_s"] = now_s
-    assert daemon.time.time is now_s
+    Clock.__init__.__defaults__ = (now_s, time.monotonic, time.sleep)
+    assert Clock().now_s is now_s
 
 
 def shorten_delays(period_s=5.0):
     """Shorten the delays of the service from minutes to fractions of a second."""
     from station.inbox import journal
-    from station.processing import isolation
+    from station.processing.workers import isolation
     from station.service import daemon
 
     journal.FIRST_RETRY_S = journal.MAX_RETRY_S = 0.1

@@ -12,8 +12,8 @@ from typing import Protocol
 
 from station.config import Site
 from station.inbox.inbox import ScanFile
-from station.processing import isolation
 from station.processing.scan_tasks import Rejected, ScanHistory, StoredResult, reprocess_scan
+from station.processing.workers import isolation
 
 
 class Executor(Protocol):

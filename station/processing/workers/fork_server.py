@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 PRELOAD = (
     "station.processing.scan_tasks",
     "station.service.publishing",
-    "station.processing.isolation",
+    "station.processing.workers.worker_process",
     "typer",  # imported by the main module of the command, which a worker loads too
     "PIL.WebPImagePlugin",  # without it, each worker imports the plugins of all image formats to write one
     "station.readers.las",

@@ -1,0 +1,89 @@
+"""Where the scanner stands under an SOP, and the transformation of its shots to the map."""
+
+from __future__ import annotations
+
+import hashlib
+from pathlib import Path
+
+from pyproj import CRS, Transformer
+
+from station.config import Site
+from station.errors import ConfigError
+from station.quantities import VERTICAL_AXIS, ScanGeometry
+from station.readers.sop import read_matrix
+from station.science.geometry import pose
+from station.sections import Origin, SopSection
+
+
+def scan_geometry(
+    site: Site,
+    position_m: tuple[float, float, float] | None,
+    axis: tuple[float, float, float] = VERTICAL_AXIS,
+) -> ScanGeometry:
+    """Return the geometry and settings that are the same for all scans under one SOP."""
+    return ScanGeometry(
+        scanner=site.instrument,
+        grid=site.grid_cells,
+        position_m=position_m,
+        axis=axis,
+        min_points=site.grid.min_points,
+        published_budget=site.uncertainty.model == "voordendag2023",
+        registration_sigma_m=site.uncertainty.registration_sigma_m,
+        store_terms=site.uncertainty.store_terms,
+    )
+
+
+def sop_identity(sop: SopSection) -> str:
+    """Return an identifier that changes with the content of the SOP file and with `sop.scan`."""
+    content = sop.file.read_bytes() + (f"\n{sop.scan}".encode() if sop.scan else b"")
+    return f"{sop.file.stem}-{hashlib.sha256(content).hexdigest()[:8]}"
+
+
+def scanner_to_map(site: Site, sop: SopSection) -> pose.ScannerToMap:
+    """Return the transformation from scanner to map under an SOP; raise ConfigError if there is none."""
+    matrix = read_matrix(sop.file)
+    radius_m = site.scanner.range_max_m
+    if site.map.crs is None:
+        return pose.scanner_to_local_map(matrix)
+    if site.map.pop is not None:
+        return pose.scanner_to_map_by_pop(matrix, read_matrix(site.map.pop), site.map.crs, radius_m)
+    if site.map.origin is not None:
+        return pose.scanner_to_map_by_origin(matrix, _degrees(site.map.origin), site.map.crs, radius_m)
+    _require_on_map(site.map.crs, matrix[:3, 3].tolist(), sop.file)
+    return pose.scanner_to_map_directly(matrix, site.map.crs, radius_m)
+
+
+def _degrees(origin: Origin) -> tuple[float, float, float]:
+    return origin.latitude_deg, origin.longitude_deg, origin.height_m
+
+
+def _require_on_map(crs: str, position_m: list[float], file: Path) -> None:
+    """Raise ConfigError if an SOP places the scanner off the map: it probably refers to a local frame."""
+    horizontal = pose.horizontal_crs(crs)
+    area = CRS.from_user_input(crs).area_of_use
+    to_degrees = Transformer.from_crs(horizontal, horizontal.geodetic_crs, always_xy=True)
+    longitude, latitude = to_degrees.transform(position_m[0], position_m[1])
+    if area is None:
+        return
+    inside = area.west - 1 <= longitude <= area.east + 1 and area.south - 1 <= latitude <= area.north + 1
+    if not inside:
+        raise ConfigError(
+            f"{file}: places the scanner at easting {position_m[0]:g}, northing {position_m[1]:g}, outside"
+            f" {crs} ({area.name}). If it refers to a local frame, set map.origin or map.pop, or omit"
+            " map.crs"
+        )
+
+
+def map_position(site: Site) -> tuple[float, float, float] | None:
+    """Return easting, northing and height of `map.origin` [m]; None without it."""
+    if site.map.origin is None or site.map.crs is None:
+        return None
+    to_map = Transformer.from_crs(pose.GEOGRAPHIC, pose.horizontal_crs(site.map.crs), always_xy=True)
+    latitude, longitude, height_m = _degrees(site.map.origin)
+    east_m, north_m, up_m = to_map.transform(longitude, latitude, height_m)
+    return float(east_m), float(north_m), float(up_m)
+
+
+def scanner_height_m(site: Site, sop: SopSection) -> float | None:
+    """Return the height of the scanner above the ellipsoid [m]; None without a map, whose zero is unknown."""
+    return None if site.map.crs is None else scanner_to_map(site, sop).position_m[2]
