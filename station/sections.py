@@ -11,10 +11,12 @@ from datetime import UTC, datetime
 from ipaddress import ip_address
 from pathlib import Path
 from typing import Annotated, Any, Literal
+from zoneinfo import ZoneInfo, ZoneInfoNotFoundError
 
 from pydantic import AfterValidator, AwareDatetime, BaseModel, ConfigDict, Field, model_validator
 
 from station.quantities import Air, IntensityScale, Scanner
+from station.scan_names import ZONE_MARK, start_in_name
 from station.scanners import SCANNERS
 
 Positive = Annotated[float, Field(gt=0)]
@@ -57,11 +59,22 @@ def _require_time_pattern(pattern: str) -> str:
     time = datetime(2025, 7, 15, 13, 14, 15, tzinfo=UTC)
     try:
         datetime.strptime(time.strftime(pattern), pattern)  # noqa: DTZ007 - the pattern may contain a zone
+        if start_in_name(time.strftime(pattern), pattern) is None:
+            raise ValueError("a name written by it does not match it")  # noqa: TRY301 - as those of strptime
     except (ValueError, re.error, OverflowError) as error:
         raise ValueError(f"not a pattern of times, such as %y%m%d_%H%M%S: {error}") from error
     return pattern
 
 
+def _require_zone(zone: str) -> str:
+    try:
+        ZoneInfo(zone)
+    except (ZoneInfoNotFoundError, ValueError, OSError) as error:
+        raise ValueError('no time zone: give its name, such as "Europe/Vienna", or "UTC"') from error
+    return zone
+
+
+Zone = Annotated[str, AfterValidator(_require_zone)]
 Utc = Annotated[AwareDatetime, AfterValidator(_in_utc)]
 
 
@@ -117,13 +130,31 @@ class ScansSection(Section):
 
     inbox: Path
     name: Annotated[str, AfterValidator(_require_time_pattern)] = "%y%m%d_%H%M%S"
+    zone: Zone = "UTC"
     frame: Literal["scanner", "map"] = "scanner"
     point_time: Literal["auto", "none"] = "auto"
     intensity: IntensityScale = "auto"
     settle_s: NotNegative = 60.0
     expected_every_s: Positive = 3600.0
+    suffix: Annotated[str, Field(pattern=r"^(\.[A-Za-z0-9]+){1,2}$")] | None = None
+    columns: tuple[str, ...] = ()
+    convert: tuple[str, ...] | None = None
     polling: bool = False
     timeout_s: Positive = 1800.0
+
+    @property
+    def pattern(self) -> str:
+        """The pattern of the names with the time zone of their times (see `scan_names.start_in_name`)."""
+        return self.name if self.zone == "UTC" else f"{self.name}{ZONE_MARK}{self.zone}"
+
+    @model_validator(mode="after")
+    def _conversion_is_complete(self) -> ScansSection:
+        if self.convert is not None and self.suffix is None:
+            raise ValueError('convert needs suffix, that of the files to convert, such as ".rxp"')
+        missing = [word for word in ("{in}", "{out}") if word not in " ".join(self.convert or (word,))]
+        if missing:
+            raise ValueError(f"convert lacks {' and '.join(missing)}, which stand for scan and LAZ file")
+        return self
 
 
 class ScannerSection(Section):

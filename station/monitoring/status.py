@@ -13,7 +13,7 @@ from station.inbox.journal import Entry, Journal, State
 from station.inbox.lock import is_locked, pause_reason
 from station.monitoring.alarm_state import active
 from station.monitoring.preconditions import clock_problem, format_utc, require_disk_space
-from station.readers.scan import suffixes
+from station.readers.conversion import scan_suffixes
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -71,7 +71,8 @@ def _queue_status(site: Site, journal: Journal) -> Status:
     ]
     inbox_problem = ""
     try:
-        names = {safe_name(name) for name in list_folder(site.scans.inbox) if is_scan(name, suffixes())}
+        suffixes = scan_suffixes(site.scans)
+        names = {safe_name(name) for name in list_folder(site.scans.inbox) if is_scan(name, suffixes)}
     except NotReadyError as error:
         names, inbox_problem = set(), str(error)
     running = is_locked(site.station.data)

@@ -14,7 +14,7 @@ import numpy as np
 from station.archive.reference_files import valid_versions
 from station.config import Site, read_site
 from station.errors import NotReadyError, ScanError, StationError
-from station.inbox.inbox import start_from_name
+from station.inbox.inbox import is_scan, start_from_name
 from station.inbox.journal import Journal
 from station.inbox.lock import is_locked
 from station.inbox.scan_files import scan_file
@@ -33,11 +33,12 @@ from station.processing import isolation
 from station.processing.integrity import check_store
 from station.processing.scan_inputs import map_position, pressure_fault, scanner_height_m, scanner_to_map
 from station.processing.scan_tasks import dry_run, load_areas, polygon_cells, series_for
+from station.readers.conversion import scan_suffixes
 from station.readers.flags import read_flags
 from station.readers.inclination import read_inclination
-from station.readers.scan import suffixes
 from station.readers.sop import valid_sop
 from station.readers.weather import interpolate_air, read_weather
+from station.scan_names import scan_stem
 from station.science.analysis.verdict import NO_BRIGHTNESS
 from station.science.geometry import inclination
 
@@ -102,7 +103,7 @@ def _files_read(site: Site) -> list[Path]:
         files += [
             log
             for scan in _scans(site)[-1:]
-            if (log := scan.with_name(scan.stem + site.inclination.suffix)).exists()
+            if (log := scan.with_name(scan_stem(scan) + site.inclination.suffix)).exists()
         ]
     return files
 
@@ -235,9 +236,9 @@ def _inclination(site: Site) -> Iterator[Finding]:
     if site.inclination is None or site.inclination.mode == "absolute" or not scans or not site.sop:
         return
     try:
-        sop = valid_sop(site.sop, start_from_name(scans[-1].name, site.scans.name))
+        sop = valid_sop(site.sop, start_from_name(scans[-1].name, site.scans.pattern))
         rotation = scanner_to_map(site, sop).to_local[:3, :3]
-        log_path = scans[-1].with_name(scans[-1].stem + site.inclination.suffix)
+        log_path = scans[-1].with_name(scan_stem(scans[-1]) + site.inclination.suffix)
         log, _ = inclination.clean(read_inclination(log_path), site.instrument.inclination_range_rad)
     except StationError:
         return
@@ -260,8 +261,9 @@ def _newest_height_m(site: Site) -> float | None:
 
 def _scans(site: Site) -> list[Path]:
     """Return the scans in the inbox, by name; none if it cannot be read."""
+    known = scan_suffixes(site.scans)
     try:
-        return sorted(path for path in site.scans.inbox.iterdir() if path.suffix.lower() in suffixes())
+        return sorted(path for path in site.scans.inbox.iterdir() if is_scan(path.name, known))
     except OSError:  # a finding of its own
         return []
 

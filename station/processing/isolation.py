@@ -212,12 +212,19 @@ def _await_report(
 
 
 def _cpu_ticks(pid: int | None) -> int:
-    """Return the CPU time that a process has used, in clock ticks; 0 if it has ended. Source: proc(5)."""
+    """Return the CPU time that a process and those it has started have used, in clock ticks.
+
+    0 if it has ended. A worker waits for the command that converts its scan. Source: proc(5).
+    """
     try:
         fields = Path(f"/proc/{pid}/stat").read_text(encoding="utf-8").rpartition(")")[2].split()
     except OSError:
         return 0
-    return int(fields[11]) + int(fields[12])
+    try:
+        children = Path(f"/proc/{pid}/task/{pid}/children").read_text(encoding="ascii").split()
+    except OSError:  # it has ended, or the kernel does not list them
+        children = []
+    return int(fields[11]) + int(fields[12]) + sum(_cpu_ticks(int(child)) for child in children)
 
 
 @contextmanager

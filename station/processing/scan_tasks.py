@@ -46,10 +46,12 @@ from station.processing.usable_inputs import usable_site
 from station.products.overview import Overview
 from station.quantities import Bools, Measurement, Quality, Reference, ScanGeometry, VarianceComponents
 from station.queries.aggregates import LEVERAGE_VARIABLES
+from station.readers.conversion import open_site_scan
 from station.readers.flags import read_flags, reasons_for
 from station.readers.polygons import cells_inside, read_polygons
 from station.readers.raster import read_geotiff
-from station.readers.scan import ScanReader, open_scan, reject_future, utc_interval
+from station.readers.scan import ScanReader, reject_future, utc_interval
+from station.scan_names import scan_stem
 from station.science.adjustment import ground_classes
 from station.science.adjustment.joint import Adjustment
 from station.science.analysis import inclination_check, verdict
@@ -227,7 +229,7 @@ def check_header(site: Site, scan: ScanFile, progress: Progress) -> None:
     """Raise ScanError if the headers of a scan show that it cannot be used."""
     progress()
     with open_scan_for(site, scan.path) as reader:
-        utc_interval(reader, site.scans.name)
+        utc_interval(reader, site.scans.pattern)
 
 
 def dry_run(site: Site, scan: ScanFile, progress: Progress) -> tuple[str, str, dict[str, float | str]]:
@@ -250,7 +252,7 @@ def _compute_epoch(
     waiting_before: str = "",
 ) -> epochs.Epoch:
     with open_scan_for(site, scan.path) as reader:
-        start, end, _ = utc_interval(reader, site.scans.name)
+        start, end, _ = utc_interval(reader, site.scans.pattern)
         reject_future(start, time.time())
         inputs = load_scan_inputs(
             site,
@@ -312,7 +314,7 @@ def _compute_epoch(
     return epochs.Epoch(
         start_s=start.timestamp(),
         end_s=end.timestamp(),
-        scan_id=scan.path.stem,
+        scan_id=scan_stem(scan.path),
         measurement=measurement,
         shared=shared,
         redundancy=adjustment[1].redundancy if adjustment else None,
@@ -466,7 +468,8 @@ def load_areas(site: Site) -> dict[str, Bools]:
 def open_scan_for(site: Site, path: Path) -> Iterator[ScanReader]:
     """Yield a reader of a scan with the settings of the site; raises ScanError or NotReadyError."""
     range_max_m = site.scanner.range_max_m if site.scans.frame == "scanner" else None
-    with open_scan(path, range_max_m=range_max_m) as reader:
+    work_folder = site.station.data
+    with open_site_scan(path, site.scans, range_max_m=range_max_m, work_folder=work_folder) as reader:
         if site.scans.frame == "map" and site.map.crs and reader.header.crs_wkt:
             _require_same_map(reader.header.crs_wkt, site.map.crs)
         yield reader

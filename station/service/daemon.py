@@ -27,7 +27,7 @@ from station.logs import log_to_stderr, logfmt
 from station.monitoring.metrics import Metrics
 from station.monitoring.preconditions import EARLIEST_S, clock_problem, require_disk_space
 from station.processing import fork_server, isolation
-from station.readers.scan import suffixes
+from station.readers.conversion import scan_suffixes
 from station.service.inbox_watcher import InboxWatcher
 from station.service.scheduler import JobScheduler, LoopEvent
 from station.service.systemd import SystemdNotifier
@@ -243,7 +243,7 @@ class Daemon:
             on_compacted=lambda: self.post(LoopEvent.COMPACTED),
             in_service=True,
         )
-        inbox = Inbox(site, journal, suffixes())
+        inbox = Inbox(site, journal, scan_suffixes(site.scans))
         watcher = InboxWatcher(
             site.scans.inbox, lambda: self.post(LoopEvent.INBOX_CHANGED), polling=site.scans.polling
         )

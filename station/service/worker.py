@@ -449,7 +449,7 @@ class Worker:
         """Return the name of an earlier scan that will be judged soon, '' if there is none."""
         unsettled = self._journal.unsettled(however_often_failed=however_often_failed)
         for name, known_s in unsettled.items():
-            if (known_s or start_from_name(name, self._site.scans.name).timestamp()) < start_utc_s:
+            if (known_s or start_from_name(name, self._site.scans.pattern).timestamp()) < start_utc_s:
                 return name
         return ""
 
@@ -458,7 +458,7 @@ class Worker:
         entry = self._journal.entry(name)
         if entry is not None and entry.start_utc_s is not None:
             return entry.start_utc_s
-        return start_from_name(name, self._site.scans.name).timestamp()
+        return start_from_name(name, self._site.scans.pattern).timestamp()
 
     def _requeue_without_reference(self) -> None:
         """Requeue epochs without change: power failed between building the reference and its first use."""
