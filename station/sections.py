@@ -281,23 +281,49 @@ class InclinationSection(Section):
 
 
 class WeatherColumns(Section):
-    """Column names of the weather log."""
+    """Column names of the weather log; those of the dialect where none is given."""
 
-    time: str = "TIMESTAMP"
-    temperature_c: str
-    humidity_pct: str
-    pressure_hpa: str
+    time: str | Annotated[tuple[str, ...], Field(min_length=1)] | None = None
+    temperature_c: str | None = None
+    humidity_pct: str | None = None
+    pressure_hpa: str | None = None
+
+
+class WeatherUnits(Section):
+    """Units of the weather log that it does not state itself."""
+
+    temperature_c: Literal["C", "F", "K"] | None = None
+    humidity_pct: Literal["%", "fraction"] | None = None
+    pressure_hpa: Literal["hPa", "kPa", "Pa", "bar", "inHg", "mmHg"] | None = None
+
+
+WeatherFormat = Literal["toa5", "csv", "smet", "dwd", "meteoswiss", "davis", "hobo", "lufft", "geosphere"]
 
 
 class WeatherSection(Section):
     """The station's weather log."""
 
     file: Path
-    format: Literal["toa5", "csv"] = "toa5"
-    columns: WeatherColumns
+    format: WeatherFormat = "toa5"
+    columns: WeatherColumns | None = None
+    names: tuple[str, ...] = ()
+    units: WeatherUnits | None = None
+    time_format: str | None = None
+    zone: Zone | None = None
     max_age_s: Positive = 3600.0
     wait_s: NotNegative = 900.0
     utc_offset_h: Annotated[float, Field(ge=-14, le=14)] = 0.0
+
+    @model_validator(mode="after")
+    def _columns_are_known(self) -> WeatherSection:
+        if self.format in {"toa5", "csv"}:
+            given = self.columns.model_dump(exclude_none=True) if self.columns else {}
+            missing = [key for key in ("temperature_c", "humidity_pct", "pressure_hpa") if key not in given]
+            if missing:
+                raise ValueError(f'format = "{self.format}" needs columns.{", columns.".join(missing)}')
+        if self.zone is not None and self.utc_offset_h:
+            raise ValueError("zone and utc_offset_h both say what the clock of the logger shows: keep one")
+        return self
 
 
 class AirValues(Section):

@@ -107,7 +107,7 @@ def test_counts_are_exact_and_means_to_the_storage_quantum(kind, tmp_path):
     count = np.bincount(cell, minlength=shape[0] * shape[1]).reshape(shape)
     height_m = np.bincount(cell, points.xyz_m[2, points.is_last] - 1500, shape[0] * shape[1])
     mean_m = 1500 + height_m.reshape(shape) / count
-    with xr.open_dataset(next((tmp_path / "data").rglob("2025*.nc"))) as epoch:
+    with xr.open_dataset(next((tmp_path / "data" / "epochs").rglob("*.nc"))) as epoch:
         stored = epoch.isel(time=0) if "time" in epoch.dims else epoch
         np.testing.assert_array_equal(stored["point_count"], count)
         assert np.abs(stored["elevation"].to_numpy() - mean_m).max() <= 2**-11 + (kind == "pcd") * 1e-4

@@ -7,6 +7,7 @@ import os
 import shutil
 import time
 from collections.abc import Iterable, Iterator
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
@@ -37,7 +38,7 @@ from station.readers.conversion import scan_suffixes
 from station.readers.flags import read_flags
 from station.readers.inclination import read_inclination
 from station.readers.sop import valid_sop
-from station.readers.weather import interpolate_air, read_weather
+from station.readers.weather import interpolate_air, log_files, read_weather
 from station.scan_names import scan_stem
 from station.science.analysis.verdict import NO_BRIGHTNESS
 from station.science.geometry import inclination
@@ -93,7 +94,9 @@ def _named(what: str, findings: Iterable[LevelAndMessage]) -> Iterator[Finding]:
 def _files_read(site: Site) -> list[Path]:
     """Return the files that the service reads, as far as they exist."""
     files = [site.path, *(sop.file for sop in site.sop), *_scans(site)[-1:]]
-    files += [section.file for section in (site.weather, site.areas, site.flags) if section]
+    files += [section.file for section in (site.areas, site.flags) if section]
+    with suppress(StationError):  # a finding of its own
+        files += log_files(site.weather.file)[-1:] if site.weather else []
     files += [
         path
         for path in (site.map.pop, site.adjustment.stable, site.reference.scans)
@@ -203,12 +206,7 @@ def _weather(site: Site) -> Iterator[Finding]:
     if settings is None:
         return
     try:
-        log = read_weather(
-            settings.file,
-            format=settings.format,
-            columns=settings.columns,
-            utc_offset_h=settings.utc_offset_h,
-        )
+        log = read_weather(settings)
     except (ScanError, NotReadyError) as error:
         yield _finding("warning", "weather", str(error))
         return

@@ -23,8 +23,6 @@ def settings(folder, script, **more):
     return ScansSection(inbox=folder, suffix=".rxp", convert=command(script), **more)
 
 
-
-
 def test_the_converted_scan_is_read_under_its_own_name_and_removed(tmp_path, write_sweep):
     plain = write_sweep("250715_090000.laz", 5000)
     work, source = tmp_path / "data", plain.with_suffix(".rxp")

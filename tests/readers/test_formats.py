@@ -109,9 +109,7 @@ def ply_file(path, points, *, text=False, byte_order="<"):
     for name, values in fields.items():
         records[name] = values
     element = plyfile.PlyElement.describe(records, "vertex")
-    faces = plyfile.PlyElement.describe(
-        np.array([([0, 1, 2],)], [("vertex_indices", "i4", (3,))]), "face"
-    )
+    faces = plyfile.PlyElement.describe(np.array([([0, 1, 2],)], [("vertex_indices", "i4", (3,))]), "face")
     plyfile.PlyData([element, faces], text=text, byte_order=byte_order).write(str(path))
     return path
 
