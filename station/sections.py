@@ -17,7 +17,7 @@ from pydantic import AfterValidator, AwareDatetime, BaseModel, ConfigDict, Field
 
 from station.quantities import Air, IntensityScale, Scanner
 from station.scan_names import ZONE_MARK, start_in_name
-from station.scanners import SCANNERS
+from station.scanners import SCANNERS, scanner_model
 
 Positive = Annotated[float, Field(gt=0)]
 NotNegative = Annotated[float, Field(ge=0)]
@@ -178,15 +178,16 @@ class ScannerSection(Section):
     def _fill_from_model(cls, values: Any) -> Any:  # noqa: ANN401 - any TOML value
         if not isinstance(values, dict) or not isinstance(values.get("model", ""), str):
             return values  # pydantic reports the types
-        model = values.get("model", "riegl-vz-6000")
+        given = values.get("model", "riegl-vz-6000")
+        model = scanner_model(given) or given
         known = SCANNERS.get(model, {})
         missing = set(SCANNERS["riegl-vz-6000"]) - set(values)
         if not known and missing:
             raise ValueError(
-                f"unknown scanner {model!r}: choose from {', '.join(SCANNERS)},"
+                f"unknown scanner {given!r}: choose from {', '.join(SCANNERS)},"
                 f" or give {', '.join(sorted(missing))}"
             )
-        return {**known, **values}
+        return {**known, **values, "model": model}
 
     @property
     def instrument(self) -> Scanner:
