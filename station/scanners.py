@@ -8,8 +8,8 @@ import re
 # (VZ-4000, LMS-Z390i). The papers give no range noise and no aperture for the VZ-6000, and nothing for the
 # VZ-400i: these values, and the ranges of the inclination sensors, are from the manufacturer's data sheets
 # (RIEGL: 10 mm and 3 mm precision; 0.35 mrad, 1.55 µm). VZ-400, VZ-1000 and Livox Mid-70: definitions of
-# HELIOS++ (Winiwarter et al., 2022, data/scanners_tls.xml), made from the data sheets; its accuracy is taken
-# for the noise of a shot, which is less. The beam of the Mid-70 is 0.52 by 4.89 mrad: that of a round one with
+# HELIOS++ (Winiwarter et al., 2022, data/scanners_tls.xml), made from the data sheets; its accuracy
+# stands for the noise of a shot, which is less. The beam of the Mid-70 is 0.52 by 4.89 mrad: that of a round one with
 # the same mean square; its direction is known to 0.1° (one sigma), as the step of an encoder 0.35°; it has no
 # inclination sensor.
 SCANNERS: dict[str, dict[str, float]] = {
@@ -87,7 +87,7 @@ SCANNERS: dict[str, dict[str, float]] = {
 
 
 def scanner_model(name: str) -> str | None:
-    """Return the known model that a name such as `VZ-6000` or `Riegl VZ 6000` means; None if it is unknown."""
+    """Return the known model that a name such as `VZ-6000` or `Riegl VZ 6000` means; None without one."""
     plain = _letters_and_digits(name)
     for model in SCANNERS:
         if plain in {_letters_and_digits(model), _letters_and_digits(model.partition("-")[2])}:

@@ -62,7 +62,7 @@ def _site_text(project: Project) -> str:
     return "\n".join(
         [
             f"#:schema ./{SCHEMA_NAME}",
-            f"# From the RiSCAN project {project.name}. Lines with `check:` need your eyes; then: station check.",
+            f"# From the RiSCAN project {project.name}. Mind the lines with `check:`; then station check.",
             "",
             "[station]",
             f'id = "{ident}"',
@@ -99,7 +99,7 @@ def _sop_lines(project: Project) -> list[str]:
         mark = "# " if start in starts else ""  # two SOPs must not begin together
         starts.add(start)
         lines += [
-            f"{mark}[[sop]]{'' if position.start_utc else '   # check: the project has no scan that dates it'}",
+            f"{mark}[[sop]]{'' if position.start_utc else '   # check: no scan of the project dates it'}",
             f"{mark}from = {start}",
             f'{mark}file = "{_file_stem(position.name)}-SOP.dat"',
         ]
@@ -115,11 +115,8 @@ def _map_lines(project: Project) -> list[str]:
     lines = ["# check: the project has no POP: the map is its own frame, see docs/how-to/sop.md"]
     if project.pop is not None:
         crs, east_m, north_m = _utm_position(project.pop, position)
-        lines = [
-            "[map]",
-            f'crs = "{crs}"                    # check: or the CRS of your maps',
-            'pop = "POP.dat"',
-        ]
+        crs_line = f'crs = "{crs}"                    # check: or the CRS of your maps'
+        lines = ["[map]", crs_line, 'pop = "POP.dat"']
     half_m = position.extent_m or DEFAULT_EXTENT_M
     cell_m = max(10.0 ** math.floor(math.log10(2 * half_m / CELLS)), 0.01)
     edge_m = CELLS / 2 * cell_m * math.ceil(half_m / (CELLS / 2 * cell_m))
@@ -151,10 +148,15 @@ def _air_lines(project: Project) -> list[str]:
     air = next((position.air for position in project.positions if position.air), None)
     if air is None:
         return []
+    values = {
+        "temperature_c": air.temperature_c,
+        "pressure_hpa": air.pressure_hpa,
+        "humidity_pct": air.humidity_pct,
+    }
+    pairs = ", ".join(f"{key} = {value:.1f}" for key, value in values.items())
     return [
         "[air]",
-        f"scanner_setting = {{ temperature_c = {air.temperature_c:.1f}, pressure_hpa = {air.pressure_hpa:.1f},"
-        f" humidity_pct = {air.humidity_pct:.1f} }}",
+        f"scanner_setting = {{ {pairs} }}",
         "scanner_corrects = true               # check: the scanner applied the atmosphere above",
         "",
     ]

@@ -37,6 +37,7 @@ from station.processing.scan_tasks import dry_run, load_areas, polygon_cells, se
 from station.readers.conversion import scan_suffixes
 from station.readers.flags import read_flags
 from station.readers.inclination import read_inclination
+from station.readers.polygons import mended_outlines
 from station.readers.sop import valid_sop
 from station.readers.weather import interpolate_air, log_files, read_weather
 from station.scan_names import scan_stem
@@ -148,7 +149,11 @@ def _sop_poses(site: Site) -> Iterator[Finding]:
 
 def _polygons(site: Site) -> Iterator[Finding]:
     """Yield the number of cells in each named polygon."""
+    files = [site.areas.file] if site.areas else []
+    files += [site.adjustment.stable] if isinstance(site.adjustment.stable, Path) else []
     try:
+        for message in (text for file in files for text in mended_outlines(file, site.map.crs)):
+            yield _finding("warning", "polygons", message)
         named = load_areas(site)
         areas = {f"area {name}": cells for name, cells in named.items()}
         if isinstance(site.adjustment.stable, Path) and site.adjustment.method == "joint":

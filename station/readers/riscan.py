@@ -7,7 +7,7 @@ import re
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
-from xml.etree import ElementTree
+from xml.etree import ElementTree as ET
 
 from station.errors import ConfigError
 from station.quantities import Air, Floats
@@ -45,10 +45,10 @@ def read_project(path: Path) -> Project:
     if path.is_dir():
         path = path / PROJECT_FILE
     try:
-        root = ElementTree.fromstring(read_text(path))  # noqa: S314 - expat limits expansion
+        root = ET.fromstring(read_text(path))  # noqa: S314 - expat limits expansion
     except OSError as error:
         raise ConfigError(f"{path}: cannot be read: {error.strerror}") from error
-    except (ElementTree.ParseError, UnicodeDecodeError) as error:
+    except (ET.ParseError, UnicodeDecodeError) as error:
         raise ConfigError(f"{path}: not a RiSCAN project: {error}") from error
     positions = tuple(_position(node, path) for node in root.iter("scanposition") if _is_kept(node))
     if root.tag != "project" or not positions:
@@ -58,12 +58,12 @@ def read_project(path: Path) -> Project:
     return Project(root.get("name", path.stem), pop if is_placed else None, positions)
 
 
-def _is_kept(node: ElementTree.Element) -> bool:
+def _is_kept(node: ET.Element) -> bool:
     """Return False for what the user has deleted."""
     return "deleted" not in node.get("states", "")
 
 
-def _position(node: ElementTree.Element, path: Path) -> ScanPosition:
+def _position(node: ET.Element, path: Path) -> ScanPosition:
     name = node.get("name", "")
     sop = _matrix(node.find("sop"), path)
     if sop is None:
@@ -89,12 +89,12 @@ def _position(node: ElementTree.Element, path: Path) -> ScanPosition:
     )
 
 
-def _matrix(node: ElementTree.Element | None, path: Path) -> Floats | None:
+def _matrix(node: ET.Element | None, path: Path) -> Floats | None:
     text = None if node is None else node.findtext("matrix")
     return None if not text else checked_matrix(" ".join(text.split()), path)
 
 
-def _air(node: ElementTree.Element) -> Air | None:
+def _air(node: ET.Element) -> Air | None:
     """Return the atmosphere that was set; the vapour pressure becomes humidity by the Magnus formula.
 
     Source: WMO-No. 8 (2021), annex 4.B.

@@ -6,7 +6,7 @@ import re
 from collections.abc import Iterable
 from datetime import datetime
 from pathlib import Path
-from xml.etree import ElementTree
+from xml.etree import ElementTree as ET
 
 import numpy as np
 
@@ -19,6 +19,7 @@ ROTATION_TOLERANCE = 1e-6  # moves a point 1,000 km away by 1 m; files with nine
 MAX_CORRECTABLE = 1e-4  # a few digits lost in writing; beyond that it is not a rotation
 POSITION, QUATERNION = ("x", "y", "z"), ("qw", "qx", "qy", "qz")
 ANGLES = ("roll_deg", "pitch_deg", "yaw_deg")
+NAMED = re.compile(r"\"?([a-z][a-z_]*)\"?\s*[=:]\s*(\S+?),?")
 DECIMAL_COMMA = re.compile(r"[-+]?\d*(,\d*)?([eE][-+]?\d+)?")
 MAX_COORDINATE_M = 1e8  # from the origin of any frame or map; the earth's radius is 6.4e6
 
@@ -65,8 +66,8 @@ def checked_matrix(text: str, path: Path) -> Floats:
 def _xml_matrix(text: str, path: Path) -> str:
     """Return the numbers of the only element `matrix` of an XML document."""
     try:
-        matrices = list(ElementTree.fromstring(text).iter("matrix"))  # noqa: S314 - expat limits expansion
-    except ElementTree.ParseError as error:
+        matrices = list(ET.fromstring(text).iter("matrix"))  # noqa: S314 - expat limits expansion
+    except ET.ParseError as error:
         raise ConfigError(f"{path}: not valid XML: {error}") from error
     if len(matrices) != 1:
         advice = ": station import riscan reads whole projects" if matrices else ""
@@ -76,9 +77,7 @@ def _xml_matrix(text: str, path: Path) -> str:
 
 def _named_values(text: str) -> dict[str, float]:
     """Return the numbers of lines such as `roll_deg = 1.5`; empty if they are not named."""
-    pairs = [
-        re.fullmatch(r"\"?([a-z][a-z_]*)\"?\s*[=:]\s*(\S+?),?", line.lower()) for line in text.splitlines()
-    ]
+    pairs = [NAMED.fullmatch(line.lower()) for line in text.splitlines()]
     return {pair[1]: float(pair[2].replace(",", ".")) for pair in pairs if pair}
 
 
@@ -133,7 +132,7 @@ def _sixteen_numbers(text: str, path: Path) -> Floats:
 
 
 def _numbers(line: str) -> list[str]:
-    """Return the numbers of a line; a comma is that of decimals if there are other separators between them."""
+    """Return the numbers of a line; a comma is that of decimals if other separators are between them."""
     words = line.replace(";", " ").split()
     if len(words) in {4, 16} and all(DECIMAL_COMMA.fullmatch(word) for word in words):
         return [word.replace(",", ".") for word in words]

@@ -127,8 +127,8 @@ def _is_newest_first(file: BinaryIO, header: Header, parse: ParseRow, name: str)
         fields = next((row for row in rows if len(row) > max(header.time_indices)), None)
         if fields is not None:
             raise ScanError(
-                f"{name}: no row has a readable time: the first one is {header.time_text(fields)!r}, but times"
-                " must be ISO 8601, such as 2025-07-15 00:10:00, or as weather.time_format says"
+                f"{name}: no row has a readable time: the first one is {header.time_text(fields)!r}, but"
+                " times must be ISO 8601, such as 2025-07-15 00:10:00, or as weather.time_format says"
             )
     return False
 
