@@ -1,4 +1,4 @@
-"""From a folder of scans of each format to the series, by the lines that docs/how-to/other-formats.md gives."""
+"""From a folder of scans of each format to the series, by the lines of docs/how-to/your-own-files.md."""
 
 import gzip
 import json
@@ -79,8 +79,10 @@ FORMATS = {
     "named text": (written.FULL["xyz"], ""),
     "text": (
         lambda path, points: written.text_file(path / "a.csv", points, delimiter=",", fields="xyzitnc"),
-        'suffix = ".csv"\n'
-        'columns = ["x", "y", "z", "intensity", "time", "return_number", "number_of_returns"]',
+        (
+            'suffix = ".csv"\n'
+            'columns = ["x", "y", "z", "intensity", "time", "return_number", "number_of_returns"]'
+        ),
     ),
     "convert": (foreign, f'suffix = ".rxp"\nconvert = {json.dumps(COPY)}'),
 }

@@ -85,7 +85,9 @@ def convert(command: Sequence[str], source: Path, copy: Path, *, timeout_s: floa
     arguments = [word.replace("{in}", str(source)).replace("{out}", str(copy)) for word in command]
     name = Path(arguments[0]).name
     with tempfile.TemporaryFile() as stderr:
-        try:
+        usual_limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+        try:  # the command inherits the limit, from its first byte on
+            resource.setrlimit(resource.RLIMIT_FSIZE, (limit_bytes, usual_limits[1]))
             process = subprocess.Popen(  # noqa: S603 - the command of the site file
                 arguments,
                 cwd=copy.parent,
@@ -96,8 +98,9 @@ def convert(command: Sequence[str], source: Path, copy: Path, *, timeout_s: floa
             )
         except OSError as error:
             raise NotReadyError(f"scans.convert: {arguments[0]} cannot be run: {error.strerror}") from error
+        finally:
+            resource.setrlimit(resource.RLIMIT_FSIZE, usual_limits)
         with _killed_with_this_process(process):
-            resource.prlimit(process.pid, resource.RLIMIT_FSIZE, (limit_bytes, limit_bytes))
             status = _wait(process, time.monotonic() + timeout_s)
         stderr.seek(0)
         lines = stderr.read(1 << 16).decode("utf-8", "replace").split("\n")

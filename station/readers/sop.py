@@ -19,7 +19,7 @@ ROTATION_TOLERANCE = 1e-6  # moves a point 1,000 km away by 1 m; files with nine
 MAX_CORRECTABLE = 1e-4  # a few digits lost in writing; beyond that it is not a rotation
 POSITION, QUATERNION = ("x", "y", "z"), ("qw", "qx", "qy", "qz")
 ANGLES = ("roll_deg", "pitch_deg", "yaw_deg")
-NAMED = re.compile(r"\"?([a-z][a-z_]*)\"?\s*[=:]\s*(\S+?),?")
+NAMED = re.compile(r"\"?([a-z][a-z_]*)\"?\s*[=:]\s*(\S+?)\s*[,}]*")
 DECIMAL_COMMA = re.compile(r"[-+]?\d*(,\d*)?([eE][-+]?\d+)?")
 MAX_COORDINATE_M = 1e8  # from the origin of any frame or map; the earth's radius is 6.4e6
 

@@ -114,7 +114,7 @@ def test_a_command_has_the_memory_of_its_worker(tmp_path):
         run_isolated(_open, source, settings(tmp_path, script), memory_gb=1.0, timeout_s=30.0)
 
 
-def _open(path, scans, progress):
+def _open(path, scans, _progress):
     with open_site_scan(path, scans, range_max_m=None, work_folder=path.parent):
         pass
 

@@ -1,4 +1,4 @@
-"""Scans of other formats than LAS, each written by another library, against the arrays they were written from."""
+"""Scans of other formats than LAS, each written by another library, against the arrays in them."""
 
 import gzip
 import struct
@@ -131,7 +131,8 @@ def pcd_file(path, points, encoding):
 def text_file(path, points, *, delimiter=" ", header="", decimal_comma=False, fields="xyzit"):
     columns = {
         "x": points.xyz_m[0], "y": points.xyz_m[1], "z": points.xyz_m[2], "i": points.intensity,
-        "t": points.time_s, "r": points.reflectance_db, "n": points.return_number, "c": points.number_of_returns,
+        "t": points.time_s, "r": points.reflectance_db,
+        "n": points.return_number, "c": points.number_of_returns,
     }  # fmt: skip
     table = np.column_stack([columns[field] for field in fields])
     lines = [delimiter.join(f"{value:.6f}" for value in row) for row in table]
@@ -163,7 +164,8 @@ FULL = {
     "compressed pcd": lambda path, points: pcd_file(path / "a.pcd", points, "BINARY_COMPRESSED"),
     "text pcd": lambda path, points: pcd_file(path / "a.pcd", points, "ASCII"),
     "xyz": lambda path, points: text_file(
-        path / "a.xyz", points, header="//X Y Z Intensity GpsTime return_number number_of_returns", fields="xyzitnc"
+        path / "a.xyz", points, fields="xyzitnc",
+        header="//X Y Z Intensity GpsTime return_number number_of_returns",
     ),
     "RiSCAN text": lambda path, points: text_file(
         path / "a.asc", points, delimiter=";", decimal_comma=True, fields="xyzitnc",
@@ -184,7 +186,10 @@ def test_points_times_returns_and_intensity_are_those_written(kind, tmp_path):
     np.testing.assert_allclose(time_s, points.time_s[last], atol=1e-5)
     np.testing.assert_allclose(intensity, points.intensity[last] / 65535, atol=1e-6)
     for size in (7, 999):
-        assert all(np.array_equal(a, b) for a, b in zip(read(path, size=size), (xyz_m, time_s, intensity)))
+        assert all(
+            np.array_equal(a, b)
+            for a, b in zip(read(path, size=size), (xyz_m, time_s, intensity), strict=False)
+        )
 
 
 @pytest.mark.parametrize("kind", FULL)

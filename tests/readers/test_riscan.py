@@ -39,8 +39,8 @@ def test_a_real_project(shared_data):
     assert (first.name, second.name) == ("SP01", "SP02")
     assert (first.instrument, first.first_scan) == ("VZ-1000", "151120_150227")
     assert first.start_utc == datetime(2015, 11, 20, 15, 2, 27, tzinfo=UTC)
-    np.testing.assert_allclose(first.sop[0], [0.99203538996098432, 4.7632160018149184e-05, 0.12595944901488946,
-                                              -3.1470172510255578], rtol=1e-9)  # fmt: skip
+    first_row = [0.99203538996098432, 4.7632160018149184e-05, 0.12595944901488946, -3.1470172510255578]
+    np.testing.assert_allclose(first.sop[0], first_row, rtol=1e-9)
     assert project.pop[2, 3] == 3143447.4201939853
     assert (first.air.temperature_c, first.air.pressure_hpa) == (12.0, 1000.0)
     assert first.air.humidity_pct == pytest.approx(60.0, abs=0.2)  # RiSCAN's default
@@ -71,8 +71,10 @@ def test_an_identity_is_no_pop_and_a_folder_is_a_project(tmp_path):
         ("\x00\x01", "not a RiSCAN project"),
         ("<project><scanpositions><scanposition name='a'/></scanpositions></project>", "a has no SOP"),
         (
-            "<project><scanpositions><scanposition name='a'><sop><matrix>1 2 3</matrix></sop></scanposition>"
-            "</scanpositions></project>",
+            (
+                "<project><scanpositions><scanposition name='a'><sop><matrix>1 2 3</matrix></sop>"
+                "</scanposition></scanpositions></project>"
+            ),
             r"has rows of \[3\]",
         ),
     ],

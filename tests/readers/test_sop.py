@@ -134,7 +134,7 @@ PLACE = "x = 12.5\ny = -3.25\nz = 1500\n"
     "text",
     [
         SIXTEEN,
-        f'<?xml version="1.0"?>\n<sop name="SOP" kind="SOP"><matrix rows="4" cols="4"> {SIXTEEN} </matrix></sop>',
+        f'<?xml version="1.0"?>\n<sop kind="SOP"><matrix rows="4" cols="4"> {SIXTEEN} </matrix></sop>',
         ROWS.replace(".", ","),
         "\n".join(";".join(line.split()) for line in ROWS.replace(".", ",").split("\n")),
         "\n".join(", ".join(line.split()) for line in ROWS.split("\n")),
@@ -143,7 +143,7 @@ PLACE = "x = 12.5\ny = -3.25\nz = 1500\n"
         PLACE.replace("=", ":") + "roll_deg: {}\npitch_deg: {}\nyaw_deg: {}".format(
             *np.degrees([0.1, 0.59, -1.2])
         ),
-        '{{\n"x": 12.5,\n"y": -3.25,\n"z": 1500,\n"roll_deg": {},\n"pitch_deg": {},\n"yaw_deg": {}\n}}'.format(
+        '{{\n"x": 12.5,\n"y": -3.25,\n"z": 1500,\n"roll_deg": {},\n"pitch_deg": {},\n"yaw_deg": {}}}'.format(
             *np.degrees([0.1, 0.59, -1.2])
         ),
     ],

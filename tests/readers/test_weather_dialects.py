@@ -1,4 +1,4 @@
-"""Weather logs as loggers and services write them, with their headers; the expected values are worked by hand."""
+"""Weather logs as loggers and services write them; the expected values are worked by hand."""
 
 from datetime import UTC, datetime
 
@@ -10,8 +10,8 @@ from station.errors import NotReadyError, ScanError
 from station.readers.weather import read_weather
 from station.sections import WeatherSection
 
-# Each: format, lines of the site file, the file. All say: 15 July 2025, 00:10 and 00:20 UTC; -1.5 °C, 684.5 hPa
-# and 51 % at the first.
+# Each: lines of the site file, and the file. All say: 15 July 2025, 00:10 and 00:20 UTC; at first -1.5 °C,
+# 684.5 hPa and 51 %.
 DAVIS = (
     "\t\tTemp\tHi\tLow\tOut\tDew\t\t\n"
     "Date\tTime\tOut\tTemp\tTemp\tHum\tPt.\tBar  \n"
@@ -21,36 +21,36 @@ DAVIS = (
 LOGS = {
     "smet": (
         {"format": "smet"},
-        "SMET 1.1 ASCII\n[HEADER]\nstation_id = weissfluhjoch\nnodata = -999\ntz = 1\n"
+        ("SMET 1.1 ASCII\n[HEADER]\nstation_id = weissfluhjoch\nnodata = -999\ntz = 1\n"
         "fields = timestamp TA RH VW P\n[DATA]\n"
-        "2025-07-15T01:10:00 271.65 0.51 3.2 68450\n2025-07-15T01:20:00 -999 0.50 3.1 68460\n",
+        "2025-07-15T01:10:00 271.65 0.51 3.2 68450\n2025-07-15T01:20:00 -999 0.50 3.1 68460\n"),
     ),
     "smet with units of its own": (
         {"format": "smet"},
-        "SMET 1.1 ASCII\n[HEADER]\nnodata = -999\ntz = 0\nfields = timestamp TA RH P\n"
+        ("SMET 1.1 ASCII\n[HEADER]\nnodata = -999\ntz = 0\nfields = timestamp TA RH P\n"
         "units_offset = 0 273.15 0 0\nunits_multiplier = 1 1 0.01 100\n[DATA]\n"
-        "2025-07-15T00:10:00 -1.5 51 684.5\n2025-07-15T00:20:00 -999 50 684.6\n",
+        "2025-07-15T00:10:00 -1.5 51 684.5\n2025-07-15T00:20:00 -999 50 684.6\n"),
     ),
     "dwd": (
         {"format": "dwd"},
-        "STATIONS_ID;MESS_DATUM;  QN;PP_10;TT_10;TM5_10;RF_10;TD_10;eor\r\n"
+        ("STATIONS_ID;MESS_DATUM;  QN;PP_10;TT_10;TM5_10;RF_10;TD_10;eor\r\n"
         "          3;202507150010;    3;  684.5;  -1.5;  -1.0;  51.0;  -1.6;eor\r\n"
-        "          3;202507150020;    3;  684.6;  -999;  -1.0;  50.0;  -1.6;eor\r\n",
+        "          3;202507150020;    3;  684.6;  -999;  -1.0;  50.0;  -1.6;eor\r\n"),
     ),
     "meteoswiss": (
         {"format": "meteoswiss"},
-        "station_abbr;reference_timestamp;tre200s0;ure200s0;tde200s0;prestas0;pp0qnhs0;gre000z0\n"
-        "JUN;15.07.2025 00:10;-1.5;51;-6.7;684.5;1015;0\nJUN;15.07.2025 00:20;;50;-6.7;684.6;1015;0\n",
+        ("station_abbr;reference_timestamp;tre200s0;ure200s0;tde200s0;prestas0;pp0qnhs0;gre000z0\n"
+        "JUN;15.07.2025 00:10;-1.5;51;-6.7;684.5;1015;0\nJUN;15.07.2025 00:20;;50;-6.7;684.6;1015;0\n"),
     ),
     "meteoswiss as it was": (
         {"format": "meteoswiss"},
-        "Station/Location;Date;tre200s0;rre150z0;ure200s0;prestas0\n"
-        "JUN;202507150010;-1.5;0;51;684.5\nJUN;202507150020;-;0;50;684.6\n",
+        ("Station/Location;Date;tre200s0;rre150z0;ure200s0;prestas0\n"
+        "JUN;202507150010;-1.5;0;51;684.5\nJUN;202507150020;-;0;50;684.6\n"),
     ),
     "geosphere": (
         {"format": "geosphere"},
-        "time,station,tl,rf,p\n2025-07-15T00:10+00:00,11343,-1.5,51.0,684.5\n"
-        "2025-07-15T00:20+00:00,11343,,50.0,684.6\n",
+        ("time,station,tl,rf,p\n2025-07-15T00:10+00:00,11343,-1.5,51.0,684.5\n"
+        "2025-07-15T00:20+00:00,11343,,50.0,684.6\n"),
     ),
     "davis": (
         {"format": "davis", "units": {"temperature_c": "F", "pressure_hpa": "inHg"}},
@@ -58,21 +58,22 @@ LOGS = {
     ),
     "hobo": (
         {"format": "hobo"},
-        '"Plot Title: hut"\n'
+        ('"Plot Title: hut"\n'
         '"#","Date Time, GMT+02:00","Temp, °C (LGR S/N: 1, SEN S/N: 2)","RH, % (LGR S/N: 1, SEN S/N: 2)",'
         '"Abs Pres, kPa (LGR S/N: 1, SEN S/N: 3)"\n'
-        '1,"07/15/25 02:10:00 AM",-1.5,51,68.45\n2,"07/15/25 02:20:00 AM",,50,68.46\n',
+        '1,"07/15/25 02:10:00 AM",-1.5,51,68.45\n2,"07/15/25 02:20:00 AM",,50,68.46\n'),
     ),
     "lufft": (
         {"format": "lufft", "zone": "Europe/Vienna"},
-        "Date time ; Temperature [°C] ; Abs. air pressure [hPa] ; Relative humidity [%] ; Abs. humidity [g/m³]\n"
-        "15.07.2025 02:10:00 ; -1,5 ; 684,5 ; 51,0 ; 2,2\n15.07.2025 02:20:00 ; ; 684,6 ; 50,0 ; 2,2\n",
+        ("Date time ; Temperature [°C] ; Abs. air pressure [hPa] ; Relative humidity [%] ; Dew point [°C]\n"
+        "15.07.2025 02:10:00 ; -1,5 ; 684,5 ; 51,0 ; 2,2\n15.07.2025 02:20:00 ; ; 684,6 ; 50,0 ; 2,2\n"),
     ),
     "csv with a preamble, a units row and decimal commas": (
         {"format": "csv", "time_format": "%d.%m.%Y %H:%M", "zone": "Europe/Zurich",
-         "columns": {"time": ["Datum", "Zeit"], "temperature_c": "T", "humidity_pct": "rF", "pressure_hpa": "p"}},
-        "Station: Hütte\nExport vom 16.07.2025\n\nDatum;Zeit;T;rF;p\n;;°F;%;kPa\n"
-        "15.07.2025;02:10;29,3;51;68,45\n15.07.2025;02:20;;50;68,46\n",
+         "columns": {"time": ["Datum", "Zeit"], "temperature_c": "T", "humidity_pct": "rF",
+                     "pressure_hpa": "p"}},
+        ("Station: Hütte\nExport vom 16.07.2025\n\nDatum;Zeit;T;rF;p\n;;°F;%;kPa\n"
+        "15.07.2025;02:10;29,3;51;68,45\n15.07.2025;02:20;;50;68,46\n"),
     ),
     "csv without a header, in seconds since 1970": (
         {"format": "csv", "time_format": "unix", "names": ["time", "-", "t", "rh", "p"],
