@@ -9,9 +9,9 @@ import re
 # VZ-400i: these values, and the ranges of the inclination sensors, are from the manufacturer's data sheets
 # (RIEGL: 10 mm and 3 mm precision; 0.35 mrad, 1.55 µm). VZ-400, VZ-1000 and Livox Mid-70: definitions of
 # HELIOS++ (Winiwarter et al., 2022, data/scanners_tls.xml), made from the data sheets; its accuracy stands
-# for the noise of a shot, which is less. The beam of the Mid-70 is 0.52 by 4.89 mrad, as wide as a round one of
-# 3.5 mrad in the mean square. Its direction is known to 0.1° (one sigma), as with an encoder of 0.35° a step. It has
-# no inclination sensor.
+# for the noise of a shot, which is less. The beam of the Mid-70 is 0.52 by 4.89 mrad, as wide as a round one
+# of 3.5 mrad in the mean square. Its direction is known to 0.1° (one sigma), as with an encoder of 0.35° a
+# step. It has no inclination sensor.
 SCANNERS: dict[str, dict[str, float]] = {
     "riegl-vz-6000": {
         "wavelength_um": 1.064,

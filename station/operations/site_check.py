@@ -20,6 +20,7 @@ from station.inbox.journal import Journal
 from station.inbox.lock import is_locked
 from station.inbox.scan_files import scan_file
 from station.monitoring.preconditions import EARLIEST_S
+from station.operations.inbox_contents import inbox_findings
 from station.operations.site_plausibility import (
     LevelAndMessage,
     alarm_findings,
@@ -57,6 +58,7 @@ def site_findings(site_path: Path) -> list[Finding]:
         *_sop_poses(site),
         *_polygons(site),
         *_folders(site),
+        *_named("inbox", inbox_findings(site)),
         *_named("rights", rights_findings(site, _files_read(site))),
         *_flags(site),
         *_clock(),
