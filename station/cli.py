@@ -12,7 +12,6 @@ from station.commands import (
     calibrate,
     check,
     exports,
-    imports,
     papers,
     process,
     products,
@@ -42,7 +41,7 @@ COMMANDS = (
 for command in COMMANDS:
     app.command()(command)
 app.add_typer(sop.app, name="sop")
-app.add_typer(imports.app, name="import")
+app.add_typer(sop.import_app, name="import")
 app.add_typer(alarms.app, name="alarms")
 
 

@@ -9,7 +9,7 @@ import laspy
 import numpy as np
 import pytest
 import xarray as xr
-from readers import test_formats as written
+from readers.formats import test_formats as written
 
 pytestmark = pytest.mark.integration
 

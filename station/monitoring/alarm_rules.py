@@ -22,7 +22,7 @@ from station.logs import logfmt
 from station.monitoring.alarm_state import Alarm
 from station.monitoring.area_curves import AreaCurve, read_curves
 from station.monitoring.preconditions import require_disk_space
-from station.readers.conversion import scan_suffixes
+from station.readers.formats.conversion import scan_suffixes
 from station.science.analysis.change_detection import ChangeDetections, detect_changes, threshold_sigmas
 from station.science.gridding.significance import SIGNIFICANT_SIGMAS
 from station.sections import AlarmsSection, ChangeAlarm

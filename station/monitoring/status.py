@@ -13,7 +13,7 @@ from station.inbox.journal import Entry, Journal, State
 from station.inbox.lock import is_locked, pause_reason
 from station.monitoring.alarm_state import active
 from station.monitoring.preconditions import clock_problem, format_utc, require_disk_space
-from station.readers.conversion import scan_suffixes
+from station.readers.formats.conversion import scan_suffixes
 
 if TYPE_CHECKING:
     from pathlib import Path

@@ -20,7 +20,7 @@ from station.processing.scan_tasks import series_for
 from station.quantities import Floats
 from station.queries.box_series import box_statistics
 from station.queries.stable_ground import validate_sigma
-from station.readers.conversion import open_site_scan, scan_suffixes
+from station.readers.formats.conversion import open_site_scan, scan_suffixes
 from station.science.analysis.precision import (
     AnglePrecision,
     RangeModel,

@@ -10,7 +10,7 @@ from pathlib import Path
 from station.config import Site
 from station.inbox.inbox import is_scan
 from station.operations.site_plausibility import LevelAndMessage
-from station.readers.conversion import scan_suffixes
+from station.readers.formats.conversion import scan_suffixes
 from station.readers.scan import TEXT_SUFFIXES, suffixes
 from station.scan_names import scan_stem, start_in_name
 

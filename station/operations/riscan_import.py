@@ -11,7 +11,7 @@ from pyproj import Transformer
 from station.config import SCHEMA_NAME, site_schema
 from station.errors import ConfigError
 from station.quantities import Floats
-from station.readers.riscan import Project, ScanPosition, read_project
+from station.readers.formats.riscan import Project, ScanPosition, read_project
 from station.scanners import SCANNERS, scanner_model
 from station.science.geometry import pose
 

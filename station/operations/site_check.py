@@ -35,8 +35,8 @@ from station.processing import isolation
 from station.processing.integrity import check_store
 from station.processing.scan_inputs import map_position, pressure_fault, scanner_height_m, scanner_to_map
 from station.processing.scan_tasks import dry_run, load_areas, polygon_cells, series_for
-from station.readers.conversion import scan_suffixes
 from station.readers.flags import read_flags
+from station.readers.formats.conversion import scan_suffixes
 from station.readers.inclination import read_inclination
 from station.readers.polygons import mended_outlines
 from station.readers.sop import valid_sop

@@ -43,7 +43,7 @@ from station.inbox.journal import Entry, State
 from station.inbox.scan_files import find_scan
 from station.processing.provenance import StoredEpoch, stored_epochs
 from station.processing.scan_tasks import Progress, series_for
-from station.readers.conversion import scan_suffixes
+from station.readers.formats.conversion import scan_suffixes
 
 
 @dataclass(frozen=True)

@@ -28,7 +28,7 @@ from station.quantities import (
     SharedParameters,
     VarianceComponents,
 )
-from station.readers.conversion import open_site_scan
+from station.readers.formats.conversion import open_site_scan
 from station.readers.inclination import align_gps_week, read_inclination
 from station.readers.scan import ScanReader
 from station.readers.sop import read_matrix, valid_sop

@@ -46,8 +46,8 @@ from station.processing.usable_inputs import usable_site
 from station.products.overview import Overview
 from station.quantities import Bools, Measurement, Quality, Reference, ScanGeometry, VarianceComponents
 from station.queries.aggregates import LEVERAGE_VARIABLES
-from station.readers.conversion import open_site_scan
 from station.readers.flags import read_flags, reasons_for
+from station.readers.formats.conversion import open_site_scan
 from station.readers.polygons import cells_inside, read_polygons
 from station.readers.raster import read_geotiff
 from station.readers.scan import ScanReader, reject_future, utc_interval

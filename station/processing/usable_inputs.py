@@ -56,7 +56,7 @@ def usable_site(site: Site, *, save: bool = False) -> Site:
         return read_polygons(path, site.map.crs)
 
     def to_text(path: Path) -> Serialise | None:
-        """A layer consists of several files, or is told by its suffix: its copy is a GeoJSON."""
+        """A layer consists of several files, or is known by its suffix: its copy is a GeoJSON."""
         if path.suffix.lower() not in LAYER_SUFFIXES:
             return None
         return lambda polygons: to_geojson(polygons, site.map.crs).encode()

@@ -1,8 +1,8 @@
 """The dialects of weather logs: where their header is, how their columns are called, and in which units.
 
 Sources: Campbell Scientific, TOA5; MeteoIO, SMET 1.1; DWD Climate Data Center, 10 minutes and hourly;
-MeteoSwiss, open data of SwissMetNet; Davis, WeatherLink; Onset, HOBOware; Lufft, UMB Config Tool; GeoSphere
-Austria, Data Hub.
+MeteoSwiss, open data of SwissMetNet; Davis, WeatherLink; HOBO loggers, HOBOware; Lufft, UMB Config Tool;
+GeoSphere Austria, Data Hub.
 """
 
 from __future__ import annotations

@@ -27,7 +27,7 @@ from station.logs import log_to_stderr, logfmt
 from station.monitoring.metrics import Metrics
 from station.monitoring.preconditions import EARLIEST_S, clock_problem, require_disk_space
 from station.processing import fork_server, isolation
-from station.readers.conversion import scan_suffixes
+from station.readers.formats.conversion import scan_suffixes
 from station.service.inbox_watcher import InboxWatcher
 from station.service.scheduler import JobScheduler, LoopEvent
 from station.service.systemd import SystemdNotifier

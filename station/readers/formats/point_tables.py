@@ -33,7 +33,7 @@ Table = dict[str, NDArray[Any]]  # columns (n,) by the names of FIELDS; x, y and
 MAX_COORDINATE_M = 1e8  # no map of the Earth is larger
 SURVEY_POINTS = 16_384  # read at a time when a file is opened
 TRACK_SAMPLES = 1000  # of the azimuth of the head
-UNKNOWN_COUNT_STEP = 64  # points between samples if the number of points is not known beforehand
+UNKNOWN_COUNT_STEP = 64  # points between samples if a file does not state their number
 # The largest value of an intensity that a format does not limit itself: fractions, 8, 12 and 16 bits.
 FULL_SCALES = (1.0, 255.0, 4095.0, float(MAX_INTENSITY))
 PTS_LIMITS = (-2048.0, 2047.0)  # of the intensity of Leica's PTS files

@@ -16,7 +16,7 @@ import numpy as np
 
 from station.errors import NotReadyError, ScanError
 from station.quantities import Floats
-from station.readers.point_tables import Contents, Table, TableScan
+from station.readers.formats.point_tables import Contents, Table, TableScan
 from station.readers.scan import gps_to_utc
 
 CARTESIAN = ("cartesianX", "cartesianY", "cartesianZ")

@@ -11,8 +11,8 @@ from typing import BinaryIO, ClassVar
 import numpy as np
 
 from station.errors import ScanError
-from station.readers.point_records import Layout, read_header_line, record_tables
-from station.readers.point_tables import Contents, Table, TableScan, field_of
+from station.readers.formats.point_records import Layout, read_header_line, record_tables
+from station.readers.formats.point_tables import Contents, Table, TableScan, field_of
 
 TYPES = {
     "char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1", "short": "i2", "int16": "i2", "ushort": "u2",

@@ -9,13 +9,12 @@ from datetime import UTC, datetime
 
 import numpy as np
 import pytest
+from readers.conftest import TURN_RAD_S, sweep
 
 from station.errors import NotReadyError, ScanError
-from station.readers.conversion import open_site_scan, scan_suffixes
+from station.readers.formats.conversion import open_site_scan, scan_suffixes
 from station.readers.scan import open_scan, suffixes, utc_interval
 from station.sections import ScansSection
-
-from .conftest import TURN_RAD_S, sweep
 
 COUNT = 3000
 RANGE_MAX_M = 1000.0
@@ -475,7 +474,7 @@ def test_compressed_files_are_read_like_others_and_leave_nothing(tmp_path, write
 
 
 def test_a_gzip_bomb_is_refused(tmp_path, monkeypatch):
-    monkeypatch.setattr("station.readers.conversion.MIN_LIMIT_BYTES", 1 << 22)
+    monkeypatch.setattr("station.readers.formats.conversion.MIN_LIMIT_BYTES", 1 << 22)
     bomb = tmp_path / "a.xyz.gz"
     bomb.write_bytes(gzip.compress(bytes(1 << 25)))
     with (

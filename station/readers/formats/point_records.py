@@ -11,8 +11,8 @@ from typing import BinaryIO
 import numpy as np
 
 from station.errors import ScanError
-from station.readers.point_tables import Table
-from station.readers.point_text import parse_rows
+from station.readers.formats.point_tables import Table
+from station.readers.formats.point_text import parse_rows
 
 MAX_HEADER_LINE = 4096  # bytes
 MIN_TEXT_BYTES = 2  # of a number and what separates it from the next

@@ -11,7 +11,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from station.errors import NotReadyError, ScanError
-from station.readers.point_tables import Contents, Table, TableScan
+from station.readers.formats.point_tables import Contents, Table, TableScan
 
 XYZ = "riegl.xyz"
 # Attributes that are read if they are there, with what they hold; targets are counted from 1.

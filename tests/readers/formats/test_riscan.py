@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from station.errors import ConfigError
-from station.readers.riscan import read_project
+from station.readers.formats.riscan import read_project
 
 SOP = "1 0 0 10  0 1 0 20  0 0 1 1.5  0 0 0 1"
 POSITION = """

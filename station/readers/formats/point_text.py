@@ -13,7 +13,7 @@ import numpy as np
 
 from station.errors import ScanError
 from station.quantities import Floats
-from station.readers.point_tables import Contents, Table, TableScan, field_of
+from station.readers.formats.point_tables import Contents, Table, TableScan, field_of
 
 MAX_LINE = 4096  # characters
 MAX_HEADER_LINES = 50

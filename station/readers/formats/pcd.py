@@ -12,8 +12,8 @@ from typing import BinaryIO, ClassVar
 import numpy as np
 
 from station.errors import ScanError
-from station.readers.point_records import Layout, read_header_line, record_tables
-from station.readers.point_tables import Contents, Table, TableScan, field_of
+from station.readers.formats.point_records import Layout, read_header_line, record_tables
+from station.readers.formats.point_tables import Contents, Table, TableScan, field_of
 
 KINDS = {"I": "i", "U": "u", "F": "f"}
 MAX_HEADER_LINES = 100

@@ -8,7 +8,7 @@ import pytest
 
 from station.errors import InconclusiveError, NotReadyError, ScanError
 from station.processing.isolation import run_isolated
-from station.readers.conversion import convert, open_site_scan
+from station.readers.formats.conversion import convert, open_site_scan
 from station.sections import ScansSection
 
 COPY = "import shutil, sys; shutil.copy(sys.argv[1], sys.argv[2])"
