@@ -69,9 +69,37 @@ def foreign(path, points):
     return las(path / "plain.laz", points).rename(path / "a.rxp")
 
 
+def copc(path, points):
+    copclib = pytest.importorskip("copclib")
+    config = copclib.CopcConfigWriter(
+        6, copclib.Vector3(*[0.0001] * 3), copclib.Vector3(WEST_M, SOUTH_M, 0.0)
+    )
+    low_m, high_m = points.xyz_m.min(axis=1) - 0.001, points.xyz_m.max(axis=1) + 0.001
+    config.las_header.min, config.las_header.max = copclib.Vector3(*low_m), copclib.Vector3(*high_m)
+    writer = copclib.FileWriter(str(path / "a.copc.laz"), config)
+    order = np.random.default_rng(1).permutation(COUNT)  # by level, not by time
+    for key, indices in (
+        ((0, 0, 0, 0), order[:500]),
+        ((1, 0, 0, 0), order[500:9000]),
+        ((1, 1, 0, 0), order[9000:]),
+    ):
+        node = copclib.Points(writer.copc_config.las_header)
+        for index in indices.tolist():
+            point = node.CreatePoint()
+            point.x, point.y, point.z = points.xyz_m[:, index].tolist()
+            point.gps_time, point.intensity = float(points.time_s[index]), int(points.intensity[index])
+            point.return_number = int(points.return_number[index])
+            point.number_of_returns = int(points.number_of_returns[index])
+            node.AddPoint(point)
+        writer.AddNode(copclib.VoxelKey(*key), node)
+    writer.Close()
+    return path / "a.copc.laz"
+
+
 COPY = [sys.executable, "-c", "import shutil, sys; shutil.copy(*sys.argv[1:3])", "{in}", "{out}"]
 FORMATS = {
     "laz": (lambda path, points: las(path / "a.laz", points), ""),
+    "copc": (copc, ""),
     "laz.gz": (packed, ""),
     "e57": (lambda path, points: written.e57_file(path / "a.e57", points), ""),
     "ply": (lambda path, points: written.ply_file(path / "a.ply", points), ""),
