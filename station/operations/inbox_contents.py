@@ -33,7 +33,7 @@ CONVERTED = {
 
 def inbox_findings(site: Site) -> Iterator[LevelAndMessage]:
     """Yield what of the inbox is not read, and the lines that would let it in."""
-    files = list(_files(site.scans.inbox))
+    files = list(files_below(site.scans.inbox))
     known = scan_suffixes(site.scans)
     scans = [path for path in files if is_scan(path.name, known) and path.parent == site.scans.inbox]
     yield from _other_formats(
@@ -47,7 +47,7 @@ def inbox_findings(site: Site) -> Iterator[LevelAndMessage]:
     yield from _names(site, scans or deeper)
 
 
-def _files(folder: Path) -> Iterator[Path]:
+def files_below(folder: Path) -> Iterator[Path]:
     """Yield the files of a folder and those below it, by their names; hidden ones are left out."""
     count = 0
     for parent, folders, names in os.walk(folder):

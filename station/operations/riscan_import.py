@@ -18,6 +18,11 @@ from station.science.geometry import pose
 DEFAULT_EXTENT_M = 100.0  # of the grid, if the project does not tell how far its scans reach
 CELLS = 500  # along the grid, about
 MAX_NAME = 32  # characters of a station's id
+SCANS = [
+    'inbox = "inbox"                       # check: where the scans arrive',
+    'name = "%y%m%d_%H%M%S"                # start of the scan, in the time of the scanner\'s clock',
+    'zone = "UTC"                          # check: the zone of that clock, such as "Europe/Vienna"',
+]
 UTM_NORTH, UTM_SOUTH = 32600, 32700  # EPSG, plus the zone
 
 
@@ -27,14 +32,18 @@ def import_riscan(project_path: Path, folder: Path) -> list[Path]:
     Raises ConfigError if the project cannot be read or a file exists: nothing is overwritten.
     """
     project = read_project(project_path)
-    matrices = {f"{_file_stem(position.name)}-SOP.dat": position.sop for position in project.positions}
+    matrices = {f"{file_stem(position.name)}-SOP.dat": position.sop for position in project.positions}
     if len(matrices) < len(project.positions):
         raise ConfigError(f"{project_path}: two scan positions have the same name: rename one")
     if project.pop is not None:
         matrices["POP.dat"] = project.pop
-    site_path = folder / "site.toml"
-    texts = {site_path: _site_text(project)}
-    texts |= {folder / name: _matrix_text(matrix) for name, matrix in matrices.items()}
+    texts = {folder / "site.toml": site_text(f"the RiSCAN project {project.name}", project, SCANS)}
+    texts |= {folder / name: matrix_text(matrix) for name, matrix in matrices.items()}
+    return write_new(folder, texts)
+
+
+def write_new(folder: Path, texts: dict[Path, str]) -> list[Path]:
+    """Write files and the schema of the site file to a folder; raise ConfigError if one exists."""
     existing = [path for path in texts if path.exists()]
     if existing:
         raise ConfigError(f"{existing[0]}: already exists; nothing is overwritten")
@@ -48,44 +57,48 @@ def import_riscan(project_path: Path, folder: Path) -> list[Path]:
     return list(texts)
 
 
-def _file_stem(name: str) -> str:
+def file_stem(name: str) -> str:
+    """Return a name that can be part of a file name."""
     return re.sub(r"[^A-Za-z0-9_-]", "_", name) or "position"
 
 
-def _matrix_text(matrix: Floats) -> str:
+def matrix_text(matrix: Floats) -> str:
+    """Return a matrix as four rows of numbers."""
     return "\n".join(" ".join(f"{value:.15g}" for value in row) for row in matrix) + "\n"
 
 
-def _site_text(project: Project) -> str:
-    """Return the site file of a project; what it cannot tell is marked with `check:`."""
-    ident = _file_stem(project.name)[:MAX_NAME].strip("_-") or "station"
+def site_text(source: str, project: Project, scans: list[str], more: list[str] | None = None) -> str:
+    """Return a site file; `scans` are the lines of its table, `more` those of tables after the others.
+
+    What the project cannot tell is marked with `check:`.
+    """
+    ident = file_stem(project.name)[:MAX_NAME].strip("_-") or "station"
     return "\n".join(
         [
             f"#:schema ./{SCHEMA_NAME}",
-            f"# From the RiSCAN project {project.name}. Mind the lines with `check:`; then station check.",
+            f"# From {source}. Mind the lines with `check:`; then station check.",
             "",
             "[station]",
             f'id = "{ident}"',
             'data = "data"',
             "",
             "[scans]",
-            'inbox = "inbox"                       # check: where the scans arrive',
-            'name = "%y%m%d_%H%M%S"                # start of the scan, in the time of the scanner\'s clock',
-            'zone = "UTC"                          # check: the zone of that clock, such as "Europe/Vienna"',
+            *scans,
             "",
             *_scanner_lines(project),
             *_sop_lines(project),
             *_map_lines(project),
             *_air_lines(project),
+            *(more or []),
         ]
     )
 
 
 def _scanner_lines(project: Project) -> list[str]:
     name = next((position.instrument for position in project.positions if position.instrument), "")
-    model = scanner_model(name)
+    model = scanner_model(name) if project.positions else "riegl-vz-6000"
     if model is not None:
-        return ["[scanner]", f'model = "{model}"', ""]
+        return ["[scanner]", f'model = "{model}"              # check', ""]
     keys = [f"{key} = {value:g}" for key, value in SCANNERS["riegl-vz-400i"].items()]
     note = "# check: not in the table of scanners: these are the values of a VZ-400i"
     return ["[scanner]", f'model = "{name or "unknown"}"', note, *keys, ""]
@@ -99,9 +112,9 @@ def _sop_lines(project: Project) -> list[str]:
         mark = "# " if start in starts else ""  # two SOPs must not begin together
         starts.add(start)
         lines += [
-            f"{mark}[[sop]]{'' if position.start_utc else '   # check: no scan of the project dates it'}",
+            f"{mark}[[sop]]{'' if position.start_utc else '   # check: from when it holds'}",
             f"{mark}from = {start}",
-            f'{mark}file = "{_file_stem(position.name)}-SOP.dat"',
+            f'{mark}file = "{file_stem(position.name)}-SOP.dat"',
         ]
         lines += [f'{mark}scan = "{position.first_scan}"'] if position.first_scan else []
         lines += [""]
@@ -109,10 +122,12 @@ def _sop_lines(project: Project) -> list[str]:
 
 
 def _map_lines(project: Project) -> list[str]:
-    """Return map and grid: around the scanner of the last position, as far as its scans reach."""
+    """Return map and grid: around the scanner of the last position, if any, as far as its scans reach."""
+    if not project.positions:
+        return []
     position = project.positions[-1]
     east_m, north_m = (float(value) for value in position.sop[:2, 3])
-    lines = ["# check: the project has no POP: the map is its own frame, see docs/how-to/sop.md"]
+    lines = ["# check: there is no POP: the map is the frame of the SOP, see docs/how-to/sop.md"]
     if project.pop is not None:
         crs, east_m, north_m = _utm_position(project.pop, position)
         crs_line = f'crs = "{crs}"                    # check: or the CRS of your maps'

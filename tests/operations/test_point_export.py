@@ -34,7 +34,7 @@ def processed(tmp_path_factory):
 
 def test_clouds_give_the_stored_change(processed, tmp_path):
     site = read_site(processed / "site.toml")
-    grid, epochs = site.grid_cells, station.open(processed)
+    grid, epochs = site.grid_cells, station.open(processed / "data")
     with netCDF4.Dataset(processed / "data" / "reference.nc") as file:
         surface_m = np.ma.filled(file["reference_elevation"][:].astype(float), np.nan)
         mean_residual_m = np.ma.filled(file["reference_mean_residual"][:].astype(float), np.nan)
