@@ -41,6 +41,7 @@ COMMANDS = (
 for command in COMMANDS:
     app.command()(command)
 app.add_typer(sop.app, name="sop")
+app.add_typer(sop.import_app, name="import")
 app.add_typer(alarms.app, name="alarms")
 
 

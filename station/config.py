@@ -79,6 +79,8 @@ class Site(SiteFile):
                 "reference": True,
             },
         )
+        if self.scans.convert or self.scans.columns:  # without them, the hash is that of earlier versions
+            settings["scans"] |= self.scans.model_dump(mode="json", include={"columns", "convert"})
         if self.map.pop:
             settings["pop"] = _sha256(self.map.pop)
         if isinstance(self.adjustment.stable, Path):
@@ -93,7 +95,8 @@ class Site(SiteFile):
         settings = self.model_dump(
             mode="json",
             include={
-                "scans": {"frame", "name", "point_time", "intensity", "timeout_s"},
+                "scans": {"frame", "name", "zone", "columns", "convert", "point_time", "intensity"}
+                | {"timeout_s"},
                 "service": {"memory_gb"},
                 **dict.fromkeys(
                     ("scanner", "sop", "map", "grid", "inclination", "weather", "air", "adjustment",

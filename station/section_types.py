@@ -5,8 +5,11 @@ from __future__ import annotations
 import re
 from datetime import UTC, datetime
 from typing import Annotated, Any
+from zoneinfo import ZoneInfo, ZoneInfoNotFoundError
 
 from pydantic import AfterValidator, AwareDatetime, BaseModel, ConfigDict, Field
+
+from station.scan_names import start_in_name
 
 Positive = Annotated[float, Field(gt=0)]
 NotNegative = Annotated[float, Field(ge=0)]
@@ -48,11 +51,22 @@ def require_time_pattern(pattern: str) -> str:
     time = datetime(2025, 7, 15, 13, 14, 15, tzinfo=UTC)
     try:
         datetime.strptime(time.strftime(pattern), pattern)  # noqa: DTZ007 - the pattern may contain a zone
+        if start_in_name(time.strftime(pattern), pattern) is None:
+            raise ValueError("a name written by it does not match it")  # noqa: TRY301 - as those of strptime
     except (ValueError, re.error, OverflowError) as error:
         raise ValueError(f"not a pattern of times, such as %y%m%d_%H%M%S: {error}") from error
     return pattern
 
 
+def _require_zone(zone: str) -> str:
+    try:
+        ZoneInfo(zone)
+    except (ZoneInfoNotFoundError, ValueError, OSError) as error:
+        raise ValueError('no time zone: give its name, such as "Europe/Vienna", or "UTC"') from error
+    return zone
+
+
+Zone = Annotated[str, AfterValidator(_require_zone)]
 Utc = Annotated[AwareDatetime, AfterValidator(_in_utc)]
 
 

@@ -13,7 +13,8 @@ from typing import Annotated, Any, Literal
 from pydantic import AfterValidator, ConfigDict, Field, model_validator
 
 from station.quantities import Air, IntensityScale, Scanner
-from station.scanners import SCANNERS
+from station.scan_names import ZONE_MARK
+from station.scanners import SCANNERS, scanner_model
 from station.section_types import (
     Arm,
     NotNegative,
@@ -21,6 +22,7 @@ from station.section_types import (
     Positive,
     Section,
     Utc,
+    Zone,
     require_projected,
     require_time_pattern,
     without_required,
@@ -73,13 +75,31 @@ class ScansSection(Section):
 
     inbox: Path
     name: Annotated[str, AfterValidator(require_time_pattern)] = "%y%m%d_%H%M%S"
+    zone: Zone = "UTC"
     frame: Literal["scanner", "map"] = "scanner"
     point_time: Literal["auto", "none"] = "auto"
     intensity: IntensityScale = "auto"
     settle_s: NotNegative = 60.0
     expected_every_s: Positive = 3600.0
+    suffix: Annotated[str, Field(pattern=r"^(\.[A-Za-z0-9]+){1,2}$")] | None = None
+    columns: tuple[str, ...] = ()
+    convert: tuple[str, ...] | None = None
     polling: bool = False
     timeout_s: Positive = 1800.0
+
+    @property
+    def pattern(self) -> str:
+        """The pattern of the names with the time zone of their times (see `scan_names.start_in_name`)."""
+        return self.name if self.zone == "UTC" else f"{self.name}{ZONE_MARK}{self.zone}"
+
+    @model_validator(mode="after")
+    def _conversion_is_complete(self) -> ScansSection:
+        if self.convert is not None and self.suffix is None:
+            raise ValueError('convert needs suffix, that of the files to convert, such as ".rxp"')
+        missing = [word for word in ("{in}", "{out}") if word not in " ".join(self.convert or (word,))]
+        if missing:
+            raise ValueError(f"convert lacks {' and '.join(missing)}, which stand for scan and LAZ file")
+        return self
 
 
 class ScannerSection(Section):
@@ -103,15 +123,16 @@ class ScannerSection(Section):
     def _fill_from_model(cls, values: Any) -> Any:  # noqa: ANN401 - any TOML value
         if not isinstance(values, dict) or not isinstance(values.get("model", ""), str):
             return values  # pydantic reports the types
-        model = values.get("model", "riegl-vz-6000")
+        given = values.get("model", "riegl-vz-6000")
+        model = scanner_model(given) or given
         known = SCANNERS.get(model, {})
         missing = set(SCANNERS["riegl-vz-6000"]) - set(values)
         if not known and missing:
             raise ValueError(
-                f"unknown scanner {model!r}: choose from {', '.join(SCANNERS)},"
+                f"unknown scanner {given!r}: choose from {', '.join(SCANNERS)},"
                 f" or give {', '.join(sorted(missing))}"
             )
-        return {**known, **values}
+        return {**known, **values, "model": model}
 
     @property
     def instrument(self) -> Scanner:
@@ -206,23 +227,49 @@ class InclinationSection(Section):
 
 
 class WeatherColumns(Section):
-    """Column names of the weather log."""
+    """Column names of the weather log; those of the dialect where none is given."""
 
-    time: str = "TIMESTAMP"
-    temperature_c: str
-    humidity_pct: str
-    pressure_hpa: str
+    time: str | Annotated[tuple[str, ...], Field(min_length=1)] | None = None
+    temperature_c: str | None = None
+    humidity_pct: str | None = None
+    pressure_hpa: str | None = None
+
+
+class WeatherUnits(Section):
+    """Units of the weather log that it does not state itself."""
+
+    temperature_c: Literal["C", "F", "K"] | None = None
+    humidity_pct: Literal["%", "fraction"] | None = None
+    pressure_hpa: Literal["hPa", "kPa", "Pa", "bar", "inHg", "mmHg"] | None = None
+
+
+WeatherFormat = Literal["toa5", "csv", "smet", "dwd", "meteoswiss", "davis", "hobo", "lufft", "geosphere"]
 
 
 class WeatherSection(Section):
     """The station's weather log."""
 
     file: Path
-    format: Literal["toa5", "csv"] = "toa5"
-    columns: WeatherColumns
+    format: WeatherFormat = "toa5"
+    columns: WeatherColumns | None = None
+    names: tuple[str, ...] = ()
+    units: WeatherUnits | None = None
+    time_format: str | None = None
+    zone: Zone | None = None
     max_age_s: Positive = 3600.0
     wait_s: NotNegative = 900.0
     utc_offset_h: Annotated[float, Field(ge=-14, le=14)] = 0.0
+
+    @model_validator(mode="after")
+    def _columns_are_known(self) -> WeatherSection:
+        if self.format in {"toa5", "csv"}:
+            given = self.columns.model_dump(exclude_none=True) if self.columns else {}
+            missing = [key for key in ("temperature_c", "humidity_pct", "pressure_hpa") if key not in given]
+            if missing:
+                raise ValueError(f'format = "{self.format}" needs columns.{", columns.".join(missing)}')
+        if self.zone is not None and self.utc_offset_h:
+            raise ValueError("zone and utc_offset_h both say what the clock of the logger shows: keep one")
+        return self
 
 
 class AirValues(Section):

@@ -15,11 +15,24 @@ from station.commands._options import Json, SiteArgument
 def init(
     folder: Annotated[Path, typer.Argument(metavar="DIR", help="Where to write it.", show_default=False)],
     like: Annotated[str, typer.Option(help="hef: glacier, VZ-6000. mammoth: snow field, VZ-400i.")] = "hef",
+    source: Annotated[
+        Path | None,
+        typer.Option(
+            "--from",
+            metavar="FOLDER",
+            help="Write it for the scans, logs and matrices in this folder.",
+            exists=True,
+            file_okay=False,
+            show_default=False,
+        ),
+    ] = None,
 ) -> None:
     """Write a commented site file to start from."""
     from station.config import write_site
+    from station.operations.site_proposal import propose_site
 
-    print(write_site(folder, like))
+    for path in [write_site(folder, like)] if source is None else propose_site(source, folder):
+        print(path)
 
 
 def check(

@@ -25,6 +25,7 @@ class ExportFormat(StrEnum):
     geotiff = "geotiff"
     csv = "csv"
     stac = "stac"
+    points = "points"
     netcdf = "netcdf"
     zarr = "zarr"
     references = "references"
@@ -32,7 +33,12 @@ class ExportFormat(StrEnum):
     erddap = "erddap"
 
 
-OF_EPOCHS = {ExportFormat.geotiff, ExportFormat.csv, ExportFormat.stac}  # the others are of the series
+OF_EPOCHS = {
+    ExportFormat.geotiff,
+    ExportFormat.csv,
+    ExportFormat.stac,
+    ExportFormat.points,
+}  # the others are of the series
 
 
 class ExportPeriod(StrEnum):
@@ -58,7 +64,7 @@ def export(
     kind: Annotated[
         ExportFormat,
         typer.Argument(
-            metavar="geotiff|csv|stac|netcdf|zarr|references|ncml|erddap",
+            metavar="geotiff|csv|stac|points|netcdf|zarr|references|ncml|erddap",
             help="The format.",
             show_default=False,
         ),
@@ -104,6 +110,8 @@ def export(
     references, ncml and erddap describe it for the cloud and for data servers, without a copy.
     geotiff, stac and csv: the newest epoch, or those of a span; change and its uncertainty as GeoTIFF with
     QGIS styles, a STAC catalogue of these, or scans and areas as CSV.
+    points: the scans of these epochs as LAZ, corrected, on the map, each point with change, sigma and quality
+    of its cell.
     """
     from station.config import read_site
     from station.products.area_tables import Span
@@ -119,6 +127,12 @@ def export(
         ("--every", every), ("--area", area), ("--variables", variables), ("--chunks", chunks), ("--url", url)
     ) if value is not None]:  # fmt: skip
         raise typer.BadParameter(f"{given[0]} is for the series, not for {kind.value}")
+    if kind is ExportFormat.points:
+        from station.operations.point_export import export_points
+
+        for path in export_points(settings, span if first or last else None, out, progress_bar("writing")):
+            print(path)
+        return
     for path in write_files(
         settings, kind.value, span if first or last else None, out, progress_bar("writing")
     ):

@@ -1,4 +1,4 @@
-"""`station sop solve` and `station sop show`."""
+"""`station sop solve`, `station sop show`, and `station import riscan`, which begins with SOPs."""
 
 from __future__ import annotations
 
@@ -13,6 +13,11 @@ from station.commands._options import Json
 
 app = typer.Typer(
     help="Solve an SOP from points and planes; inspect one.",
+    no_args_is_help=True,
+    rich_markup_mode=None,
+)
+import_app = typer.Typer(
+    help="Begin with what other programs wrote.",
     no_args_is_help=True,
     rich_markup_mode=None,
 )
@@ -78,3 +83,28 @@ def show(
         if json_
         else "\n".join(format_pose(pose) for pose in poses)
     )
+
+
+@import_app.callback()
+def _group() -> None:
+    """Keep `riscan` a command of its own."""
+
+
+@import_app.command()
+def riscan(
+    project: Annotated[
+        Path,
+        typer.Argument(metavar="PROJECT", help="The project folder or its .rsp file.", show_default=False),
+    ],
+    folder: Annotated[
+        Path, typer.Argument(metavar="DIR", help="Where to write the files.", show_default=False)
+    ],
+) -> None:
+    """Write SOPs, POP and a first site file from a RiSCAN PRO project.
+
+    SOPs begin with the first scan of their position. Lines of the site file that say `check:` need your eyes.
+    """
+    from station.operations.riscan_import import import_riscan
+
+    for path in import_riscan(project, folder):
+        print(path)

@@ -18,7 +18,6 @@ import stat
 import time
 from dataclasses import dataclass
 from datetime import UTC, datetime
-from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -27,6 +26,7 @@ from station.inbox.file_hash import sample_file
 from station.inbox.journal import LONGEST_RETRY_S
 from station.inbox.journal_reader import UNFINISHED, State
 from station.logs import logfmt
+from station.scan_names import scan_stem, start_in_name
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Mapping
@@ -102,7 +102,7 @@ class Inbox:
         now_s: Callable[[], float] = time.time,
     ) -> None:
         self._folder = site.scans.inbox
-        self._pattern = site.scans.name
+        self._pattern = site.scans.pattern
         self._settle_s = site.scans.settle_s
         self._max_live_s = MAX_LIVE_INTERVALS * site.scans.expected_every_s
         self._inclination = site.inclination
@@ -122,7 +122,8 @@ class Inbox:
         """
         files = list_folder(self._folder)
         summaries = self._journal.summaries()
-        scans = {name: status for name, status in files.items() if is_scan(name, self._suffixes)}
+        log_suffix = self._inclination.suffix if self._inclination else ""
+        scans = {name: status for name, status in files.items() if is_scan(name, self._suffixes, log_suffix)}
         new = len({safe_name(name) for name in scans} - summaries.keys())
         stable: list[ScanFile] = []
         to_precheck: ScanFile | None = None
@@ -245,7 +246,7 @@ class Inbox:
         return _identity(status) if status is not None and is_usable else ()
 
     def _log_name(self, name: str) -> str | None:
-        return f"{Path(name).stem}{self._inclination.suffix}" if self._inclination else None
+        return f"{scan_stem(name)}{self._inclination.suffix}" if self._inclination else None
 
     def _retry_delay_s(self, status: os.stat_result, summary: EntrySummary | None) -> float:
         """Return the time until a deferred scan is tried again [s]; 0 if it can be tried now."""
@@ -293,9 +294,13 @@ def list_folder(folder: Path) -> dict[str, os.stat_result]:
     return files
 
 
-def is_scan(name: str, suffixes: tuple[str, ...]) -> bool:
-    """Return True if a file name is that of a scan; hidden files are transfers in progress."""
-    return name.lower().endswith(suffixes) and not name.startswith(".")
+def is_scan(name: str, suffixes: tuple[str, ...], log_suffix: str = "") -> bool:
+    """Return True if a file name is that of a scan; hidden files are transfers in progress.
+
+    `log_suffix` is that of inclination logs, which may end like scans in text.
+    """
+    is_log = bool(log_suffix) and name.endswith(log_suffix)
+    return name.lower().endswith(suffixes) and not name.startswith(".") and not is_log
 
 
 def safe_name(name: str) -> str:
@@ -334,13 +339,9 @@ def _identity(status: os.stat_result) -> tuple[int, ...]:
     return status.st_ino, status.st_size, status.st_mtime_ns
 
 
-@lru_cache(maxsize=1 << 16)
 def start_from_name(name: str, pattern: str) -> datetime:
     """Return the start of a scan according to its name; datetime.max (sorted last) if the name has none."""
-    try:
-        return datetime.strptime(Path(name).stem, pattern).replace(tzinfo=UTC)
-    except ValueError:
-        return datetime.max.replace(tzinfo=UTC)
+    return start_in_name(name, pattern) or datetime.max.replace(tzinfo=UTC)
 
 
 def _is_open_for_writing(scan: ScanFile) -> bool:

@@ -7,6 +7,7 @@ from pathlib import Path
 
 from station.config import Site
 from station.inbox.inbox import ScanFile
+from station.scan_names import scan_stem
 
 
 def scan_file(site: Site, path: Path) -> ScanFile:
@@ -41,5 +42,5 @@ def archive_path(archive: Path, name: str, start_utc_s: float) -> Path:
 def _log_path(site: Site, scan: Path) -> Path | None:
     if site.inclination is None:
         return None
-    log_path = scan.with_name(f"{scan.stem}{site.inclination.suffix}").absolute()
+    log_path = scan.with_name(f"{scan_stem(scan)}{site.inclination.suffix}").absolute()
     return log_path if log_path.is_file() and not log_path.is_symlink() else None

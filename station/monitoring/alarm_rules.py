@@ -22,7 +22,7 @@ from station.logs import logfmt
 from station.monitoring.alarm_state import Alarm
 from station.monitoring.area_curves import AreaCurve, read_curves
 from station.monitoring.preconditions import require_disk_space
-from station.readers.scan import suffixes
+from station.readers.formats.conversion import scan_suffixes
 from station.science.analysis.change_detection import ChangeDetections, detect_changes, threshold_sigmas
 from station.science.gridding.significance import SIGNIFICANT_SIGMAS
 from station.sections import AlarmsSection, ChangeAlarm
@@ -106,8 +106,9 @@ def _stalled(site: Site, rules: AlarmsSection, now_s: float) -> Iterator[Alarm]:
         waiting = [entry for entry in journal.waiting() if entry.state is State.WAITING]
         journaled = journal.summaries()
     stuck = sum(entry.first_seen_utc_s < from_s and not entry.waiting_reason for entry in waiting)
+    suffixes = scan_suffixes(site.scans)
     for name, file in list_folder(site.scans.inbox).items():  # ctime is the arrival: mtime may be older
-        stuck += is_scan(name, suffixes()) and safe_name(name) not in journaled and file.st_ctime < from_s
+        stuck += is_scan(name, suffixes) and safe_name(name) not in journaled and file.st_ctime < from_s
     if stuck:
         text = f"{stuck} scans wait, but none was processed for {rules.stalled_h:g} h: the service stalls"
         yield Alarm("stalled", text)

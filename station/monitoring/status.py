@@ -13,7 +13,7 @@ from station.inbox.journal_reader import Entry, JournalReader, State
 from station.inbox.lock import is_locked, pause_reason
 from station.monitoring.alarm_state import active
 from station.monitoring.preconditions import clock_problem, format_utc, require_disk_space
-from station.readers.scan import suffixes
+from station.readers.formats.conversion import scan_suffixes
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -73,7 +73,7 @@ def _queue_status(site: Site, journal: JournalReader, entries: list[Entry]) -> S
     ]
     inbox_problem = ""
     try:
-        known = suffixes()
+        known = scan_suffixes(site.scans)
         names = {safe_name(name) for name in list_folder(site.scans.inbox) if is_scan(name, known)}
     except NotReadyError as error:
         names, inbox_problem = set(), str(error)

@@ -14,12 +14,13 @@ import numpy as np
 from station.archive.atomic_files import atomic_write
 from station.config import Site
 from station.errors import ScanError, StoreError
+from station.inbox.inbox import is_scan
 from station.processing.site_files import series_for
 from station.processing.workers import isolation
 from station.quantities import Floats
 from station.queries.box_series import box_statistics
 from station.queries.stable_ground import validate_sigma
-from station.readers.scan import open_scan, suffixes
+from station.readers.formats.conversion import open_site_scan, scan_suffixes
 from station.science.analysis.precision import (
     AnglePrecision,
     RangeModel,
@@ -80,11 +81,8 @@ def sigma_report(site: Site, max_epochs: int, progress: Progress) -> Calibration
 
 def _newest_scans(site: Site) -> list[Path]:
     inbox = site.scans.inbox
-    scans = (
-        sorted(path for path in inbox.iterdir() if path.suffix.lower() in suffixes())
-        if inbox.is_dir()
-        else []
-    )
+    known = scan_suffixes(site.scans)
+    scans = sorted(path for path in inbox.iterdir() if is_scan(path.name, known)) if inbox.is_dir() else []
     return scans[-COMPARED_SCANS:]
 
 
@@ -114,7 +112,9 @@ def _read_shots(site: Site, path: Path) -> tuple[Floats, Floats]:
     points: list[Floats] = []
     intensity: list[Floats] = []
     count = 0
-    with open_scan(path, range_max_m=site.scanner.range_max_m) as reader:
+    with open_site_scan(
+        path, site.scans, range_max_m=site.scanner.range_max_m, work_folder=site.station.data
+    ) as reader:
         for block in reader.blocks(intensity=site.scans.intensity):
             points.append(block.xyz_m.T)
             intensity.append(np.ones(len(block)) if block.intensity is None else block.intensity)

@@ -289,7 +289,7 @@ def _load_tilt_offset(site: Site, scan: ScanFile, progress: Tick) -> None:
     """Load the inputs of a scan, which saves the tilt offset of its SOP."""
     progress()
     with open_scan_for(site, scan.path) as reader:
-        start, end, _ = utc_interval(reader, site.scans.name)
+        start, end, _ = utc_interval(reader, site.scans.pattern)
         load_scan_inputs(site, reader, scan.log, start, end)
 
 

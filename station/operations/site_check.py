@@ -7,6 +7,7 @@ import os
 import shutil
 import time
 from collections.abc import Iterable, Iterator
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
@@ -14,11 +15,12 @@ import numpy as np
 from station.archive.reference_files import valid_versions
 from station.config import Site, read_site
 from station.errors import NotReadyError, ScanError, StationError
-from station.inbox.inbox import start_from_name
+from station.inbox.inbox import is_scan, start_from_name
 from station.inbox.journal_reader import JournalReader
 from station.inbox.lock import is_locked
 from station.inbox.scan_files import scan_file
 from station.monitoring.preconditions import EARLIEST_S
+from station.operations.inbox_contents import inbox_findings
 from station.operations.site_plausibility import (
     LevelAndMessage,
     alarm_findings,
@@ -36,10 +38,12 @@ from station.processing.scanner_pose import map_position, scanner_height_m, scan
 from station.processing.site_files import load_areas, polygon_cells, series_for
 from station.processing.workers import isolation
 from station.readers.flags import read_flags
+from station.readers.formats.conversion import scan_suffixes
 from station.readers.inclination import read_inclination
-from station.readers.scan import suffixes
+from station.readers.polygons import mended_outlines
 from station.readers.sop import valid_sop
-from station.readers.weather import interpolate_air, read_weather
+from station.readers.weather import interpolate_air, log_files, read_weather
+from station.scan_names import scan_stem
 from station.science.analysis.verdict import NO_BRIGHTNESS
 from station.science.geometry import inclination
 
@@ -56,6 +60,7 @@ def site_findings(site_path: Path) -> list[Finding]:
         *_sop_poses(site),
         *_polygons(site),
         *_folders(site),
+        *_named("inbox", inbox_findings(site)),
         *_named("rights", rights_findings(site, _files_read(site))),
         *_flags(site),
         *_clock(),
@@ -94,7 +99,9 @@ def _named(what: str, findings: Iterable[LevelAndMessage]) -> Iterator[Finding]:
 def _files_read(site: Site) -> list[Path]:
     """Return the files that the service reads, as far as they exist."""
     files = [site.path, *(sop.file for sop in site.sop), *_scans(site)[-1:]]
-    files += [section.file for section in (site.weather, site.areas, site.flags) if section]
+    files += [section.file for section in (site.areas, site.flags) if section]
+    with suppress(StationError):  # a finding of its own
+        files += log_files(site.weather.file)[-1:] if site.weather else []
     files += [
         path
         for path in (site.map.pop, site.adjustment.stable, site.reference.scans)
@@ -104,7 +111,7 @@ def _files_read(site: Site) -> list[Path]:
         files += [
             log
             for scan in _scans(site)[-1:]
-            if (log := scan.with_name(scan.stem + site.inclination.suffix)).exists()
+            if (log := scan.with_name(scan_stem(scan) + site.inclination.suffix)).exists()
         ]
     return files
 
@@ -146,7 +153,11 @@ def _sop_poses(site: Site) -> Iterator[Finding]:
 
 def _polygons(site: Site) -> Iterator[Finding]:
     """Yield the number of cells in each named polygon."""
+    files = [site.areas.file] if site.areas else []
+    files += [site.adjustment.stable] if isinstance(site.adjustment.stable, Path) else []
     try:
+        for message in (text for file in files for text in mended_outlines(file, site.map.crs)):
+            yield _finding("warning", "polygons", message)
         named = load_areas(site)
         areas = {f"area {name}": cells for name, cells in named.items()}
         if isinstance(site.adjustment.stable, Path) and site.adjustment.method == "joint":
@@ -204,12 +215,7 @@ def _weather(site: Site) -> Iterator[Finding]:
     if settings is None:
         return
     try:
-        log = read_weather(
-            settings.file,
-            format=settings.format,
-            columns=settings.columns,
-            utc_offset_h=settings.utc_offset_h,
-        )
+        log = read_weather(settings)
     except (ScanError, NotReadyError) as error:
         yield _finding("warning", "weather", str(error))
         return
@@ -237,9 +243,9 @@ def _inclination(site: Site) -> Iterator[Finding]:
     if site.inclination is None or site.inclination.mode == "absolute" or not scans or not site.sop:
         return
     try:
-        sop = valid_sop(site.sop, start_from_name(scans[-1].name, site.scans.name))
+        sop = valid_sop(site.sop, start_from_name(scans[-1].name, site.scans.pattern))
         rotation = scanner_to_map(site, sop).to_local[:3, :3]
-        log_path = scans[-1].with_name(scans[-1].stem + site.inclination.suffix)
+        log_path = scans[-1].with_name(scan_stem(scans[-1]) + site.inclination.suffix)
         log, _ = inclination.clean(read_inclination(log_path), site.instrument.inclination_range_rad)
     except StationError:
         return
@@ -262,8 +268,9 @@ def _newest_height_m(site: Site) -> float | None:
 
 def _scans(site: Site) -> list[Path]:
     """Return the scans in the inbox, by name; none if it cannot be read."""
+    known = scan_suffixes(site.scans)
     try:
-        return sorted(path for path in site.scans.inbox.iterdir() if path.suffix.lower() in suffixes())
+        return sorted(path for path in site.scans.inbox.iterdir() if is_scan(path.name, known))
     except OSError:  # a finding of its own
         return []
 

@@ -16,7 +16,7 @@ from station.errors import ConfigError, StoreError
 from station.quantities import Floats, Scanner
 from station.readers.sop import read_matrix
 from station.readers.tie_features import read_tie_features
-from station.scanners import SCANNERS
+from station.scanners import SCANNERS, scanner_model
 from station.science.geometry import pose
 from station.science.geometry.registration import POSE, Features, Registration, solve
 from station.science.uncertainty.point_covariance import shot_covariance
@@ -78,9 +78,10 @@ class SopSolution:
 
 def scanner_by_model(model: str) -> Scanner:
     """Return a scanner by its model; raise ConfigError if the model is unknown."""
-    if model not in SCANNERS:
+    known = scanner_model(model)
+    if known is None:
         raise ConfigError(f"--scanner {model}: unknown; choose one of {', '.join(SCANNERS)}")
-    return ScannerSection.model_validate({"model": model}).instrument
+    return ScannerSection.model_validate({"model": known}).instrument
 
 
 def solve_sop(

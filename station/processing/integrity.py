@@ -44,7 +44,7 @@ from station.inbox.scan_files import find_scan
 from station.processing.provenance import StoredEpoch, stored_epochs
 from station.processing.site_files import series_for
 from station.processing.workers.worker_process import Progress
-from station.readers.scan import suffixes
+from station.readers.formats.conversion import scan_suffixes
 
 
 @dataclass(frozen=True)
@@ -343,7 +343,7 @@ def _journal_entry(site: Site, stored: StoredEpoch) -> Entry:
 
 def _scan_filename(site: Site, stored: StoredEpoch) -> str:
     """Return the file name of the scan of an epoch, which stores only its stem."""
-    for suffix in suffixes():
+    for suffix in scan_suffixes(site.scans):
         name = stored.provenance.scan_id + suffix
         if find_scan(site, name, stored.provenance.start_s):
             return name

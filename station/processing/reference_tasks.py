@@ -38,6 +38,7 @@ from station.processing.site_files import exclusion_reason, open_scan_for, serie
 from station.processing.workers.worker_process import Progress
 from station.quantities import Reference, ScanGeometry, VarianceComponents
 from station.readers.scan import utc_interval
+from station.scan_names import scan_stem
 from station.science.adjustment.joint import Adjustment
 from station.science.adjustment.variance_components import estimate_variance_components
 from station.science.gridding.gridder import Gridder
@@ -247,7 +248,7 @@ def _add_scan(
     Without a surface, add it to the grid in `shared`, which its first scan creates.
     """
     with open_scan_for(site, scan.path) as reader:
-        start, end, _ = utc_interval(reader, site.scans.name)
+        start, end, _ = utc_interval(reader, site.scans.pattern)
         inputs = load_scan_inputs(site, reader, scan.log, start, end)
         viewing = geometry_cache(inputs.geometry)
         gridder = shared[0] if shared else new_gridder(inputs.geometry, viewing)
@@ -260,7 +261,7 @@ def _add_scan(
         stack.add(gridder, stacking_inputs(gridder, viewing, adjustment), viewing.reference.roughness_m2)
     progress()
     provenance = ScanProvenance(
-        scan_id=scan.path.stem,
+        scan_id=scan_stem(scan.path),
         start_s=start.timestamp(),
         end_s=end.timestamp(),
         scan_sha256=sha256_file(scan.path),

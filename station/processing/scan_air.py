@@ -20,13 +20,8 @@ def air_from_log(section: WeatherSection, time_utc_s: float, height_m: float | N
     `height_m` is that of the scanner, None if it is unknown. Raises ScanError if the log or its pressure
     cannot be used, NotReadyError if the log cannot be read.
     """
-    log = read_weather(
-        section.file,
-        format=section.format,
-        columns=section.columns,
-        utc_offset_h=section.utc_offset_h,
-        window_utc_s=(time_utc_s - section.max_age_s, time_utc_s + section.max_age_s),
-    )
+    window_utc_s = time_utc_s - section.max_age_s, time_utc_s + section.max_age_s
+    log = read_weather(section, window_utc_s)
     air = interpolate_air(log, time_utc_s, section.max_age_s)
     if air is not None and (message := pressure_fault(air, height_m)):
         raise ScanError(message)

@@ -27,9 +27,11 @@ from station.quantities import (
     SharedParameters,
     VarianceComponents,
 )
+from station.readers.formats.conversion import open_site_scan
 from station.readers.inclination import align_gps_week, read_inclination
-from station.readers.scan import ScanReader, open_scan
+from station.readers.scan import ScanReader
 from station.readers.sop import valid_sop
+from station.scan_names import scan_stem
 from station.science.adjustment import prior
 from station.science.geometry import inclination
 from station.science.geometry.air import air_correction
@@ -90,7 +92,7 @@ def load_scan_inputs(
     if track is None and site.scans.point_time == "auto":
         warnings.append("no time per point: one mean tilt for the whole scan")
     rotation = transform.to_local[:3, :3]
-    log = _load_log(site, log_path, track, rotation, warnings)
+    log = _load_log(site, log_path or _converted_log(site, reader), track, rotation, warnings)
     faults = _static_tilt_faults(site, log)
     tilt_offset = read_tilt_offset(site, sop_id)
     if tilt_offset is None:
@@ -165,6 +167,14 @@ def _inputs_in_map_frame(site: Site, start_s: float) -> ScanInputs:
             weather_known=False,
         )
     return ScanInputs(geometry, Pose(None, None), log_only_covariance, adjustment_inputs, None, None, (), {})
+
+
+def _converted_log(site: Site, reader: ScanReader) -> Path | None:
+    """Return the inclination log that the command which converted a scan wrote next to it, None without."""
+    if site.scans.convert is None or site.inclination is None:
+        return None
+    path = reader.path.with_name(scan_stem(reader.path) + site.inclination.suffix)
+    return path if path.is_file() else None
 
 
 def _load_log(
@@ -299,7 +309,7 @@ def _find_tilt_offset(
         raise NotReadyError(
             f"waits for {waiting_before}: the first scan under an SOP defines its tilt offset"
         )
-    if sop.scan is not None and sop.scan != reader.path.stem:
+    if sop.scan is not None and sop.scan != scan_stem(reader.path):
         log, track = _load_earlier_log(site, sop.scan)
         if log is None:
             warnings.append(f"log of {sop.scan}, the scan of the SOP, not found: tilt not corrected")
@@ -315,7 +325,9 @@ def _load_earlier_log(site: Site, stem: str) -> tuple[InclinationLog | None, Azi
     scans = [path for path in site.scans.inbox.glob(f"{stem}.*") if path != log_path]
     if not log_path.is_file() or not scans:
         return None, None
-    with open_scan(scans[0], range_max_m=site.scanner.range_max_m) as reader:
+    with open_site_scan(
+        scans[0], site.scans, range_max_m=site.scanner.range_max_m, work_folder=site.station.data
+    ) as reader:
         track = reader.azimuth_track()
     log, _ = inclination.clean(read_inclination(log_path), site.instrument.inclination_range_rad)
     if track is not None and len(log.time_s):

@@ -52,6 +52,7 @@ from station.quantities import Bools, Reference, ScanGeometry, VarianceComponent
 from station.queries.aggregates import LEVERAGE_VARIABLES
 from station.readers.raster import read_geotiff
 from station.readers.scan import reject_future, utc_interval
+from station.scan_names import scan_stem
 from station.science.adjustment import ground_classes
 from station.science.adjustment.joint import Adjustment
 from station.science.analysis import inclination_check, verdict
@@ -193,7 +194,7 @@ def check_header(site: Site, scan: ScanFile, progress: Progress) -> None:
     """Raise ScanError if the headers of a scan show that it cannot be used."""
     progress()
     with open_scan_for(site, scan.path) as reader:
-        utc_interval(reader, site.scans.name)
+        utc_interval(reader, site.scans.pattern)
 
 
 def dry_run(site: Site, scan: ScanFile, progress: Progress) -> tuple[str, str, dict[str, float | str]]:
@@ -215,7 +216,7 @@ def _compute_epoch(
     is_dry_run: bool = False,
 ) -> epochs.Epoch:
     with open_scan_for(site, scan.path) as reader:
-        start, end, _ = utc_interval(reader, site.scans.name)
+        start, end, _ = utc_interval(reader, site.scans.pattern)
         reject_future(start, history.now_s)
         inputs = load_scan_inputs(
             site,
@@ -278,7 +279,7 @@ def _compute_epoch(
     return epochs.Epoch(
         start_s=start.timestamp(),
         end_s=end.timestamp(),
-        scan_id=scan.path.stem,
+        scan_id=scan_stem(scan.path),
         measurement=measurement,
         shared=shared,
         redundancy=adjustment[1].redundancy if adjustment else None,

@@ -16,8 +16,9 @@ from station.inbox.file_hash import sha256_file
 from station.inbox.inbox import ScanFile
 from station.quantities import Bools
 from station.readers.flags import read_flags, reasons_for
+from station.readers.formats.conversion import open_site_scan
 from station.readers.polygons import cells_inside, read_polygons
-from station.readers.scan import ScanReader, open_scan
+from station.readers.scan import ScanReader
 from station.science.geometry.pose import horizontal_crs, is_same_map
 
 
@@ -72,7 +73,8 @@ def load_areas(site: Site) -> dict[str, Bools]:
 def open_scan_for(site: Site, path: Path) -> Iterator[ScanReader]:
     """Yield a reader of a scan with the settings of the site; raises ScanError or NotReadyError."""
     range_max_m = site.scanner.range_max_m if site.scans.frame == "scanner" else None
-    with open_scan(path, range_max_m=range_max_m) as reader:
+    work_folder = site.station.data
+    with open_site_scan(path, site.scans, range_max_m=range_max_m, work_folder=work_folder) as reader:
         if site.scans.frame == "map" and site.map.crs and reader.header.crs_wkt:
             _require_same_map(reader.header.crs_wkt, site.map.crs)
         yield reader

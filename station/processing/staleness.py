@@ -20,6 +20,7 @@ from station.inbox.scan_files import find_scan
 from station.processing.provenance import CurrentConfig, ScanProvenance, StoredEpoch, stored_epochs
 from station.processing.site_files import file_version, series_for
 from station.processing.workers.worker_process import Progress
+from station.scan_names import scan_stem
 
 LATE_INPUTS = {"inclination log arrived later", "weather arrived later"}  # the service reprocesses these
 EPOCH_MISSING = "epoch damaged or missing"
@@ -163,7 +164,7 @@ def stale_versions(
     """Return the versions built with other settings or inputs, and those that build on them."""
     if isinstance(site.reference.scans, Path):
         return ()
-    by_stem = {Path(entry.name).stem: entry for entry in entries}
+    by_stem = {scan_stem(entry.name): entry for entry in entries}
     versions = valid_versions(series)
     for index, reference_provenance in enumerate(versions.values()):
         is_stale = reference_provenance.science_hash not in {"", site.science_hash}

@@ -11,7 +11,7 @@ from collections.abc import Callable
 from contextlib import suppress
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar
 
 from station.archive.atomic_files import atomic_write
 from station.config import Site
@@ -19,12 +19,13 @@ from station.errors import NotReadyError, ScanError, StationError, StoreError
 from station.processing.scan_air import air_from_log
 from station.processing.scanner_pose import scanner_height_m
 from station.readers.flags import read_flags
-from station.readers.polygons import read_polygons
+from station.readers.polygons import LAYER_SUFFIXES, read_polygons, to_geojson
 from station.readers.regular_file import open_regular
 from station.readers.sop import valid_sop
 
 T = TypeVar("T")
 Check = Callable[[Path], object]  # raises StationError if a file cannot be used
+Serialise = Callable[[Any], bytes]  # the content of a file's copy, from what its check returns
 
 MAX_BYTES = 1 << 26  # of an optional file; a polygon of a million corners has half of it
 
@@ -45,7 +46,7 @@ def usable_site(site: Site, *, save: bool = False) -> Site:
     def usable(key: str, path: Path, check: Check) -> Path | None:
         copy = site.last_good(key)
         try:
-            _check_and_save(path, copy, check, save=save)
+            _check_and_save(path, copy, check, save=save, serialise=to_text(path))
         except StationError as fault:
             exists = copy.is_file()
             faults.append(f"{fault}: {'its last good version is used' if exists else 'it is not used'}")
@@ -54,6 +55,12 @@ def usable_site(site: Site, *, save: bool = False) -> Site:
 
     def check_polygons(path: Path) -> object:
         return read_polygons(path, site.map.crs)
+
+    def to_text(path: Path) -> Serialise | None:
+        """A layer consists of several files, or is known by its suffix: its copy is a GeoJSON."""
+        if path.suffix.lower() not in LAYER_SUFFIXES:
+            return None
+        return lambda polygons: to_geojson(polygons, site.map.crs).encode()
 
     changes: dict[str, object] = {}
     if site.areas:
@@ -83,7 +90,7 @@ def weather_fault(site: Site) -> str:
     return ""
 
 
-def _check_and_save(path: Path, copy: Path, check: Check, *, save: bool) -> None:
+def _check_and_save(path: Path, copy: Path, check: Check, *, save: bool, serialise: Serialise | None) -> None:
     """Raise StationError if a file cannot be used; else, with `save`, bring its copy up to date."""
     try:
         with open_regular(path) as file:
@@ -92,7 +99,10 @@ def _check_and_save(path: Path, copy: Path, check: Check, *, save: bool) -> None
             raise StationError(f"{path}: larger than {MAX_BYTES >> 20} MB")
         if copy.is_file() and copy.read_bytes() == content:
             return
-        check(path)
+        checked = check(path)
+        if serialise is not None:
+            content = serialise(checked)
+            save = save and not (copy.is_file() and copy.read_bytes() == content)
     except OSError as error:
         raise StationError(f"{path}: cannot be read: {error.strerror}") from error
     except MemoryError as error:

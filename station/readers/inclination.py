@@ -11,18 +11,23 @@ from station.errors import ScanError
 from station.quantities import Floats, InclinationLog
 from station.readers.regular_file import open_regular
 from station.readers.scan import WEEK_S, decoder_errors
+from station.readers.weather_dialects import name_and_unit
 
 COLUMNS = ("time", "roll", "pitch")
+DELIMITERS = (";", "\t", ",")  # else white space
+UNITS = {"rad": 180 / np.pi, "mrad": 0.18 / np.pi, "ms": 1e-3}  # factors to degrees and seconds, if not these
 MAX_BYTES = 1 << 26  # 1 Hz for a month
 MAX_TIME_DIFFERENCE_S = 86_400.0  # from the median time of the log; no scan lasts longer
 
 
 def read_inclination(path: Path) -> InclinationLog:
-    """Read `Time,Roll,Pitch` [degrees] and return it uncleaned [rad]; an unreadable row is all NaN.
+    """Read time [s], roll and pitch [degrees] and return them uncleaned [rad]; an unreadable row is all NaN.
 
-    Unreadable rows are kept so that the cleaning can count them. A last line without a newline is unreadable,
-    because half a number is a wrong number, and so is a time more than a day from the others. GPS seconds of
-    the week continue past the end of the week, as those of the scan do.
+    The first line names the columns, `Time,Roll,Pitch`, with units behind them or not; without it they are
+    these three. Other delimiters and decimal commas are recognised. Unreadable rows are kept so that the
+    cleaning can count them. A last line without a newline is unreadable, because half a number is a wrong
+    number, and so is a time more than a day from the others. GPS seconds of the week continue past the end of
+    the week, as those of the scan do.
     Raises ScanError if no row can be read, NotReadyError if the disk fails or access is denied.
     """
     with decoder_errors(f"{path.name} cannot be read"), open_regular(path) as file:
@@ -33,11 +38,10 @@ def read_inclination(path: Path) -> InclinationLog:
     lines = [line for line in complete.split("\n") if line.strip()]
     if not lines:
         raise ScanError(f"{path.name}: contains no rows")
-    names = [name.strip(' "\r').lower() for name in lines[0].split(",")]
-    if not set(COLUMNS) <= set(names):
-        raise ScanError(f"{path.name}: its first line is not Time,Roll,Pitch but {lines[0][:60]!r}")
-    indices = [names.index(name) for name in COLUMNS]
-    rows = np.array([_parse_row(line, indices) for line in lines[1:]]).reshape(-1, 3)
+    delimiter = next((mark for mark in DELIMITERS if mark in lines[0]), None)
+    columns = _columns(lines[0], delimiter, path.name)
+    has_header = not np.isfinite(_parse_row(lines[0], delimiter, columns)).all()
+    rows = np.array([_parse_row(line, delimiter, columns) for line in lines[has_header:]]).reshape(-1, 3)
     if partial_line.strip():
         rows = np.vstack([rows, [np.nan] * 3])
     readable = np.isfinite(rows).all(axis=-1)
@@ -47,6 +51,19 @@ def read_inclination(path: Path) -> InclinationLog:
     readable &= np.abs(time_s - np.median(time_s[readable])) <= MAX_TIME_DIFFERENCE_S
     time_s[~readable] = rows[~readable] = np.nan
     return InclinationLog(time_s, np.radians(rows[:, 1]), np.radians(rows[:, 2]))
+
+
+def _columns(first_line: str, delimiter: str | None, name: str) -> list[tuple[int, float]]:
+    """Return index of each of COLUMNS, and the factor to its unit."""
+    fields = [field.strip(' "\r') for field in first_line.split(delimiter)]
+    named = [name_and_unit(field.lower()) for field in fields]
+    found = {column: (index, unit) for index, (column, unit) in reversed(list(enumerate(named)))}
+    if set(COLUMNS) <= found.keys():
+        return [(found[column][0], UNITS.get(found[column][1], 1.0)) for column in COLUMNS]
+    columns = [(index, 1.0) for index in range(len(COLUMNS))]
+    if len(fields) == len(COLUMNS) and np.isfinite(_parse_row(first_line, delimiter, columns)).all():
+        return columns
+    raise ScanError(f"{name}: its first line is not Time,Roll,Pitch but {first_line[:60]!r}")
 
 
 def align_gps_week(log: InclinationLog, time_s: float) -> InclinationLog:
@@ -61,13 +78,15 @@ def align_gps_week(log: InclinationLog, time_s: float) -> InclinationLog:
     return replace(log, time_s=log.time_s + weeks * WEEK_S)
 
 
-def _parse_row(line: str, indices: list[int]) -> tuple[float, ...]:
-    """Return the values of some columns of a line; all NaN if one is missing."""
-    fields = line.split(",")
+def _parse_row(line: str, delimiter: str | None, columns: list[tuple[int, float]]) -> tuple[float, ...]:
+    """Return the values of some columns of a line, each by its factor; all NaN if one is missing."""
+    fields = line.split(delimiter)
     try:
-        return tuple(float(fields[index]) for index in indices)
+        if delimiter != ",":
+            fields = [field.replace(",", ".") for field in fields]
+        return tuple(float(fields[index]) * factor for index, factor in columns)
     except (ValueError, IndexError):
-        return (np.nan,) * len(indices)
+        return (np.nan,) * len(columns)
 
 
 def _unwrap_week(time_s: Floats) -> Floats:

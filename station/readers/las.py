@@ -24,12 +24,18 @@ from station.quantities import AzimuthTrack, Bools, Floats, IntensityScale, Ints
 from station.readers.las_echoes import Brightness, Records, brightness_candidates, discard_tables
 from station.readers.las_header import LasFileHeader, read_header
 from station.readers.prefetch import Buffer, prefetch
-from station.readers.scan import WEEK_S, ScanHeader, decoder_errors
+from station.readers.scan import (
+    MAX_SCAN_S,
+    ScanHeader,
+    continue_week,
+    decoder_errors,
+    head_track,
+    require_in_range,
+)
 
 POSITION_AND_TIME = DecompressionSelection.base().decompress_z().decompress_gps_time()  # of formats 6 and up
 GROUND = POSITION_AND_TIME.decompress_flags().decompress_classification()
 BLOCKS_PER_BUFFER = 8  # decoded together, several chunks per core; converted one by one, in the cache
-MAX_SCAN_S = 86_400.0
 SAMPLE_COUNT = 200  # points sampled from a scan with no or few chunks
 SKIP_POINTS = 50_000  # points decoded at a time to skip them
 BRIGHTNESS_POINTS = 1000  # points at the start of a scan that show whether its brightness varies
@@ -138,8 +144,8 @@ class LasScan:
     def azimuth_track(self) -> AzimuthTrack | None:
         """Return the azimuth of the scanner head over time [rad], from sampled echoes.
 
-        Decodes only the end of the file if there are enough chunks. None for a scan without time or not in
-        the scanner's frame.
+        Decodes only the end of the file if there are enough chunks. None for a scan without time, not in the
+        scanner's frame, or whose azimuth does not follow a head.
         """
         if self._range_max_m is None or self.time_range_s() is None:
             return None
@@ -150,10 +156,7 @@ class LasScan:
                 (shots.time_s[0], *shots.xyz_m[:2, 0]) for shots in blocks if shots.time_s is not None
             ]
             time_s, x_m, y_m = np.array(first_shots).T
-        time_s, first_index = np.unique(time_s, return_index=True)
-        if len(time_s) < 2:
-            return None
-        return AzimuthTrack(time_s, np.unwrap(np.arctan2(y_m[first_index], x_m[first_index])))
+        return head_track(time_s, x_m, y_m)
 
     @cached_property
     def _sample(self) -> tuple[Floats, Floats, Floats]:
@@ -291,14 +294,7 @@ class _ShotDecoder:
 
     def check_range(self, shots: Shots) -> None:
         """Raise ScanError if one of the shots, at least one, is out of range."""
-        if self._range_max_m is None:
-            return
-        farthest_m = float(np.sqrt((shots.xyz_m**2).sum(axis=0).max()))
-        if farthest_m > self._range_max_m:
-            raise ScanError(
-                f"an echo {farthest_m:,.0f} m away, beyond scanner.range_max_m = {self._range_max_m:g}:"
-                " corrupt, or not of the unit, frame or scanner that the site file states"
-            )
+        require_in_range(shots.xyz_m, self._range_max_m)
 
     def _scale_axis(self, records: Records, axis: int, values: Floats) -> None:
         """Write the coordinates (n,) along an axis into `values` [m]."""
@@ -319,9 +315,8 @@ class _ShotDecoder:
             raise ScanError("a time stamp is not a number: corrupt, or written by a faulty program")
         if self._first_s is None:
             self._first_s = float(time_s[0])
-        if low_s < self._first_s - WEEK_S / 2 and low_s >= 0 and self._first_s < WEEK_S:
-            time_s = np.where(time_s < self._first_s - WEEK_S / 2, time_s + WEEK_S, time_s)
-            low_s, high_s = float(time_s.min()), float(time_s.max())
+        time_s = continue_week(time_s, self._first_s)
+        low_s, high_s = float(time_s.min()), float(time_s.max())
         self._earliest_s, self._latest_s = min(self._earliest_s, low_s), max(self._latest_s, high_s)
         if self._scanner_frame and self._latest_s - self._earliest_s > MAX_SCAN_S:
             raise ScanError(

@@ -67,10 +67,10 @@ def brightness_candidates(header: LasFileHeader, scale: IntensityScale) -> list[
     candidates = []
     if scale in {"auto", "reflectance"} and (extra := header.reflectance) is not None:
         field = _single_field(extra.dtype, extra.position, header)
-        candidates.append(Brightness(field, _from_decibels(extra.scale, extra.offset), in_extra_bytes=True))
+        candidates.append(Brightness(field, from_decibels(extra.scale, extra.offset), in_extra_bytes=True))
     if scale in {"auto", "linear", "decibel"}:
         field = _single_field("<u2", INTENSITY_POSITION, header)
-        convert = _from_decibels(SPAN_DB / MAX_INTENSITY, LOWEST_DB) if scale == "decibel" else _from_linear
+        convert = from_decibels(SPAN_DB / MAX_INTENSITY, LOWEST_DB) if scale == "decibel" else _from_linear
         candidates.append(Brightness(field, convert, in_extra_bytes=False))
     return candidates
 
@@ -84,7 +84,7 @@ def _from_linear(values: NDArray[np.number]) -> Floats:
     return np.asarray(values * (1 / MAX_INTENSITY))
 
 
-def _from_decibels(scale: float, offset: float) -> Callable[[NDArray[np.number]], Floats]:
+def from_decibels(scale: float, offset: float) -> Callable[[NDArray[np.number]], Floats]:
     """Return the conversion of `scale` times a value plus `offset`, in dB relative to white, to intensity."""
 
     def convert(values: NDArray[np.number]) -> Floats:

@@ -1,51 +1,122 @@
-"""Named polygons on the map, from GeoJSON."""
+"""Named polygons on the map, from GeoJSON, GeoPackage or Shapefile, in any coordinate system."""
 
 from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import shapely
+from pyproj import CRS, Transformer
 from pyproj.exceptions import CRSError
 
 from station.errors import ConfigError
-from station.quantities import Bools, Grid
+from station.quantities import Bools, Floats, Grid
 from station.readers.regular_file import read_text
 from station.science.geometry.pose import horizontal_crs, is_same_map
 
 TILE_CELLS = 64  # rows and columns of cells that are tested together
 KINDS = ("Polygon", "MultiPolygon")
+LAYER_SUFFIXES = (".gpkg", ".shp")  # read with the extra `polygons`
+WGS84 = "OGC:CRS84"  # of a GeoJSON that declares none: RFC 7946, 4
+MAX_AREA_CHANGE = 1e-6  # of an outline that is mended, relative
+
+
+class _Feature(NamedTuple):
+    """A feature of a file, as it stands there."""
+
+    location: str  # file, number and name
+    name: str
+    geometry: shapely.Geometry
 
 
 def read_polygons(path: Path, crs: str | None) -> dict[str, shapely.Geometry]:
-    """Read the polygons of a GeoJSON file by name, in file order, in map coordinates.
+    """Read the polygons of a file by name, in file order, in map coordinates.
 
     A polygon's name is its property `name`, else `id`, in any case of letters, else `area_1` by its position
-    in the file. A file that declares no CRS is taken to be in map coordinates. Raises ConfigError, with file
-    and feature, if the CRS is not that of the map, the coordinates are degrees, something is damaged, a
-    polygon intersects itself, two have the same name, or there is none.
+    in the file. Other coordinate systems are reprojected; a GeoJSON that declares none is in degrees of WGS84
+    if it can be, else in map coordinates. An outline that touches itself is mended if the area stays the
+    same. Raises ConfigError, with file and feature, if something is damaged, a polygon intersects itself, two
+    have the same name, or there is none.
     """
-    document = _read_json(path)
-    projected = crs is not None and horizontal_crs(crs).is_projected
-    if crs is not None:
-        _check_crs(path, document.get("crs"), crs)
-    polygons: dict[str, shapely.Geometry] = {}
-    for number, feature in enumerate(_features(path, document), start=1):
-        name = _name(feature, number)
-        location = f"{path}: feature {number} ({name})"
-        if name in polygons:
-            raise ConfigError(f"{location}: another feature has this name: rename one")
-        polygons[name] = _polygon(location, feature.get("geometry"))
-        west, south, east, north = polygons[name].bounds
-        if projected and max(-west, east) <= 180 and max(-south, north) <= 90:
-            raise ConfigError(
-                f"{location}: its coordinates look like degrees; {_reprojection_hint(path, crs)}"
-            )
-    if not polygons:
+    return {feature.name: _mended(feature)[0] for feature in _features_on_map(path, crs)}
+
+
+def mended_outlines(path: Path, crs: str | None) -> list[str]:
+    """Return a message for each polygon of a file whose outline is mended; raises as `read_polygons`."""
+    features = _features_on_map(path, crs)
+    return [f"{feature.location}: {fault}; mended" for feature in features if (fault := _mended(feature)[1])]
+
+
+def to_geojson(polygons: dict[str, shapely.Geometry], crs: str | None) -> str:
+    """Return polygons on the map as the text of a GeoJSON that declares the map's CRS."""
+    features = [
+        {"type": "Feature", "properties": {"name": name}, "geometry": json.loads(shapely.to_geojson(polygon))}
+        for name, polygon in polygons.items()
+    ]
+    declared = {"crs": {"type": "name", "properties": {"name": crs}}} if crs is not None else {}
+    return json.dumps({"type": "FeatureCollection", **declared, "features": features})
+
+
+def _features_on_map(path: Path, crs: str | None) -> list[_Feature]:
+    """Return the features of a file in map coordinates, their outlines not checked."""
+    is_layer = path.suffix.lower() in LAYER_SUFFIXES
+    features, declared = _read_layer(path) if is_layer else _read_geojson(path)
+    if not features:
         raise ConfigError(f"{path}: contains no feature: draw a polygon, or leave the file out")
-    return polygons
+    names = set()
+    for feature in features:
+        if feature.name in names:
+            raise ConfigError(f"{feature.location}: another feature has this name: rename one")
+        names.add(feature.name)
+    if crs is None:
+        return features
+    expected = horizontal_crs(crs)
+    if declared is None and not is_layer and _are_degrees(features, expected):
+        declared = CRS.from_user_input(WGS84)
+    if declared is None or is_same_map(declared, expected):
+        return features
+    transformer = Transformer.from_crs(declared, expected, always_xy=True)
+    return [_reprojected(feature, transformer) for feature in features]
+
+
+def _are_degrees(features: list[_Feature], expected: CRS) -> bool:
+    """Return True if all coordinates can be degrees; raise ConfigError if only some of them can."""
+    if not expected.is_projected:
+        return False
+    bounds = [feature.geometry.bounds for feature in features]
+    degrees = [max(-west, east) <= 180 and max(-south, north) <= 90 for west, south, east, north in bounds]
+    if any(degrees) and not all(degrees):
+        location = features[degrees.index(True)].location
+        raise ConfigError(f"{location}: its coordinates look like degrees, others of the file do not")
+    return all(degrees)
+
+
+def _reprojected(feature: _Feature, transformer: Transformer) -> _Feature:
+    def transform(xy: Floats) -> Floats:
+        return np.stack(transformer.transform(xy[:, 0], xy[:, 1]), axis=-1)
+
+    geometry = shapely.transform(feature.geometry, transform)
+    if not np.isfinite(shapely.get_coordinates(geometry)).all():
+        raise ConfigError(f"{feature.location}: is not in the area of its CRS or of that of the map")
+    return feature._replace(geometry=geometry)
+
+
+def _mended(feature: _Feature) -> tuple[shapely.Geometry, str]:
+    """Return a valid polygon and what was wrong with it, '' if nothing.
+
+    Raises ConfigError if mending it would change its area: then it is not known what was meant.
+    """
+    polygon = feature.geometry
+    if polygon.is_valid:
+        return polygon, ""
+    fault = shapely.is_valid_reason(polygon)
+    parts = shapely.get_parts(shapely.make_valid(polygon, method="structure", keep_collapsed=False))
+    mended = shapely.union_all([part for part in parts if part.geom_type in KINDS])
+    if abs(mended.area - polygon.area) > MAX_AREA_CHANGE * polygon.area or mended.is_empty:
+        raise ConfigError(f"{feature.location}: {fault}: repair its outline")
+    return mended, fault
 
 
 def cells_inside(geometry: shapely.Geometry, grid: Grid) -> Bools:
@@ -97,24 +168,47 @@ def _read_json(path: Path) -> dict[str, Any]:
     return document
 
 
-def _check_crs(path: Path, declared: object, crs: str) -> None:
-    """Raise ConfigError if the file declares a CRS other than `crs`."""
+def _read_geojson(path: Path) -> tuple[list[_Feature], CRS | None]:
+    """Return the features of a GeoJSON, and the CRS that it declares, which RFC 7946 no longer allows."""
+    document = _read_json(path)
+    features = []
+    for number, member in enumerate(_features(path, document), start=1):
+        name = _name(member.get("properties"), member.get("id"), number)
+        location = f"{path}: feature {number} ({name})"
+        features.append(_Feature(location, name, _polygon(location, member.get("geometry"))))
+    declared = document.get("crs")
     if declared is None:
-        return
+        return features, None
     try:
-        declared_crs = horizontal_crs(declared["properties"]["name"])  # type: ignore[index]
+        return features, horizontal_crs(declared["properties"]["name"])
     except (KeyError, TypeError, AttributeError, CRSError) as error:
-        raise ConfigError(
-            f"{path}: crs {declared} is not understood; {_reprojection_hint(path, crs)}"
-        ) from error
-    if not is_same_map(declared_crs, horizontal_crs(crs)):
-        raise ConfigError(
-            f"{path}: is in {declared_crs.name}, map.crs is {crs}; {_reprojection_hint(path, crs)}"
-        )
+        raise ConfigError(f"{path}: crs {declared} is not understood: name an EPSG code") from error
 
 
-def _reprojection_hint(path: Path, crs: str | None) -> str:
-    return f"reproject it: ogr2ogr -t_srs {crs} on_the_map.geojson {path.name}"
+def _read_layer(path: Path) -> tuple[list[_Feature], CRS | None]:
+    """Return the features of a GeoPackage or Shapefile with one layer, and its CRS."""
+    try:
+        import pyogrio  # noqa: PLC0415 - an extra
+    except ImportError as error:
+        raise ConfigError(f"{path}: needs a library: pip install 'tls-station[polygons]'") from error
+    try:
+        layers = [name for name, kind in pyogrio.list_layers(path) if kind is not None]
+        if len(layers) != 1:
+            raise ConfigError(f"{path}: has layers {', '.join(layers) or '(none)'}: export one of polygons")
+        meta, _, geometries, columns = pyogrio.raw.read(path, layer=layers[0], force_2d=True)
+        declared = horizontal_crs(meta["crs"]) if meta["crs"] else None
+    except (pyogrio.errors.DataSourceError, pyogrio.errors.DataLayerError, CRSError) as error:
+        raise ConfigError(f"{path}: cannot be read: {error}") from error
+    features = []
+    for number, (wkb, values) in enumerate(zip(geometries, zip(*columns, strict=True), strict=True), start=1):
+        name = _name(dict(zip(meta["fields"].tolist(), values, strict=True)), None, number)
+        location = f"{path}: feature {number} ({name})"
+        geometry = None if wkb is None else shapely.from_wkb(wkb)
+        if geometry is None or geometry.geom_type not in KINDS or geometry.is_empty:
+            kind = "without geometry" if geometry is None else geometry.geom_type
+            raise ConfigError(f"{location}: is {kind}; expected {' or '.join(KINDS)}")
+        features.append(_Feature(location, name, geometry))
+    return features, declared
 
 
 def _features(path: Path, document: dict[str, Any]) -> list[dict[str, Any]]:
@@ -132,11 +226,11 @@ def _features(path: Path, document: dict[str, Any]) -> list[dict[str, Any]]:
     return features
 
 
-def _name(feature: dict[str, Any], number: int) -> str:
-    properties = feature.get("properties")
+def _name(properties: object, ident: object, number: int) -> str:
+    """Return the name of a feature by its properties, else by its identifier, else by its number."""
     by_key = {key.lower(): value for key, value in properties.items()} if isinstance(properties, dict) else {}
     candidates = by_key.get("name"), by_key.get("id")
-    names = [str(value).strip() for value in (*candidates, feature.get("id")) if value is not None]
+    names = [str(value).strip() for value in (*candidates, ident) if value is not None]
     return next((name for name in names if name), f"area_{number}")
 
 
@@ -150,6 +244,4 @@ def _polygon(location: str, geometry: object) -> shapely.Geometry:
         raise ConfigError(f"{location}: is damaged: {error}") from error
     if polygon.is_empty:
         raise ConfigError(f"{location}: has no vertices")
-    if not polygon.is_valid:
-        raise ConfigError(f"{location}: {shapely.is_valid_reason(polygon)}: repair its outline")
     return polygon

@@ -9,7 +9,7 @@ import errno
 import functools
 import logging
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
@@ -18,8 +18,11 @@ from importlib.metadata import entry_points
 from pathlib import Path
 from typing import ClassVar, Protocol, Self
 
+import numpy as np
+
 from station.errors import InconclusiveError, NotReadyError, ScanError, StationError
-from station.quantities import AzimuthTrack, IntensityScale, Shots
+from station.quantities import AzimuthTrack, Floats, IntensityScale, Shots
+from station.scan_names import COMPRESSED, start_in_name
 
 log = logging.getLogger(__name__)
 
@@ -43,6 +46,10 @@ TRANSIENT_ERRNOS = {
     errno.EHOSTUNREACH,
 }  # fmt: skip
 _RUST_OS_ERROR = re.compile(r"Os \{ code: (\d+)")  # how a panic prints the system's error that caused it
+MAX_SCAN_S = 86_400.0
+TEXT = ".xyz"  # the suffix whose reader reads text
+TEXT_SUFFIXES = (".csv", ".txt", ".dat")  # of text too, but also of logs: scans only if scans.suffix says so
+MIN_TURN = 0.5  # of the head, net over total; more turning to and fro is no head that scans line by line
 MAX_CLOCK_DIFFERENCE_S = 900.0  # between name and GPS times of a scan; names are up to minutes early
 
 
@@ -65,6 +72,7 @@ class ScanHeader:
     has_time: bool  # the format has a time field; `time_range_s` is None if it is not filled
     standard_time: bool  # the flag for adjusted standard GPS time, which not every writer sets correctly
     crs_wkt: str | None  # None if the file declares none that can be parsed
+    start_utc: datetime | None = None  # that the file states; its name and standard times come first
 
 
 class ScanReader(Protocol):
@@ -143,20 +151,63 @@ def _readers() -> dict[str, type[ScanReader]]:
 
 
 def suffixes() -> tuple[str, ...]:
-    """Return the file name suffixes that can be read, e.g. (".las", ".laz")."""
-    return tuple(sorted(_readers()))
+    """Return the file name suffixes that can be read, e.g. (".las", ".las.gz", ".laz")."""
+    known = _readers()
+    return tuple(sorted([*known, *(suffix + COMPRESSED for suffix in known)]))
 
 
-def open_scan(path: Path, *, range_max_m: float | None = None) -> ScanReader:
+def open_scan(path: Path, *, range_max_m: float | None = None, columns: Sequence[str] = ()) -> ScanReader:
     """Return the open scan; its suffix selects the reader.
 
-    Raises ScanError if there is no reader for it, or if the file is not a valid scan.
+    With `columns`, or a suffix that other files have too, it is text. Raises ScanError if there is no reader
+    for it, or if the file is not a valid scan.
     """
-    reader = _readers().get(path.suffix.lower())
-    if reader is None:
-        raise ScanError(f"no reader for {path.suffix or 'a name without suffix'!r}: {', '.join(suffixes())}")
+    known, suffix = _readers(), path.suffix.lower()
+    if TEXT in known and (columns or suffix in TEXT_SUFFIXES):
+        with decoder_errors("cannot be opened"):
+            return known[TEXT](path, range_max_m=range_max_m, columns=columns)  # type: ignore[call-arg]
+    if suffix not in known:
+        raise ScanError(f"no reader for {suffix or 'a name without suffix'!r}: {', '.join(known)}")
     with decoder_errors("cannot be opened"):
-        return reader(path, range_max_m=range_max_m)
+        return known[suffix](path, range_max_m=range_max_m)
+
+
+def continue_week(time_s: Floats, first_s: float) -> Floats:
+    """Return GPS seconds of the week (n,) that continue past its end instead of falling back to zero [s].
+
+    `first_s` is the first time stamp of the scan; other time bases are returned as they are.
+    """
+    low_s = float(time_s.min())
+    if not (0 <= low_s < first_s - WEEK_S / 2 and first_s < WEEK_S):
+        return time_s
+    return np.where(time_s < first_s - WEEK_S / 2, time_s + WEEK_S, time_s)
+
+
+def require_in_range(xyz_m: Floats, range_max_m: float | None) -> None:
+    """Raise ScanError if one of the points (3, n), at least one, is beyond the range of the scanner."""
+    if range_max_m is None:
+        return
+    farthest_m = float(np.sqrt((xyz_m**2).sum(axis=0).max()))
+    if farthest_m > range_max_m:
+        raise ScanError(
+            f"an echo {farthest_m:,.0f} m away, beyond scanner.range_max_m = {range_max_m:g}:"
+            " corrupt, or not of the unit, frame or scanner that the site file states"
+        )
+
+
+def head_track(time_s: Floats, x_m: Floats, y_m: Floats) -> AzimuthTrack | None:
+    """Return the azimuth of the head [rad] by samples of the echoes (k,), in any order.
+
+    None if it does not turn steadily: scanners without scan lines look everywhere at any time.
+    """
+    time_s, first = np.unique(time_s, return_index=True)
+    if len(time_s) < 2:
+        return None
+    azimuth_rad = np.unwrap(np.arctan2(y_m[first], x_m[first]))
+    turned_rad = np.diff(azimuth_rad)
+    if abs(turned_rad.sum()) < MIN_TURN * np.abs(turned_rad).sum():
+        return None
+    return AzimuthTrack(time_s, azimuth_rad)
 
 
 def _leap_seconds(time_utc: datetime) -> int:
@@ -209,23 +260,23 @@ def detect_time_base(
     return TimeBase.SCANNER
 
 
-def _start_from_name(path: Path, pattern: str) -> datetime | None:
-    try:
-        start = datetime.strptime(path.stem, pattern)  # noqa: DTZ007 - the pattern may contain a zone
-    except ValueError:
-        return None
-    return start.astimezone(UTC) if start.tzinfo else start.replace(tzinfo=UTC)
-
-
 def scan_start(
-    path: Path, pattern: str, times_s: tuple[float, float] | None = None, *, standard: bool = False
+    path: Path,
+    pattern: str,
+    times_s: tuple[float, float] | None = None,
+    *,
+    standard: bool = False,
+    stated_utc: datetime | None = None,
 ) -> datetime:
-    """Return the start of a scan (UTC): from its name by the strptime pattern, else from standard GPS time.
+    """Return the start of a scan (UTC): from its name by the pattern, else from standard GPS time.
 
-    Raises ScanError if neither contains it, or if they contradict each other.
+    `stated_utc` is the start that the file states, used if neither contains one. Raises ScanError if there is
+    none, or if name and GPS time contradict each other.
     """
-    name_start = _start_from_name(path, pattern)
+    name_start = start_in_name(path.name, pattern)
     if times_s is None or detect_time_base(*times_s, name_start, standard=standard) is not TimeBase.STANDARD:
+        if name_start is None and stated_utc is not None:
+            return stated_utc
         if name_start is None:
             raise ScanError(
                 f"start unknown: the name does not match scans.name = {pattern!r}"
@@ -262,10 +313,13 @@ def utc_interval(reader: ScanReader, pattern: str) -> tuple[datetime, datetime, 
     The start is that in the name, if any; the duration is from the time stamps. Raises as `scan_start`.
     """
     times_s = reader.time_range_s()
-    start = scan_start(reader.path, pattern, times_s, standard=reader.header.standard_time)
+    header = reader.header
+    start = scan_start(
+        reader.path, pattern, times_s, standard=header.standard_time, stated_utc=header.start_utc
+    )
     if times_s is None:
         return start, start, TimeBase.NONE
-    time_base = detect_time_base(*times_s, start, standard=reader.header.standard_time)
+    time_base = detect_time_base(*times_s, start, standard=header.standard_time)
     try:
         return start, start + timedelta(seconds=times_s[1] - times_s[0]), time_base
     except OverflowError as error:

@@ -27,7 +27,7 @@ from station.logs import log_to_stderr, logfmt
 from station.monitoring.metrics import Metrics
 from station.monitoring.preconditions import EARLIEST_S, clock_problem, require_disk_space
 from station.processing.workers import fork_server
-from station.readers.scan import suffixes
+from station.readers.formats.conversion import scan_suffixes
 from station.service.host import Host
 from station.service.inbox_watcher import InboxWatcher
 from station.service.scheduler import JobScheduler, LoopEvent
@@ -252,7 +252,8 @@ class Daemon:
             in_service=True,
             host=self._host,
         )
-        inbox = Inbox(site, journal, suffixes(), monotonic_s=self._clock.monotonic_s, now_s=self._clock.now_s)
+        suffixes = scan_suffixes(site.scans)
+        inbox = Inbox(site, journal, suffixes, monotonic_s=self._clock.monotonic_s, now_s=self._clock.now_s)
         watcher = self._host.make_watcher(
             site.scans.inbox, lambda: self.post(LoopEvent.INBOX_CHANGED), polling=site.scans.polling
         )

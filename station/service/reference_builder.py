@@ -105,7 +105,7 @@ class ReferenceBuilder:
     def _unsettled_before(self, start_utc_s: float, *, however_often_failed: bool = False) -> str:
         unsettled = self._journal.unsettled(however_often_failed=however_often_failed)
         for name, known_s in unsettled.items():
-            if (known_s or start_from_name(name, self._site.scans.name).timestamp()) < start_utc_s:
+            if (known_s or start_from_name(name, self._site.scans.pattern).timestamp()) < start_utc_s:
                 return name
         return ""
 
@@ -114,7 +114,7 @@ class ReferenceBuilder:
         entry = self._journal.entry(name)
         if entry is not None and entry.start_utc_s is not None:
             return entry.start_utc_s
-        return start_from_name(name, self._site.scans.name).timestamp()
+        return start_from_name(name, self._site.scans.pattern).timestamp()
 
     def _requeue_without_reference(self) -> None:
         """Requeue epochs without change: power failed between building the reference and its first use."""

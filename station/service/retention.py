@@ -18,6 +18,7 @@ from station.inbox.journal_reader import Entry
 from station.inbox.scan_files import archive_path, scan_file
 from station.processing.site_files import series_for, sha256_log
 from station.processing.workers.worker_process import Progress
+from station.scan_names import scan_stem
 
 MAX_PER_RUN = 50  # scans per maintenance run; there are four runs a day
 
@@ -40,7 +41,7 @@ def expired_scans(site: Site, entries: Iterable[Entry], reserved: set[str], now_
         if entry.start_utc_s is not None
         and entry.start_utc_s < cutoff_s
         and entry.outcome is not None
-        and Path(entry.name).stem not in sop_scans
+        and scan_stem(entry.name) not in sop_scans
         and (settings.raw == "move" or entry.name not in reserved)
         and (site.scans.inbox / entry.name).is_file()
     ]

@@ -96,8 +96,8 @@ def test_a_wrong_time_costs_one_row_at_any_time_of_the_week(tmp_path, row, start
         ("\n\n", "contains no rows"),
         ("Time,Roll,Pitch\n", "none of 0 rows"),
         ("Time,Roll,Pitch\nx,y,z\n", "none of 1 rows"),
-        ("Time,X,Y\n1,2,3\n", "is not Time,Roll,Pitch but 'Time,X,Y'"),
-        ("1,2,3\n", "is not Time,Roll,Pitch"),
+        ("Time,X,Y\n1,2,3,4\n", "is not Time,Roll,Pitch but 'Time,X,Y'"),
+        ("1,2,3,4\n", "is not Time,Roll,Pitch"),
         (bytes(range(256)) * 10, "is not Time,Roll,Pitch"),
         (b"\0" * 1000, "contains no rows"),
     ],
@@ -118,3 +118,23 @@ def test_oversized_log_is_rejected(tmp_path):
 def test_missing_log_is_not_ready(tmp_path):
     with pytest.raises(NotReadyError, match="No such file"):
         read_inclination(tmp_path / "none-incl.txt")
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "Time;Roll;Pitch\n40,5;-0,286;0,275\n41,5;-0,285;0,265\n",
+        "Time[s]\tRoll[deg]\tPitch[deg]\r\n40.5\t-0.286\t0.275\r\n41.5\t-0.285\t0.265\r\n",
+        "40.5,-0.286,0.275\n41.5,-0.285,0.265\n",
+        "40.5 -0.286 0.275\n41.5 -0.285 0.265\n",
+        "Pitch (mrad),Roll (mrad),Time (ms)\n4.799655,-4.991642,40500\n4.625123,-4.974188,41500\n",
+    ],
+)
+def test_logs_in_other_dialects(tmp_path, text):
+    """0.275° are 4.799655 mrad."""
+    path = tmp_path / "a-incl.txt"
+    path.write_text(text)
+    log = read_inclination(path)
+    assert log.time_s == pytest.approx([40.5, 41.5])
+    assert np.degrees(log.roll_rad) == pytest.approx([-0.286, -0.285], abs=1e-6)
+    assert np.degrees(log.pitch_rad) == pytest.approx([0.275, 0.265], abs=1e-6)

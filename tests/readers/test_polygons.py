@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from station.errors import ConfigError
 from station.quantities import Grid
-from station.readers.polygons import cells_inside, read_polygons
+from station.readers.polygons import cells_inside, mended_outlines, read_polygons, to_geojson
 
 CRS = "EPSG:32632"
 EAST, NORTH = 632000.0, 5186000.0
@@ -113,9 +113,8 @@ GOOD = feature(polygon(square(0, 0, 10)), properties={"name": "gate"})
         (feature(polygon(square(0, 0, 10)[:-1])), "do not form a closed"),
         (feature(BOW_TIE, id="bow"), r"feature 1 \(bow\): Self-intersection.*repair its outline"),
         (collection(GOOD, GOOD), r"feature 2 \(gate\): another feature has this name"),
-        (collection(GOOD, feature(DEGREES)), r"feature 2 .*degrees.*ogr2ogr -t_srs EPSG:32632"),
-        (collection(GOOD, crs=ZONE_33), "is in WGS 84 / UTM zone 33N, map.crs is EPSG:32632.*ogr2ogr"),
-        (collection(feature(DEGREES), crs=CRS84), r"is in WGS 84 \(CRS84\).*ogr2ogr"),
+        (collection(GOOD, feature(DEGREES)), r"feature 2 .*look like degrees, others of the file do not"),
+        (collection(feature(polygon(square(1e30, 0, 1e30))), crs=ZONE_33), "not in the area of its CRS"),
         (collection(GOOD, crs={"type": "link", "properties": {"href": "x"}}), "not understood"),
         (collection(GOOD, crs="nowhere"), "not understood"),
     ],
@@ -123,6 +122,84 @@ GOOD = feature(polygon(square(0, 0, 10)), properties={"name": "gate"})
 def test_invalid_files_are_explained(read, content, message):
     with pytest.raises(ConfigError, match=message):
         read(content)
+
+
+@pytest.mark.parametrize(
+    ("crs", "declared"),
+    [
+        ("EPSG:4326", None),
+        ("EPSG:4326", CRS84),
+        ("EPSG:32633", ZONE_33),
+        ("EPSG:3857", {"properties": {"name": "EPSG:3857"}}),
+    ],
+)
+def test_other_coordinate_systems_are_reprojected(read, crs, declared):
+    """A GeoJSON without a CRS is in degrees of WGS84 (RFC 7946). Expected: GDAL's own transformation."""
+    warp = pytest.importorskip("rasterio.warp")
+    on_map = polygon(square(100, 100, 300))
+    elsewhere = warp.transform_geom(CRS, crs, on_map, precision=12)
+    (area,) = read(collection(feature(elsewhere), crs=declared)).values()
+    np.testing.assert_allclose(
+        shapely.get_coordinates(area),
+        shapely.get_coordinates(shapely.from_geojson(json.dumps(on_map))),
+        atol=1e-5,
+    )
+
+
+@pytest.mark.parametrize("suffix", [".gpkg", ".shp"])
+@pytest.mark.parametrize("crs", ["EPSG:32632", "EPSG:4326", "EPSG:25832"])
+def test_geopackage_and_shapefile(tmp_path, suffix, crs):
+    pyogrio = pytest.importorskip("pyogrio")
+    warp = pytest.importorskip("rasterio.warp")
+    shapes = {"Süd": polygon(square(100, 100, 300)), "Nord": polygon(square(0, 0, 10))}
+    elsewhere = [
+        shapely.from_geojson(json.dumps(warp.transform_geom(CRS, crs, shape))) for shape in shapes.values()
+    ]
+    path = tmp_path / f"areas{suffix}"
+    pyogrio.raw.write(
+        path,
+        shapely.to_wkb(elsewhere),
+        [np.array(list(shapes), object)],
+        ["Name"],
+        geometry_type="Polygon",
+        crs=crs,
+        encoding="UTF-8",
+    )
+    areas = read_polygons(path, CRS)
+    assert list(areas) == list(shapes)
+    assert [area.area for area in areas.values()] == pytest.approx([90_000, 100], rel=1e-6)
+    assert areas["Nord"].bounds == pytest.approx((EAST, NORTH - 10, EAST + 10, NORTH), abs=1e-4)
+    (tmp_path / "copy").write_text(to_geojson(areas, CRS))
+    copied = read_polygons(tmp_path / "copy", CRS)
+    assert {name: area.wkb for name, area in copied.items()} == {
+        name: area.wkb for name, area in areas.items()
+    }
+    path.write_bytes(path.read_bytes()[:90])
+    with pytest.raises(ConfigError):
+        read_polygons(path, CRS)
+
+
+TWO_HALVES = {"type": "MultiPolygon", "coordinates": [[square(0, 0, 10)], [square(10, 0, 10)]]}
+OVERLAPPING = {"type": "MultiPolygon", "coordinates": [[square(0, 0, 10)], [square(5, 0, 10)]]}
+SPIKE = polygon(ring((0, 0), (0, 10), (10, 10), (10, 0), (5, 0), (5, -20), (5, 0)))
+
+
+@pytest.mark.parametrize(("shape", "area_m2"), [(TWO_HALVES, 200.0), (SPIKE, 100.0)])
+def test_outlines_that_touch_are_mended_and_said(read, tmp_path, shape, area_m2):
+    assert read(feature(shape, id="a"))["a"].is_valid
+    assert read(feature(shape, id="a"))["a"].area == area_m2
+    assert cells_inside(read(feature(shape))["area_1"], GRID).sum() == area_m2
+    (message,) = mended_outlines(tmp_path / "areas.geojson", CRS)
+    assert "feature 1 (area_1)" in message
+    assert message.endswith("mended")
+    read(GOOD)
+    assert mended_outlines(tmp_path / "areas.geojson", CRS) == []
+
+
+@pytest.mark.parametrize("shape", [BOW_TIE, OVERLAPPING])
+def test_outlines_whose_area_would_change_are_refused(read, shape):
+    with pytest.raises(ConfigError, match="repair its outline"):
+        read(feature(shape))
 
 
 def test_binary_and_missing_files(tmp_path):

@@ -120,3 +120,64 @@ def test_latest_sop_that_has_begun_is_valid(when, file):
 def test_time_before_the_first_sop_is_rejected():
     with pytest.raises(ScanError, match=r"no \[\[sop\]\] .* has begun by 2024-09-30 23:59:59"):
         valid_sop(SOPS, OCTOBER - timedelta(seconds=1))
+
+
+NUMBERS = np.eye(4)
+NUMBERS[:3, :3], NUMBERS[:3, 3] = ROTATION, (12.5, -3.25, 1500.0)
+SIXTEEN = " ".join(f"{number:.16f}" for number in NUMBERS.ravel())
+ROWS = "\n".join(" ".join(f"{number:.12f}" for number in row) for row in NUMBERS)
+QUATERNION = Rotation.from_matrix(ROTATION).as_quat()  # x, y, z, w
+PLACE = "x = 12.5\ny = -3.25\nz = 1500\n"
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        SIXTEEN,
+        f'<?xml version="1.0"?>\n<sop kind="SOP"><matrix rows="4" cols="4"> {SIXTEEN} </matrix></sop>',
+        ROWS.replace(".", ","),
+        "\n".join(";".join(line.split()) for line in ROWS.replace(".", ",").split("\n")),
+        "\n".join(", ".join(line.split()) for line in ROWS.split("\n")),
+        "\n".join(",".join(line.split()) for line in ROWS.split("\n")),
+        PLACE + "qx = {}\nqy = {}\nqz = {}\nqw = {}  # the real part".format(*QUATERNION),
+        PLACE.replace("=", ":") + "roll_deg: {}\npitch_deg: {}\nyaw_deg: {}".format(
+            *np.degrees([0.1, 0.59, -1.2])
+        ),
+        '{{\n"x": 12.5,\n"y": -3.25,\n"z": 1500,\n"roll_deg": {},\n"pitch_deg": {},\n"yaw_deg": {}}}'.format(
+            *np.degrees([0.1, 0.59, -1.2])
+        ),
+    ],
+)  # fmt: skip
+def test_a_matrix_is_accepted_in_any_form(tmp_path, text):
+    """ROTATION is from the angles 0.1, 0.59, -1.2 about x, y, z by scipy."""
+    path = tmp_path / "sop.dat"
+    path.write_text(text)
+    assert read_matrix(path) == pytest.approx(NUMBERS, abs=1e-10)
+
+
+@pytest.mark.parametrize(
+    ("text", "reason"),
+    [
+        ("<project><matrix>1</matrix><matrix>2</matrix></project>", "has 2 elements.*station import riscan"),
+        ("<project/>", "has 0 elements"),
+        ("<sop><matrix>", "not valid XML"),
+        (PLACE + "qw = 1\nqx = 0\nqy = 0.5\nqz = 0", "length of 1.11803, not 1"),
+        (PLACE + "roll_deg = 1", "needs x, y, z and qw"),
+        (PLACE + "qw = 1\nqx = 0\nqy = 0\nqz = 0\nscale = 2", "has x, y, z, qw.*scale"),
+        ("x = west", "could not convert"),
+        (" ".join("1" * 15), r"16 in one line, has rows of \[15\]"),
+    ],
+)
+def test_other_forms_are_refused_with_a_reason(tmp_path, text, reason):
+    path = tmp_path / "sop.dat"
+    path.write_text(text)
+    with pytest.raises(ConfigError, match=reason):
+        read_matrix(path)
+
+
+def test_entities_do_not_expand_without_limit(tmp_path):
+    entities = "".join(f'<!ENTITY a{n} "{f"&a{n - 1};" * 20}">' for n in range(1, 12))
+    path = tmp_path / "sop.xml"
+    path.write_text(f'<!DOCTYPE s [<!ENTITY a0 "1 ">{entities}]><sop><matrix>&a11;</matrix></sop>')
+    with pytest.raises(ConfigError, match="not valid XML"):
+        read_matrix(path)

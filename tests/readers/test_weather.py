@@ -7,8 +7,9 @@ import pytest
 
 from station.errors import NotReadyError, ScanError
 from station.quantities import Air, WeatherLog
-from station.readers.weather import interpolate_air, read_weather
-from station.sections import WeatherColumns
+from station.readers import weather
+from station.readers.weather import interpolate_air
+from station.sections import WeatherColumns, WeatherSection
 
 REAL = WeatherColumns(temperature_c="TAact_2m_Avg", humidity_pct="RHact_2m_Avg", pressure_hpa="Pact")
 PLAIN = WeatherColumns(time="time", temperature_c="t", humidity_pct="rh", pressure_hpa="p")
@@ -18,6 +19,10 @@ TOA5 = (
 )
 LOGGER = WeatherColumns(temperature_c="T", humidity_pct="RH", pressure_hpa="P")
 START_S = datetime(2024, 10, 1, 5, 0, tzinfo=UTC).timestamp()
+
+
+def read_weather(path, window_utc_s=None, **settings):
+    return weather.read_weather(WeatherSection(file=path, **settings), window_utc_s)
 
 
 def write_log(tmp_path, text):
@@ -120,16 +125,19 @@ def test_unreadable_times_are_an_error_that_shows_the_first(tmp_path, first, sec
 
 
 @pytest.mark.parametrize("window_h", [None, 1.0, 20.0, 39.0])
-def test_a_log_with_the_newest_rows_first_is_an_error(tmp_path, window_h):
-    """40 hours of minutes; a service that silently finds no weather would degrade every scan."""
+def test_the_newest_rows_may_come_first(tmp_path, window_h):
+    """40 hours of minutes, long enough to be bisected; each row tells its minute."""
     times = [
         f"{datetime.fromtimestamp(START_S + 60 * minute, UTC):%Y-%m-%dT%H:%M:%S}" for minute in range(2400)
     ]
-    path = write_log(tmp_path, "time,t,rh,p\n" + csv_rows(times[::-1]))
+    rows = [f"{time},{minute / 100},55,700\n" for minute, time in enumerate(times)]
+    path = write_log(tmp_path, "time,t,rh,p\n" + "".join(reversed(rows)))
     centre_s = START_S + 3600 * (window_h or 0)
     window = None if window_h is None else (centre_s - 600, centre_s + 600)
-    with pytest.raises(ScanError, match="not in time order, the newest come first"):
-        read_weather(path, format="csv", columns=PLAIN, utc_offset_h=0, window_utc_s=window)
+    log = read_weather(path, window, format="csv", columns=PLAIN, utc_offset_h=0)
+    minutes = np.arange(2400) if window_h is None else 60 * window_h + np.arange(-10, 11)
+    np.testing.assert_allclose(log.time_utc_s, START_S + 60 * minutes)
+    np.testing.assert_allclose(log.temperature_c, minutes / 100)
 
 
 @pytest.mark.parametrize(("humidity", "is_fraction"), [("0.55", True), ("1.0", True), ("1.6", False)])

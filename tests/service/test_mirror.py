@@ -12,7 +12,8 @@ from station.config import read_site
 from station.errors import ConfigError
 from station.inbox.journal import Journal
 from station.monitoring.status import queue_status
-from station.processing.scan_tasks import series_for
+from station.processing.site_files import series_for
+from station.service.host import Host
 from station.service.mirror import BackgroundMirror, update_mirror
 from station.service.worker import Worker
 
@@ -130,7 +131,7 @@ def test_a_mirror_in_the_inbox_is_refused(write_site):
 
 @pytest.mark.integration
 def test_the_mirror_is_renewed_in_a_process_of_its_own(site):
-    mirror = BackgroundMirror(replace_memory(site))
+    mirror = BackgroundMirror(replace_memory(site), Host())
     assert mirror.start()
     assert not mirror.start()  # while it runs
     deadline_s = time.monotonic() + 60

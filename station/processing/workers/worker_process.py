@@ -101,12 +101,8 @@ class WorkerProcess:
         return kind, value
 
     def cpu_ticks(self) -> int:
-        """Return the CPU time used so far, in clock ticks; 0 if it has ended. Source: proc(5)."""
-        try:
-            fields = Path(f"/proc/{self._pid}/stat").read_text(encoding="utf-8").rpartition(")")[2].split()
-        except OSError:
-            return 0
-        return int(fields[11]) + int(fields[12])
+        """Return the CPU time used so far, in clock ticks, with that of processes it has started."""
+        return _cpu_ticks(self._pid)
 
     def end(self) -> int | None:
         """End the process; return its exit status, None if even SIGKILL has to wait for a disk."""
@@ -125,6 +121,22 @@ class WorkerProcess:
             os.close(self._pidfd)
         self._connection.close()
         return exit_status
+
+
+def _cpu_ticks(pid: int) -> int:
+    """Return the CPU time that a process and those it has started have used, in clock ticks.
+
+    0 if it has ended. A worker waits for the command that converts its scan. Source: proc(5).
+    """
+    try:
+        fields = Path(f"/proc/{pid}/stat").read_text(encoding="utf-8").rpartition(")")[2].split()
+    except OSError:
+        return 0
+    try:
+        children = Path(f"/proc/{pid}/task/{pid}/children").read_text(encoding="ascii").split()
+    except OSError:  # it has ended, or the kernel does not list them
+        children = []
+    return int(fields[11]) + int(fields[12]) + sum(_cpu_ticks(int(child)) for child in children)
 
 
 # ---- in the worker process

@@ -1,0 +1,164 @@
+"""`station export SITE points`: the corrected points of scans on the map, for other programs."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator
+from pathlib import Path
+from typing import Any
+
+import laspy
+import netCDF4
+import numpy as np
+from pyproj import CRS
+
+from station.archive.atomic_files import atomic_write
+from station.archive.epochs import EpochRef
+from station.archive.reference_files import open_reference
+from station.archive.series.index import list_epochs
+from station.config import Site
+from station.errors import StationError
+from station.inbox.inbox import ScanFile
+from station.inbox.journal_reader import JournalReader
+from station.inbox.scan_files import find_scan
+from station.processing.pipeline import grid_scan, new_gridder, stacking_inputs, to_map
+from station.processing.provenance import stored_epochs
+from station.processing.scan_inputs import ScanInputs, load_scan_inputs
+from station.processing.scan_tasks import adjust_scan, load_viewing_geometry
+from station.processing.site_files import open_scan_for, series_for
+from station.processing.usable_inputs import usable_site
+from station.processing.workers import isolation
+from station.processing.workers.worker_process import Progress
+from station.products.area_tables import Span
+from station.quantities import Floats, Floats32, Shots
+from station.readers.scan import ScanReader, utc_interval
+from station.scan_names import scan_stem
+
+POINT_FORMAT = 6  # LAS 1.4, with time
+SCALE_M = 0.0001
+EXTRA_BYTES = {  # of each point, those of its cell
+    "elevation_change": ("f4", "above the reference [m]"),
+    "elevation_change_uncertainty": ("f4", "1 sigma of a cell [m]"),
+    "quality": ("u1", "flags of the cell"),
+}
+MAX_INTENSITY = 65535
+
+Track = Callable[[list[EpochRef]], Iterable[EpochRef]]
+
+
+def export_points(site: Site, span: Span | None, folder: Path, track: Track = iter) -> Iterator[Path]:
+    """Yield a LAZ file for each epoch of a span, by default the newest, when it is written.
+
+    Raises StationError if there is no such epoch, or its scan no longer exists; else as processing a scan.
+    """
+    series = series_for(site)
+    epochs = list_epochs(series)
+    chosen = epochs[-1:] if span is None else [epoch for epoch in epochs if epoch.start in span]
+    if not chosen:
+        raise StationError("no epoch in this span")
+    with JournalReader(site.station.data / "journal.sqlite") as journal:
+        names = {scan_stem(entry.name): entry.name for entry in journal.rows()}
+    folder.mkdir(parents=True, exist_ok=True)
+    usable = usable_site(site)
+    stored = {epoch.ref.epoch_file: epoch for epoch in stored_epochs(series, chosen)}
+    for epoch in track(chosen):
+        scan_id = stored[epoch.epoch_file].provenance.scan_id
+        scan = find_scan(site, names.get(scan_id, scan_id), epoch.start.timestamp())
+        if scan is None:
+            raise StationError(f"{epoch.epoch_file}: its scan {scan_id} is neither in the inbox nor archived")
+        path = folder / f"{Path(epoch.epoch_file).stem}.laz"
+        isolation.run_isolated(
+            write_points,
+            usable,
+            scan,
+            epoch,
+            stored[epoch.epoch_file].reference,
+            path,
+            memory_gb=site.service.memory_gb,
+            timeout_s=site.scans.timeout_s,
+        )
+        yield path
+
+
+def write_points(
+    site: Site, scan: ScanFile, epoch: EpochRef, version: str, path: Path, progress: Progress
+) -> None:
+    """Write the points of a scan on the grid; `version` is its reference, '' if it has none."""
+    with open_scan_for(site, scan.path) as reader:
+        start, end, _ = utc_interval(reader, site.scans.pattern)
+        inputs = load_scan_inputs(site, reader, scan.log, start, end, save_tilt_offset=False)
+        cells, method = _cells(epoch)
+        correction_m = _correction(site, reader, inputs, version if method == "joint" else "", progress)
+        header = _header(site, cells["elevation"])
+        with (
+            atomic_write(path) as tmp_path,
+            tmp_path.open("wb") as file,
+            laspy.LasWriter(file, header, do_compress=True, closefd=False) as writer,
+        ):
+            for shots in reader.blocks(intensity=site.scans.intensity):
+                points_m = to_map(shots, inputs.pose)
+                writer.write_points(_records(site, header, shots, points_m, correction_m, cells))
+                progress()
+
+
+def _correction(
+    site: Site, reader: ScanReader, inputs: ScanInputs, version: str, progress: Progress
+) -> Floats32:
+    """Return what the adjustment subtracts from heights (ny, nx) [m]; zero without one."""
+    reference = open_reference(series_for(site), version) if version else None
+    if reference is None:
+        return np.zeros(site.grid_cells.shape, np.float32)
+    viewing = load_viewing_geometry(site, inputs.geometry, reference)
+    gridder = new_gridder(inputs.geometry, viewing)
+    grid_scan(gridder, reader.blocks(intensity=site.scans.intensity), inputs.pose, progress)
+    return stacking_inputs(gridder, viewing, adjust_scan(site, gridder, inputs, viewing))[1]
+
+
+def _cells(epoch: EpochRef) -> tuple[dict[str, np.ndarray[Any, Any]], str]:
+    """Return the stored rasters of an epoch by name (ny, nx), NaN without a value, and its adjustment."""
+    with netCDF4.Dataset(epoch.path) as file:
+        floats = {
+            name: np.ma.filled(file[name][epoch.index].astype(np.float32), np.float32(np.nan))
+            for name in ("elevation", "elevation_change", "elevation_change_uncertainty")
+        }
+        quality = np.ma.filled(file["quality"][epoch.index], 0).astype(np.uint8)
+        return floats | {"quality": quality}, str(file["adjustment"][epoch.index])
+
+
+def _header(site: Site, elevation_m: Floats32) -> laspy.LasHeader:
+    header = laspy.LasHeader(point_format=POINT_FORMAT, version="1.4")
+    grid = site.grid_cells
+    middle_m = np.nan_to_num(np.nanmean(elevation_m)) if np.isfinite(elevation_m).any() else 0.0
+    header.scales, header.offsets = np.full(3, SCALE_M), np.round([grid.west_m, grid.north_m, middle_m])
+    header.add_extra_dims(
+        [laspy.ExtraBytesParams(name, kind, text) for name, (kind, text) in EXTRA_BYTES.items()]
+    )
+    if site.map.crs is not None:
+        header.add_crs(CRS.from_user_input(site.map.crs))
+    return header
+
+
+def _records(
+    site: Site,
+    header: laspy.LasHeader,
+    shots: Shots,
+    points_m: Floats,
+    correction_m: Floats32,
+    cells: dict[str, np.ndarray[Any, Any]],
+) -> laspy.ScaleAwarePointRecord:
+    """Return the points (3, n) that lie on the grid, corrected, with the values of their cells."""
+    grid = site.grid_cells
+    column = np.floor((points_m[0] - grid.west_m) / grid.cell_m).astype(np.int64)
+    row = np.floor((grid.north_m - points_m[1]) / grid.cell_m).astype(np.int64)
+    inside = np.flatnonzero((column >= 0) & (column < grid.nx) & (row >= 0) & (row < grid.ny))
+    cell = row[inside], column[inside]
+    records = laspy.ScaleAwarePointRecord.zeros(len(inside), header=header)
+    records.x, records.y = points_m[0, inside], points_m[1, inside]
+    records.z = points_m[2, inside] - correction_m[cell]
+    records.return_number[:] = records.number_of_returns[:] = 1
+    if shots.time_s is not None:
+        records.gps_time = shots.time_s[inside]
+    if shots.intensity is not None:
+        records.intensity = np.round(shots.intensity[inside] * MAX_INTENSITY).astype(np.uint16)
+    for name in EXTRA_BYTES:
+        records[name] = cells[name][cell]
+    return records

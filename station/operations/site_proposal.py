@@ -1,0 +1,202 @@
+"""`station init --from FOLDER`: a first site file from the scans, logs and matrices that lie in a folder."""
+
+from __future__ import annotations
+
+import os
+from collections import Counter
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from pyproj import CRS
+from pyproj.exceptions import CRSError
+
+from station.errors import ConfigError, StationError
+from station.inbox.inbox import is_scan
+from station.operations.inbox_contents import PATTERNS, files_below
+from station.operations.riscan_import import import_riscan, matrix_text, site_text, write_new
+from station.processing.workers import isolation
+from station.quantities import Floats
+from station.readers.formats.conversion import open_site_scan
+from station.readers.formats.riscan import Project, ScanPosition
+from station.readers.scan import ScanHeader, suffixes
+from station.readers.sop import read_matrix
+from station.scan_names import start_in_name
+from station.scanners import SCANNERS
+from station.sections import ScansSection
+
+LOG_SUFFIX = "-incl.txt"
+MATRIX_SUFFIXES = (".dat", ".txt", ".sop")
+MAX_MATRIX_BYTES = 1 << 14
+GEOCENTRIC_M = 6e6  # a POP leads to the centre of the Earth
+MAX_SCANNER_FRAME_M = 20_000.0  # farther from the origin, points are on a map
+FIRST_LINES = {  # of weather logs, and their dialect
+    "TOA5": "toa5", "SMET": "smet", "STATIONS_ID;MESS_DATUM": "dwd", "station_abbr;": "meteoswiss",
+    "Plot Title": "hobo",
+}  # fmt: skip
+MEMORY_GB, TIMEOUT_S = 4.0, 300.0  # to look at one scan
+
+
+@dataclass(frozen=True)
+class _Found:
+    """What lies in a folder."""
+
+    scan: Path  # the newest
+    pattern: str  # of the names, "" if none of the usual ones fits
+    has_logs: bool
+    sops: list[Path]
+    pop: Path | None
+    weather: tuple[Path, str] | None  # and its dialect
+    polygons: Path | None
+
+
+def propose_site(source: Path, folder: Path) -> list[Path]:
+    """Write a site file for what lies in `source` to a folder; return the files written, it first.
+
+    Without an SOP the map is local: its origin is the scanner, and the inclination log makes it level. Raises
+    ConfigError if there is no scan that can be read, or a file exists already.
+    """
+    projects = [path for path in files_below(source) if path.suffix.lower() == ".rsp"]
+    if projects:
+        return import_riscan(projects[0], folder)
+    found = _look_into(source)
+    try:
+        header = isolation.run_isolated(_header, found.scan, memory_gb=MEMORY_GB, timeout_s=TIMEOUT_S)
+    except StationError as error:
+        raise ConfigError(f"{found.scan}: cannot be read: {error}") from error
+    on_map = float(np.abs([header.low_m[:2], header.high_m[:2]]).min()) > MAX_SCANNER_FRAME_M
+    lines = [
+        f'inbox = "{source.resolve()}"',
+        *_name_lines(found),
+        f'frame = "{"map" if on_map else "scanner"}"',
+    ]
+    texts: dict[Path, str] = {}
+    if on_map:
+        project = Project(source.resolve().name, None, ())
+        more = [*_map_frame_lines(header), *_more_lines(found, mode="relative")]
+    else:
+        sop = read_matrix(found.sops[0]) if found.sops else np.eye(4)
+        project = _project(source.resolve().name, sop, found, header)
+        texts[folder / "SOP-SOP.dat"] = matrix_text(sop)
+        if project.pop is not None:
+            texts[folder / "POP.dat"] = matrix_text(project.pop)
+        more = _more_lines(found, mode="relative" if found.sops else "absolute")
+    site = site_text(f"what lies in {source}", project, lines, more)
+    return write_new(folder, {folder / "site.toml": site, **texts})
+
+
+def _header(path: Path, _progress: object) -> ScanHeader:
+    """Return the header of a scan; runs in a worker process."""
+    scans = ScansSection(inbox=path.parent)
+    with open_site_scan(path, scans, range_max_m=None, work_folder=path.parent) as reader:
+        return reader.header
+
+
+def _look_into(source: Path) -> _Found:
+    files = list(files_below(source))
+    scans = [path for path in files if is_scan(path.name, suffixes()) and path.parent == source]
+    if not scans:
+        raise ConfigError(f"{source}: no scan that can be read lies in it: see docs/how-to/your-own-files.md")
+    common = Counter(path.suffix.lower() for path in scans).most_common(1)[0][0]
+    scans = [path for path in scans if path.suffix.lower() == common]
+    patterns = (*PATTERNS, *(f"*{pattern}" for pattern in PATTERNS))
+    pattern = next((p for p in patterns if all(start_in_name(path.name, p) for path in scans)), "")
+    newest = max(scans, key=lambda path: (start_in_name(path.name, pattern) or 0) if pattern else path.name)
+    matrices = {
+        path: matrix
+        for path in files
+        if path.suffix.lower() in MATRIX_SUFFIXES and (matrix := _matrix(path)) is not None
+    }
+    pops = [path for path, matrix in matrices.items() if np.linalg.norm(matrix[:3, 3]) > GEOCENTRIC_M]
+    return _Found(
+        scan=newest,
+        pattern=pattern,
+        has_logs=any(path.name.endswith(LOG_SUFFIX) for path in files),
+        sops=[path for path in matrices if path not in pops],
+        pop=pops[0] if pops else None,
+        weather=next(((path, kind) for path in files if (kind := _dialect(path))), None),
+        polygons=next((path for path in files if path.suffix.lower() in {".geojson", ".gpkg", ".shp"}), None),
+    )
+
+
+def _matrix(path: Path) -> Floats | None:
+    if path.name.endswith(LOG_SUFFIX) or path.stat().st_size > MAX_MATRIX_BYTES:
+        return None
+    try:
+        return read_matrix(path)
+    except ConfigError:
+        return None
+
+
+def _dialect(path: Path) -> str:
+    """Return the dialect of a weather log by its first line, '' if it is none."""
+    if path.suffix.lower() not in {".dat", ".csv", ".txt", ".smet"} or not os.access(path, os.R_OK):
+        return ""
+    with path.open("rb") as file:
+        line = file.readline(1000).decode("utf-8", "replace").lstrip('"\ufeff')
+    return next((kind for start, kind in FIRST_LINES.items() if line.startswith(start)), "")
+
+
+def _name_lines(found: _Found) -> list[str]:
+    if not found.pattern:
+        return [f'name = "%y%m%d_%H%M%S"   # check: names such as {found.scan.name} do not match it']
+    return [f'name = "{found.pattern}"', 'zone = "UTC"   # check: of the times in names']
+
+
+def _project(name: str, sop: Floats, found: _Found, header: ScanHeader) -> Project:
+    """Return a project of one scan position, as far as its scan reaches."""
+    extent_m = float(np.abs([header.low_m[:2], header.high_m[:2]]).max())
+    position = ScanPosition("SOP", sop, _model_for(extent_m), None, "", None, extent_m)
+    pop = read_matrix(found.pop) if found.pop and found.sops else None
+    return Project(name, pop, (position,))
+
+
+def _model_for(range_m: float) -> str:
+    """Return the scanner that reaches no farther than it must: a file does not tell which it is."""
+    reaching = [name for name, values in SCANNERS.items() if values["range_max_m"] >= range_m]
+    return min(reaching, key=lambda name: SCANNERS[name]["range_max_m"], default="riegl-vz-6000")
+
+
+def _map_frame_lines(header: ScanHeader) -> list[str]:
+    """Return map and grid of scans that are on a map already."""
+    (west_m, south_m, _), (east_m, north_m, _) = header.low_m, header.high_m
+    edges = [np.floor(west_m), np.floor(south_m), np.ceil(east_m), np.ceil(north_m)]
+    pairs = ", ".join(
+        f"{key} = {value:.0f}" for key, value in zip(("west", "south", "east", "north"), edges, strict=True)
+    )
+    return [
+        "[map]",
+        f'crs = "{_code(header)}"   # check',
+        "# origin = { latitude_deg = …, longitude_deg = …, height_m = … }   # check: of the scanner",
+        "",
+        "[grid]   # check: the part that you want, and its resolution",
+        f"bounds_m = {{ {pairs} }}",
+        "cell_m = 1.0",
+        "",
+    ]
+
+
+def _code(header: ScanHeader) -> str:
+    """Return the EPSG code of the CRS that a scan declares, without one that of a UTM zone to correct."""
+    try:
+        code = CRS.from_user_input(header.crs_wkt).to_epsg() if header.crs_wkt else None
+    except CRSError:
+        code = None
+    return f"EPSG:{code or 32632}"
+
+
+def _more_lines(found: _Found, *, mode: str) -> list[str]:
+    lines: list[str] = []
+    if found.has_logs:
+        note = "   # check: without an SOP, the log makes the map level" if mode == "absolute" else ""
+        lines += ["[inclination]", f'suffix = "{LOG_SUFFIX}"', f'mode = "{mode}"{note}', ""]
+    if found.weather is not None:
+        path, kind = found.weather
+        weather = ["[weather]", f'file = "{path.resolve()}"', f'format = "{kind}"']
+        if kind == "toa5":  # its columns have no usual names
+            names = 'temperature_c = "…", humidity_pct = "…", pressure_hpa = "…"'
+            weather = [f"# {line}" for line in (*weather, f"columns = {{ {names} }}   # check")]
+        lines += [*weather, ""]
+    if found.polygons is not None:
+        lines += ["[areas]", f'file = "{found.polygons.resolve()}"', ""]
+    return lines

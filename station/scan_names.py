@@ -1,0 +1,66 @@
+"""Names of scan files: the stem that scan, log and epoch share, and the start that the name states."""
+
+from __future__ import annotations
+
+import re
+from datetime import UTC, datetime
+from functools import lru_cache
+from pathlib import PurePath
+from zoneinfo import ZoneInfo
+
+COMPRESSED = ".gz"
+INNER_SUFFIXES = (".copc",)  # `x.copc.laz` is the scan `x`
+# Digits of the fields of a pattern; any other field is at least one character.
+FIELD_DIGITS = {"Y": 4, "m": 2, "d": 2, "H": 2, "I": 2, "M": 2, "S": 2, "y": 2, "j": 3}
+ANY = "*"
+ZONE_MARK = "@"  # separates the pattern from its time zone
+
+
+def scan_stem(name: str | PurePath) -> str:
+    """Return the name of a scan without folder and suffixes, also of `x.laz.gz` and `x.copc.laz`."""
+    base = PurePath(name).name
+    if base.lower().endswith(COMPRESSED):
+        base = base[: -len(COMPRESSED)]
+    stem = PurePath(base).stem
+    inner = PurePath(stem).suffix
+    return stem[: -len(inner)] if inner.lower() in INNER_SUFFIXES else stem
+
+
+@lru_cache(maxsize=1 << 16)
+def start_in_name(name: str, pattern: str) -> datetime | None:
+    """Return the start of a scan (UTC) that its name states; None if it does not match the pattern.
+
+    The pattern is one of strptime, in which `*` stands for any characters. `@` and the name of a time zone
+    may follow; of an hour that occurs twice, the first is meant.
+    """
+    pattern, _, zone = pattern.partition(ZONE_MARK)
+    stem = scan_stem(name)
+    if ANY in pattern:
+        match = _expression(pattern).fullmatch(stem)
+        if match is None:
+            return None
+        stem, pattern = "".join(match.groups()), pattern.replace(ANY, "")
+    try:
+        start = datetime.strptime(stem, pattern)  # noqa: DTZ007 - the pattern may contain a zone
+    except ValueError:
+        return None
+    if start.tzinfo is None:
+        start = start.replace(tzinfo=ZoneInfo(zone) if zone else UTC)
+    return start.astimezone(UTC)
+
+
+@lru_cache
+def _expression(pattern: str) -> re.Pattern[str]:
+    """Return the expression of a pattern with `*`; its groups are what is between the `*`."""
+    parts = []
+    for part in pattern.split(ANY):
+        fields = re.findall(r"%.|[^%]+", part)
+        parts.append("(" + "".join(_field_expression(field) for field in fields) + ")")
+    return re.compile(".*".join(parts))
+
+
+def _field_expression(field: str) -> str:
+    if not field.startswith("%"):
+        return re.escape(field)
+    digits = FIELD_DIGITS.get(field[1])
+    return rf"\d{{{digits}}}" if digits else "%" if field == "%%" else ".+"

@@ -1,0 +1,81 @@
+"""`station init --from FOLDER` writes a site file that measures the scans in the folder."""
+
+import shutil
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+from pyproj import CRS
+from support import tiny_station
+
+from station.config import read_site
+from station.errors import ConfigError
+from station.operations.site_proposal import propose_site
+
+
+@pytest.fixture(scope="module")
+def station_folder(tmp_path_factory):
+    folder = tiny_station.build(tmp_path_factory.mktemp("proposal") / "station", hours=2)
+    return folder / tiny_station.PENDING
+
+
+@pytest.fixture
+def source(station_folder, tmp_path):
+    return shutil.copytree(station_folder, tmp_path / "scans")
+
+
+def test_scans_without_anything_else_level_themselves(source, tmp_path):
+    paths = propose_site(source, tmp_path / "site")
+    site = read_site(paths[0])
+    assert site.scans.inbox == source.resolve()
+    assert (site.scans.frame, site.scans.name) == ("scanner", "%y%m%d_%H%M%S")
+    assert site.inclination.mode == "absolute"
+    assert site.map.crs is None
+    np.testing.assert_array_equal(np.loadtxt(tmp_path / "site" / "SOP-SOP.dat"), np.eye(4))
+    with pytest.raises(ConfigError, match="already exists"):
+        propose_site(source, tmp_path / "site")
+
+
+@pytest.mark.integration
+def test_the_proposed_site_measures_the_scans(source, tmp_path):
+    site, *_ = propose_site(source, tmp_path / "site")
+    scans = sorted(source.glob("*.laz"))
+    result = subprocess.run(
+        [sys.executable, "-m", "station", "process", site, *scans],
+        capture_output=True, text=True, check=False, timeout=200,
+    )  # fmt: skip
+    assert result.returncode == 0, result.stderr + result.stdout
+    assert result.stdout.count("good") + result.stdout.count("degraded") == 2
+
+
+def test_matrices_weather_and_polygons_are_found(source, tmp_path, shared_data):
+    for name in ("SOP", "POP"):
+        shutil.copy(shared_data / f"mammoth/2020-2021-{name}.dat", source)
+    (source / "weather.txt").write_text(
+        "STATIONS_ID;MESS_DATUM;  QN;PP_10;TT_10;TM5_10;RF_10;TD_10;eor\n"
+        "3;202507150010;3;684.5;-1.5;-1.0;51.0;-1.6;eor\n"
+    )
+    site = read_site(propose_site(source, tmp_path / "site")[0])
+    assert CRS.from_user_input(site.map.crs).to_epsg() == 32611  # Mammoth Mountain
+    assert site.weather.format == "dwd"
+    assert site.inclination.mode == "relative"
+    expected = np.loadtxt(shared_data / "mammoth/2020-2021-SOP.dat")
+    np.testing.assert_allclose(np.loadtxt(site.sop[0].file), expected, atol=1e-6)
+
+
+def test_scans_on_the_map_and_other_names(tmp_path):
+    points_m = [*np.random.default_rng(2).uniform(0, 50, (3, 500)), [600000.0], [5100000.0], [2000.0]]
+    source = tmp_path / "scans"
+    source.mkdir()
+    lines = [" ".join(f"{value:.3f}" for value in point) for point in points_m.T]
+    (source / "hut_2025-07-15_09-00-00.xyz").write_text("\n".join(lines) + "\n")
+    site = read_site(propose_site(source, tmp_path / "site")[0])
+    assert (site.scans.frame, site.scans.name) == ("map", "*%Y-%m-%d_%H-%M-%S")
+    assert site.grid.bounds_m.west == 600_000.0
+    assert not site.sop
+
+
+def test_a_folder_without_scans_is_refused(tmp_path):
+    with pytest.raises(ConfigError, match="no scan that can be read"):
+        propose_site(tmp_path, tmp_path / "site")

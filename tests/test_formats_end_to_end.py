@@ -1,0 +1,145 @@
+"""From a folder of scans of each format to the series, by the lines of docs/how-to/your-own-files.md."""
+
+import gzip
+import json
+import subprocess
+import sys
+
+import laspy
+import numpy as np
+import pytest
+import xarray as xr
+from readers.formats import test_formats as written
+
+pytestmark = pytest.mark.integration
+
+COUNT, CELL_M, SIZE = 40_000, 0.5, 10.0
+WEST_M, SOUTH_M = 600_000.0, 5_100_000.0
+SITE = """
+[station]
+id = "formats"
+data = "data"
+[scans]
+inbox = "inbox"
+frame = "map"
+settle_s = 0
+{scans}
+[map]
+crs = "EPSG:32632"
+[grid]
+bounds_m = {{ west = 600000, south = 5100000, east = 600010, north = 5100010 }}
+cell_m = 0.5
+[adjustment]
+method = "none"
+"""
+
+
+class Ground(written.Points):
+    """Echoes of a wavy ground on the map; only the last returns are ground."""
+
+    def __init__(self):
+        super().__init__(COUNT)
+        random = np.random.default_rng(7)
+        x_m, y_m = random.uniform(0.01, SIZE - 0.01, (2, COUNT))
+        z_m = 1500 + 0.2 * np.sin(x_m) + 0.1 * y_m + random.normal(0, 0.005, COUNT)
+        z_m[~self.is_last] += 0.8  # what is in the way: it must not count
+        self.xyz_m = np.stack([WEST_M + x_m, SOUTH_M + y_m, z_m])
+        self.xyz_m = np.round(self.xyz_m, 3) + 0.0003  # no point is on the edge of a cell
+
+
+def las(path, points):
+    header = laspy.LasHeader(point_format=6, version="1.4")
+    header.scales, header.offsets = [0.0001] * 3, [WEST_M, SOUTH_M, 0.0]
+    scan = laspy.LasData(header)
+    scan.x, scan.y, scan.z = points.xyz_m
+    scan.gps_time, scan.intensity = points.time_s, points.intensity
+    scan.return_number, scan.number_of_returns = points.return_number, points.number_of_returns
+    scan.write(path)
+    return path
+
+
+def packed(path, points):
+    plain = las(path / "plain.laz", points)
+    (path / "a.laz.gz").write_bytes(gzip.compress(plain.read_bytes()))
+    plain.unlink()
+    return path / "a.laz.gz"
+
+
+def foreign(path, points):
+    return las(path / "plain.laz", points).rename(path / "a.rxp")
+
+
+def copc(path, points):
+    copclib = pytest.importorskip("copclib")
+    config = copclib.CopcConfigWriter(
+        6, copclib.Vector3(*[0.0001] * 3), copclib.Vector3(WEST_M, SOUTH_M, 0.0)
+    )
+    low_m, high_m = points.xyz_m.min(axis=1) - 0.001, points.xyz_m.max(axis=1) + 0.001
+    config.las_header.min, config.las_header.max = copclib.Vector3(*low_m), copclib.Vector3(*high_m)
+    writer = copclib.FileWriter(str(path / "a.copc.laz"), config)
+    order = np.random.default_rng(1).permutation(COUNT)  # by level, not by time
+    for key, indices in (
+        ((0, 0, 0, 0), order[:500]),
+        ((1, 0, 0, 0), order[500:9000]),
+        ((1, 1, 0, 0), order[9000:]),
+    ):
+        node = copclib.Points(writer.copc_config.las_header)
+        for index in indices.tolist():
+            point = node.CreatePoint()
+            point.x, point.y, point.z = points.xyz_m[:, index].tolist()
+            point.gps_time, point.intensity = float(points.time_s[index]), int(points.intensity[index])
+            point.return_number = int(points.return_number[index])
+            point.number_of_returns = int(points.number_of_returns[index])
+            node.AddPoint(point)
+        writer.AddNode(copclib.VoxelKey(*key), node)
+    writer.Close()
+    return path / "a.copc.laz"
+
+
+COPY = [sys.executable, "-c", "import shutil, sys; shutil.copy(*sys.argv[1:3])", "{in}", "{out}"]
+FORMATS = {
+    "laz": (lambda path, points: las(path / "a.laz", points), ""),
+    "copc": (copc, ""),
+    "laz.gz": (packed, ""),
+    "e57": (lambda path, points: written.e57_file(path / "a.e57", points), ""),
+    "ply": (lambda path, points: written.ply_file(path / "a.ply", points), ""),
+    "pcd": (written.FULL["compressed pcd"], ""),
+    "named text": (written.FULL["xyz"], ""),
+    "text": (
+        lambda path, points: written.text_file(path / "a.csv", points, delimiter=",", fields="xyzitnc"),
+        (
+            'suffix = ".csv"\n'
+            'columns = ["x", "y", "z", "intensity", "time", "return_number", "number_of_returns"]'
+        ),
+    ),
+    "convert": (foreign, f'suffix = ".rxp"\nconvert = {json.dumps(COPY)}'),
+}
+
+
+def station(*arguments):
+    return subprocess.run([sys.executable, "-m", "station", *map(str, arguments)],
+                          capture_output=True, text=True, check=False, timeout=120)  # fmt: skip
+
+
+@pytest.mark.parametrize("kind", FORMATS)
+def test_counts_are_exact_and_means_to_the_storage_quantum(kind, tmp_path):
+    write, lines = FORMATS[kind]
+    points = Ground()
+    (tmp_path / "inbox").mkdir()
+    scan = write(tmp_path / "inbox", points)
+    scan = scan.rename(scan.with_name("250715_090000" + scan.name[1:]))
+    (tmp_path / "site.toml").write_text(SITE.format(scans=lines))
+    result = station("process", tmp_path / "site.toml", scan)
+    assert result.returncode == 0, result.stderr
+    column, row = ((points.xyz_m[:2] - [[WEST_M], [SOUTH_M]]) / CELL_M).astype(int)
+    shape = round(SIZE / CELL_M), round(SIZE / CELL_M)
+    cell = ((shape[0] - 1 - row) * shape[1] + column)[points.is_last]
+    count = np.bincount(cell, minlength=shape[0] * shape[1]).reshape(shape)
+    height_m = np.bincount(cell, points.xyz_m[2, points.is_last] - 1500, shape[0] * shape[1])
+    mean_m = 1500 + height_m.reshape(shape) / count
+    with xr.open_dataset(next((tmp_path / "data" / "epochs").rglob("*.nc"))) as epoch:
+        stored = epoch.isel(time=0) if "time" in epoch.dims else epoch
+        np.testing.assert_array_equal(stored["point_count"], count)
+        assert np.abs(stored["elevation"].to_numpy() - mean_m).max() <= 2**-11 + (kind == "pcd") * 1e-4
+        assert float(stored["point_total"]) == COUNT
+    assert not list((tmp_path / "data").glob("converting-*"))

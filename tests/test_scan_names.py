@@ -1,0 +1,67 @@
+"""Stems of scan files, and starts in their names."""
+
+from datetime import UTC, datetime
+
+import pytest
+from pydantic import ValidationError
+
+from station.scan_names import scan_stem, start_in_name
+from station.sections import ScansSection
+
+START = datetime(2025, 7, 15, 9, 0, 5, tzinfo=UTC)
+
+
+@pytest.mark.parametrize(
+    ("name", "stem"),
+    [
+        ("250715_090000.laz", "250715_090000"),
+        ("a/b/250715_090000.laz.gz", "250715_090000"),
+        ("250715_090000.COPC.LAZ", "250715_090000"),
+        ("250715_090000.copc.laz.gz", "250715_090000"),
+        ("a.b.laz", "a.b"),
+        ("250715_090000", "250715_090000"),
+    ],
+)
+def test_stem_is_the_name_without_all_suffixes(name, stem):
+    assert scan_stem(name) == stem
+
+
+@pytest.mark.parametrize(
+    ("name", "pattern"),
+    [
+        ("250715_090005.laz", "%y%m%d_%H%M%S"),
+        ("ScanPos001_250715_090005.laz", "*_%y%m%d_%H%M%S"),
+        ("ScanPos001_250715_090005.laz", "ScanPos*_%y%m%d_%H%M%S"),
+        ("hut 20250715T090005 v2.laz", "*%Y%m%dT%H%M%S*"),
+        ("1_20250715_2_090005.laz", "*_%Y%m%d_*_%H%M%S"),
+        ("Jul-15-2025_090005.laz", "%b-%d-%Y_%H%M%S"),
+        ("a+15Jul25_090005.laz", "*+%d%b%y_%H%M%S"),
+        ("250715_110005.laz", "%y%m%d_%H%M%S@Europe/Vienna"),
+        ("250715_110005+0200.laz", "%y%m%d_%H%M%S%z@America/New_York"),
+    ],
+)
+def test_start_is_found_by_patterns_with_wildcards_and_zones(name, pattern):
+    assert start_in_name(name, pattern) == START
+
+
+@pytest.mark.parametrize("name", ["ScanPos001.laz", "Scan_250715_090005.laz", "ScanPos_2507151_090005.laz"])
+def test_other_names_have_no_start(name):
+    assert start_in_name(name, "ScanPos*_%y%m%d_%H%M%S") is None
+
+
+def test_summer_time_ends_at_the_hour_that_zones_say():
+    pattern = "%y%m%d_%H%M%S@Europe/Vienna"
+    starts = [start_in_name(f"251026_0{hour}3000.laz", pattern) for hour in (1, 2, 3)]
+    assert [start.hour for start in starts] == [23, 0, 2]  # 02:30 occurs twice: the first is meant
+
+
+def test_patterns_and_zones_of_the_site_file_are_checked(tmp_path):
+    assert ScansSection(inbox=tmp_path, zone="Europe/Vienna").pattern == "%y%m%d_%H%M%S@Europe/Vienna"
+    assert ScansSection(inbox=tmp_path, name="*_%y%m%d_%H%M%S").pattern == "*_%y%m%d_%H%M%S"
+    for zone in ("Europe/Atlantis", "../etc/passwd", "Europe"):
+        with pytest.raises(ValidationError, match="no time zone"):
+            ScansSection(inbox=tmp_path, zone=zone)
+    with pytest.raises(ValidationError, match="needs suffix"):
+        ScansSection(inbox=tmp_path, convert=("pdal", "{in}", "{out}"))
+    with pytest.raises(ValidationError, match=r"lacks \{out\}"):
+        ScansSection(inbox=tmp_path, suffix=".rxp", convert=("pdal", "{in}"))
