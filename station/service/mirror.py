@@ -21,7 +21,7 @@ from station.products.exports.formats import FORMATS
 from station.products.exports.selection import pending, select, split
 from station.service.host import Host
 
-PERIODS = {"references": "1D"}  # of each file: one for all days would be written anew with each epoch
+PERIODS = {"references": "1D"}  # of each file: one for all days would be rewritten with each epoch
 
 
 def update_mirror(site: Site, progress: Progress) -> str:
