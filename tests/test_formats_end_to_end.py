@@ -2,6 +2,8 @@
 
 import gzip
 import json
+import re
+import shutil
 import subprocess
 import sys
 
@@ -10,6 +12,9 @@ import numpy as np
 import pytest
 import xarray as xr
 from readers.formats import test_formats as written
+from support import tiny_station
+
+from station import open as open_series
 
 pytestmark = pytest.mark.integration
 
@@ -143,3 +148,33 @@ def test_counts_are_exact_and_means_to_the_storage_quantum(kind, tmp_path):
         assert np.abs(stored["elevation"].to_numpy() - mean_m).max() <= 2**-11 + (kind == "pcd") * 1e-4
         assert float(stored["point_total"]) == COUNT
     assert not list((tmp_path / "data").glob("converting-*"))
+
+
+def test_scans_without_scan_lines_are_measured_like_others(tmp_path):
+    """The same echoes in any order, as a scanner without scan lines gives them, are the same series."""
+    plyfile = pytest.importorskip("plyfile")
+    folder = tiny_station.build(tmp_path / "laz", method="joint", hours=3)
+    (folder / "inbox").rmdir()
+    (folder / tiny_station.PENDING).rename(folder / "inbox")
+    text = re.sub(r"\[inclination\]\n(?:[^\[\n].*\n|\n)*", "", (folder / "site.toml").read_text())
+    assert 'frame = "scanner"' in text
+    text = re.sub(r"point_time = .*\n", "", text)
+    text = text.replace('frame = "scanner"', 'point_time = "none"\nframe = "scanner"')
+    (folder / "site.toml").write_text(text)
+    shuffled = shutil.copytree(folder, tmp_path / "ply")
+    for path in (shuffled / "inbox").glob("*.laz"):
+        las = laspy.read(path)
+        order = np.random.default_rng(4).permutation(len(las.points))
+        fields = {"x": las.x, "y": las.y, "z": las.z, "timestamp": las.gps_time, "intensity": las.intensity}
+        columns = {name: np.asarray(values)[order] for name, values in fields.items()}
+        records = np.rec.fromarrays(list(columns.values()), names=list(columns))
+        element = plyfile.PlyElement.describe(np.asarray(records), "vertex")
+        plyfile.PlyData([element]).write(str(path.with_suffix(".ply")))
+        path.unlink()
+    for site, suffix in ((folder, ".laz"), (shuffled, ".ply")):
+        result = station("process", site / "site.toml", *sorted((site / "inbox").glob(f"*{suffix}")))
+        assert result.returncode == 0, result.stdout + result.stderr
+    expected, actual = (open_series(site / "data") for site in (folder, shuffled))
+    assert np.isfinite(expected["elevation_change"]).any()
+    for name in ("point_count", "elevation", "elevation_change", "elevation_change_uncertainty"):
+        np.testing.assert_array_equal(actual[name], expected[name], name)

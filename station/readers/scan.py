@@ -167,7 +167,7 @@ def open_scan(path: Path, *, range_max_m: float | None = None, columns: Sequence
         with decoder_errors("cannot be opened"):
             return known[TEXT](path, range_max_m=range_max_m, columns=columns)  # type: ignore[call-arg]
     if suffix not in known:
-        raise ScanError(f"no reader for {suffix or 'a name without suffix'!r}: {', '.join(known)}")
+        raise ScanError(f"no reader for {suffix or 'a name without suffix'!r}: {', '.join(sorted(known))}")
     with decoder_errors("cannot be opened"):
         return known[suffix](path, range_max_m=range_max_m)
 

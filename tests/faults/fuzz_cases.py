@@ -34,7 +34,7 @@ from station.readers.scan import open_scan, utc_interval
 from station.readers.sop import read_matrix
 from station.readers.weather import VALID_RANGES, interpolate_air, read_weather
 from station.science.geometry import inclination, pose
-from station.sections import WeatherColumns
+from station.sections import WeatherSection
 
 TIMEOUT_S = 5  # for one case of a few kilobytes
 MEMORY_BYTES = 1 << 29  # in addition to the imported modules
@@ -46,9 +46,15 @@ VALID_FILES = {  # kind: file of the corpus, in the order of `write_corpus`
     "laz": "250715_000000.laz",
     "old_laz": "250715_010000.laz",
     "week_las": "250720_000000.las",
+    "e57": "250715_000000.e57",
+    "ply": "250715_000000.ply",
+    "pcd": "250715_000000.pcd",
+    "xyz": "250715_000000.xyz",
     "inclination": "incl.txt",
     "toa5": "weather.dat",
     "csv": "weather.csv",
+    "smet": "weather.smet",
+    "dwd": "weather.dwd",
     "sop": "sop.dat",
     "site": "site.toml",
     "polygons": "stable.geojson",
@@ -196,14 +202,8 @@ def check_weather(path, rng):
     offset_h = rng.choice((0, 1, -7, 5.5))
     moment_s = datetime(2025, 7, 15, 1, tzinfo=UTC).timestamp()
     window = rng.choice((None, (moment_s - 3600, moment_s + 3600)))
-    columns = COLUMNS[path.name.rpartition(".")[2]]
-    log = read_weather(
-        path,
-        format="toa5" if path.name.endswith("dat") else "csv",
-        columns=columns,
-        utc_offset_h=offset_h,
-        window_utc_s=window,
-    )
+    settings = WEATHER[path.name.rpartition(".")[2]]
+    log = read_weather(WeatherSection(file=path, utc_offset_h=offset_h, **settings), window)
     assert np.isfinite(log.time_utc_s).all()
     assert (np.diff(log.time_utc_s) > 0).all()
     air = interpolate_air(log, moment_s, 3600.0)
@@ -239,14 +239,25 @@ def check_polygons(path, _dice):
         cells_inside(polygon, grid)
 
 
-COLUMNS = {
-    "dat": WeatherColumns(temperature_c="TAact_2m_Avg", humidity_pct="RHact_2m_Avg", pressure_hpa="Pact"),
-    "csv": WeatherColumns(time="time", temperature_c="t", humidity_pct="rh", pressure_hpa="p"),
+WEATHER = {  # settings by suffix
+    "dat": {
+        "format": "toa5",
+        "columns": {"temperature_c": "TAact_2m_Avg", "humidity_pct": "RHact_2m_Avg", "pressure_hpa": "Pact"},
+    },
+    "csv": {
+        "format": "csv",
+        "columns": {"time": "time", "temperature_c": "t", "humidity_pct": "rh", "pressure_hpa": "p"},
+    },
+    "smet": {"format": "smet"},
+    "dwd": {"format": "dwd"},
 }
 TEXT_CHECKS = {
     "inclination": check_inclination,
     "toa5": check_weather,
     "csv": check_weather,
+    "smet": check_weather,
+    "dwd": check_weather,
+    "xyz": check_scan,
     "sop": check_sop,
     "site": check_site,
     "polygons": check_polygons,

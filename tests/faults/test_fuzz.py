@@ -16,6 +16,7 @@ import harness
 import laspy
 import numpy as np
 import pytest
+from readers.formats import test_formats as written
 
 WEIGHTS = {"las": 3, "laz": 4, "old_laz": 3, "week_las": 2}  # 1 for the others
 
@@ -37,8 +38,33 @@ def corpus(tmp_path_factory):
         for n in range(180)
     ]
     (target / "weather.csv").write_text("time,t,rh,p\n" + "".join(rows))
+    write_dialects(target)
+    write_formats(target)
     write_scans(laspy.read(station / harness.PENDING / f"{harness.scan_name(0)}.laz"), target)
     return folder
+
+
+def write_dialects(target):
+    """Write weather of three hours as SMET and as the DWD does."""
+    rows = [(n, n / 10 - 3, 50 + n / 9, 684 + n / 50) for n in range(180)]
+    header = "SMET 1.1 ASCII\n[HEADER]\nnodata = -999\ntz = 0\nfields = timestamp TA RH P\n[DATA]\n"
+    lines = [
+        f"2025-07-15T0{n // 60}:{n % 60:02d}:00 {t + 273.15} {rh / 100} {p * 100}\n" for n, t, rh, p in rows
+    ]
+    (target / "weather.smet").write_text(header + "".join(lines))
+    header = "STATIONS_ID;MESS_DATUM;  QN;PP_10;TT_10;RF_10;eor\n"
+    lines = [f"3;202507150{n // 60}{n % 60:02d};3;{p:.1f};{t:.1f};{rh:.1f};eor\n" for n, t, rh, p in rows]
+    (target / "weather.dwd").write_text(header + "".join(lines))
+
+
+def write_formats(target):
+    """Write a few points in the formats of other programs."""
+    points, stem = written.Points(400), target / "250715_000000"
+    written.e57_file(stem.with_suffix(".e57"), points)
+    written.ply_file(stem.with_suffix(".ply"), points)
+    written.pcd_file(stem.with_suffix(".pcd"), points, "BINARY_COMPRESSED")
+    header = "//X Y Z Intensity GpsTime return_number number_of_returns"
+    written.text_file(stem.with_suffix(".xyz"), points, header=header, fields="xyzitnc")
 
 
 def write_scans(scan, target):

@@ -65,7 +65,8 @@ def test_matrices_weather_and_polygons_are_found(source, tmp_path, shared_data):
 
 
 def test_scans_on_the_map_and_other_names(tmp_path):
-    points_m = [*np.random.default_rng(2).uniform(0, 50, (3, 500)), [600000.0], [5100000.0], [2000.0]]
+    points_m = np.random.default_rng(2).uniform(0, 50, (3, 500))
+    points_m += np.array([[600_000.0], [5_100_000.0], [2000.0]])
     source = tmp_path / "scans"
     source.mkdir()
     lines = [" ".join(f"{value:.3f}" for value in point) for point in points_m.T]

@@ -17,6 +17,7 @@ from station.readers.formats.point_tables import Contents, Table, TableScan, fie
 
 KINDS = {"I": "i", "U": "u", "F": "f"}
 MAX_HEADER_LINES = 100
+MAX_EXPANSION = 100  # of LZF, which copies at most 264 bytes by three
 SIZES = struct.Struct("<II")  # of the compressed data: compressed, uncompressed [bytes]
 
 
@@ -55,6 +56,8 @@ class PcdScan(TableScan):
             raise ScanError(
                 f"corrupt: {self._layout.count:,} points need {expected:,} bytes, it states {uncompressed:,}"
             )
+        if uncompressed > MAX_EXPANSION * compressed:
+            raise ScanError(f"corrupt: {compressed:,} bytes cannot hold {uncompressed:,} bytes of points")
         if compressed > file_size - self._layout.offset - SIZES.size:
             raise ScanError(f"cut off: {compressed:,} bytes of compressed points are not there")
         return compressed

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from itertools import islice
+from itertools import takewhile
 from pathlib import Path
 from typing import BinaryIO
 
@@ -14,7 +14,7 @@ from station.errors import ScanError
 from station.readers.formats.point_tables import Table
 from station.readers.formats.point_text import parse_rows
 
-MAX_HEADER_LINE = 4096  # bytes
+MAX_LINE = 4096  # bytes, of a header or a point
 MIN_TEXT_BYTES = 2  # of a number and what separates it from the next
 
 
@@ -57,7 +57,7 @@ class Layout:
 
 def read_header_line(file: BinaryIO) -> str:
     """Return the next line of a header; raise ScanError if there is none that is short enough."""
-    line = file.readline(MAX_HEADER_LINE)
+    line = file.readline(MAX_LINE)
     if not line.endswith(b"\n"):
         raise ScanError("its header is cut off, or not of this format")
     return line.decode("utf-8", "replace").strip()
@@ -79,7 +79,8 @@ def record_tables(path: Path, layout: Layout, size: int) -> Iterator[Table]:
 def _text_tables(path: Path, layout: Layout, size: int) -> Iterator[Table]:
     with path.open("rb") as file:
         file.seek(layout.offset)
-        lines = (line.decode("utf-8", "replace") for line in islice(file, layout.count))
+        raw_lines = (file.readline(MAX_LINE) for _ in range(layout.count))
+        lines = (line.decode("utf-8", "replace") for line in takewhile(bool, raw_lines))
         for rows in parse_rows(lines, size):
             if rows.shape[1] != len(layout.keys):
                 raise ScanError(f"a line has {rows.shape[1]} of {len(layout.keys)} values")

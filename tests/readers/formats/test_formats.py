@@ -287,6 +287,18 @@ def test_header_counts_that_lie_are_refused(tmp_path):
         open_scan(path)
 
 
+def test_a_bomb_of_compressed_points_is_refused(tmp_path):
+    path = pcd_file(tmp_path / "a.pcd", Points(300), "BINARY_COMPRESSED")
+    content = path.read_bytes()
+    start = content.index(b"DATA binary_compressed\n") + 23
+    size = struct.unpack("<II", content[start : start + 8])[1] // 300 * 50_000_000
+    content = content.replace(b"POINTS 300", b"POINTS 50000000")
+    start = content.index(b"DATA binary_compressed\n") + 23
+    path.write_bytes(content[:start] + struct.pack("<II", 1000, size) + content[start + 8 :])
+    with pytest.raises(ScanError, match="1,000 bytes cannot hold"):
+        open_scan(path)
+
+
 def test_organised_clouds_hold_nan_where_there_was_no_echo(tmp_path):
     points = Points(300)
     points.xyz_m[:, ::5] = np.nan
