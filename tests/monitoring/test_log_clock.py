@@ -81,6 +81,7 @@ def test_status_lists_the_offset_among_the_faults(problem_of, tmp_path, monkeypa
         grid=SimpleNamespace(shape=(2, 3)),
         adjusts=True,
         weather=None,
+        mirror=None,
         input_faults=(),
     )
     assert any("clock of the logger" in fault for fault in status.status(site)["faults"])
