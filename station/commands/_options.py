@@ -23,10 +23,29 @@ FromOption = Annotated[
 ToOption = Annotated[
     str | None, typer.Option("--to", metavar="TIME", help="Last epoch, UTC.", show_default=False)
 ]
+Polygons = Annotated[
+    Path | None,
+    typer.Argument(
+        metavar="[POLYGONS]",
+        help="File of named polygons; without it, those of the site.",
+        show_default=False,
+    ),
+]
+CsvOption = Annotated[
+    str | None, typer.Option("--csv", metavar="FILE", help="Write CSV; - is stdout.", show_default=False)
+]
 Against = Annotated[
     str, typer.Option(metavar="EPOCH", help="reference, previous, or an epoch: a scan's name or a time.")
 ]
 TIMES = ["%Y-%m-%d", "%Y-%m-%dT%H:%M:%S", "%Y-%m-%dT%H:%M:%SZ"]
+
+
+def print_or_write(text: str, file: str | None) -> None:
+    """Write a text to a file; print it without one, and as it is to stdout, which - stands for."""
+    if file is None or file == "-":
+        print(text, end="" if file else "\n")
+    else:
+        Path(file).write_text(text, encoding="utf-8")
 
 
 def progress_bar(label: str) -> Callable[[list[T]], Iterable[T]]:

@@ -9,7 +9,16 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from station.commands._options import Against, FromOption, SiteArgument, ToOption, progress_bar
+from station.commands._options import (
+    Against,
+    CsvOption,
+    FromOption,
+    Polygons,
+    SiteArgument,
+    ToOption,
+    print_or_write,
+    progress_bar,
+)
 
 if TYPE_CHECKING:
     from station.config import Site
@@ -40,20 +49,11 @@ class MapVariable(StrEnum):
 
 def areas(
     site: SiteArgument,
-    polygons: Annotated[
-        Path | None,
-        typer.Argument(
-            metavar="[POLYGONS]",
-            help="GeoJSON of named polygons; without it, those of the site.",
-            show_default=False,
-        ),
-    ] = None,
+    polygons: Polygons = None,
     first: FromOption = None,
     last: ToOption = None,
     against: Against = "reference",
-    table: Annotated[
-        str | None, typer.Option("--csv", metavar="FILE", help="Write CSV; - is stdout.", show_default=False)
-    ] = None,
+    table: CsvOption = None,
 ) -> None:
     """Print how areas changed, with 95 % intervals.
 
@@ -65,33 +65,19 @@ def areas(
     settings, span = read_site(site), Span.parse(first, last)
     _print_epochs(settings, against)
     records = area_records(settings, polygons, span, against, progress_bar("summing up"))
-    if table is None:
-        print(as_text(records))
-    elif table == "-":
-        print(as_csv(records), end="")
-    else:
-        Path(table).write_text(as_csv(records), encoding="utf-8")
+    print_or_write(as_text(records) if table is None else as_csv(records), table)
 
 
 def trend(
     site: SiteArgument,
-    polygons: Annotated[
-        Path | None,
-        typer.Argument(
-            metavar="[POLYGONS]",
-            help="GeoJSON of named polygons; without it, those of the site.",
-            show_default=False,
-        ),
-    ] = None,
+    polygons: Polygons = None,
     area: Annotated[str | None, typer.Option(help="One area instead of all.", show_default=False)] = None,
     first: FromOption = None,
     last: ToOption = None,
     every: Annotated[
         Period | None, typer.Option(help="A rate for each day or month, UTC.", show_default=False)
     ] = None,
-    table: Annotated[
-        str | None, typer.Option("--csv", metavar="FILE", help="Write CSV; - is stdout.", show_default=False)
-    ] = None,
+    table: CsvOption = None,
 ) -> None:
     """Print how fast areas change, and whether they speed up, with 95 % intervals.
 
@@ -105,12 +91,7 @@ def trend(
     settings, span = read_site(site), Span.parse(first, last)
     period = every.value if every else None
     records = trend_records(settings, polygons, span, area, period, progress_bar("summing up"))
-    if table is None:
-        print(as_text(records))
-    elif table == "-":
-        print(as_csv(records), end="")
-    else:
-        Path(table).write_text(as_csv(records), encoding="utf-8")
+    print_or_write(as_text(records) if table is None else as_csv(records), table)
 
 
 def _print_epochs(settings: Site, *texts: str) -> None:
