@@ -281,10 +281,9 @@ def _check_derived(series: Series) -> list[tuple[str, str, str]]:
 
 def _check_series(series: Series, refs: list[EpochRef], *, is_complete: bool) -> list[tuple[str, str, str]]:
     """Return findings if `series.nc` does not contain the stored epochs in order of time."""
-    if not refs:
-        return []
     if not series.path.is_file():
-        return [("fault", "series", "series.nc is missing: the service rebuilds it when it starts")]
+        message = "series.nc is missing: the service rebuilds it when it starts"
+        return [("fault", "series", message)] if refs else []
     if not is_intact(series):
         return [("fault", "series", "series.nc is damaged: the service rebuilds it with the next scan")]
     try:

@@ -220,8 +220,8 @@ def test_reader_of_an_open_journal_sees_changes_and_cannot_write(journal, tmp_pa
     store(journal)
     with JournalReader(tmp_path / "journal.sqlite") as reader:
         assert reader.counts()["stored"] == 1
-        with pytest.raises(StoreError, match="readonly"):
-            reader.requeue([NAME])
+        with pytest.raises(sqlite3.OperationalError, match="readonly"):
+            reader._connection.execute("DELETE FROM scan")
 
 
 def test_missing_journal_reads_as_empty(tmp_path):
