@@ -152,6 +152,8 @@ def _parser(
     """Return a function that parses a line into a row, or into None if it is not one."""
     required = (columns.time, columns.temperature_c, columns.pressure_hpa, columns.humidity_pct)
     missing = [name for name in required if name not in names]
+    if missing and any(";" in name for name in names):
+        raise ScanError(f"{file_name}: its columns are separated by ';': write commas, and points in numbers")
     if missing:
         raise ScanError(f"{file_name}: has no column {', '.join(missing)}; it has {', '.join(names)}")
     time_index, *value_indices = (names.index(name) for name in required)
