@@ -32,7 +32,7 @@ from support.tiny_station import PENDING, build, scan_name, values
 from station.config import read_site
 from station.errors import StationError
 from station.inbox.journal_reader import JournalReader, State
-from station.inbox.lock import IDENTITY
+from station.inbox.lock import IDENTITY, pause_reason
 from station.processing import integrity
 from station.service.daemon import Daemon, LoopTiming
 from station.service.scheduler import LoopEvent
@@ -338,7 +338,7 @@ class World(Machine):
         """Run the service through all that is planned, and restart it whenever it dies, as systemd does."""
         (self.folder / "state").mkdir(exist_ok=True)
         with self.installed():
-            while not self.is_over():
+            while not (self.is_finished or self.is_time_up()):
                 self.starts += 1
                 self.daemon = None
                 self.stop()  # a new service has a fork server of its own
@@ -355,15 +355,24 @@ class World(Machine):
                 self.advance(10.0)
 
     def is_over(self) -> bool:
-        """Return True if nothing is planned any more and no scan waits, or time is up."""
-        if self.timeline or self.elapsed_s < self.last_fault_s + 2 * HOUSEKEEPING_S:
-            return False
-        if self.elapsed_s > max(self.last_fault_s, _start_s(len(self.names))) + MAX_RECOVERY_S:
+        """Return True if nothing is planned any more, no scan waits and no fault, or if time is up."""
+        if self.is_time_up():
             return True
+        if (
+            self.timeline
+            or self.elapsed_s < self.last_fault_s + 2 * HOUSEKEEPING_S
+            or pause_reason(self.data)
+        ):
+            return False
         rows = self.rows()
         return set(self.names) <= rows.keys() and all(
             row.state in {State.STORED, State.SET_ASIDE} for row in rows.values()
         )
+
+    def is_time_up(self) -> bool:
+        """Return True long after the last scan and the last fault."""
+        end_s = max(self.last_fault_s, _start_s(len(self.names))) + 2 * HOUSEKEEPING_S + MAX_RECOVERY_S
+        return not self.timeline and self.elapsed_s > end_s
 
     def rows(self) -> dict[str, object]:
         """Return the rows of the journal by scan."""
