@@ -25,8 +25,16 @@ from station.sections import SiteFile
 PLAIN_MESSAGES = {  # instead of those of pydantic, which name Python classes
     "path_type": "give a path in quotes",
     "timezone_aware": "give the time zone: Z at the end for UTC",
+    "datetime_from_date_parsing": "give a date and time in UTC, as 2025-07-14T23:00:00Z",
+    "datetime_type": "give a date and time in UTC, as 2025-07-14T23:00:00Z",
     "model_type": "give a table of keys",
     "model_attributes_type": "give a table of keys",
+}
+ALTERNATIVES = {  # to a word, by the fault that pydantic reports for them
+    "model_type": "a table of keys",
+    "model_attributes_type": "a table of keys",
+    "float_parsing": "a number",
+    "int_parsing": "a whole number",
 }
 SCHEMA_NAME = "station-site.schema.json"  # next to the site file, whose first line refers to it
 
@@ -264,10 +272,16 @@ def _as_toml(value: object) -> str:
 def _merge_branches(faults: list[Any]) -> list[Any]:
     """Return the faults with one for each key: a key with several types reports a fault for each of them."""
     best: dict[tuple[object, ...], Any] = {}
+    alternatives: dict[tuple[object, ...], str] = {}
     for fault in faults:
         location = tuple(part for part in fault["loc"] if not _is_union_branch(part))
+        if fault["type"] in ALTERNATIVES:
+            alternatives[location] = ALTERNATIVES[fault["type"]]
         if location not in best or fault["type"] == "literal_error":
             best[location] = fault
+    for location, fault in best.items():
+        if fault["type"] == "literal_error" and location in alternatives:
+            best[location] = {**fault, "msg": f"{fault['msg']} or {alternatives[location]}"}
     nested = {location[:n] for location in best for n in range(len(location))}
     return [fault for location, fault in best.items() if not location or location not in nested]
 

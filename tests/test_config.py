@@ -75,7 +75,18 @@ def test_data_and_inbox_must_be_separate(tmp_path, data):
     [
         ('[[sop]]\nfrom = 2025-07-15T00:00:00\nfile = "s"\n', "sop.0.from: give the time zone: Z at the end"),
         ("[flags]\nfile = 3\n", "flags.file: give a path in quotes (given: 3)"),
-        ('[air]\nscanner_setting = "wether"\n', "air.scanner_setting: should be 'weather' (given: 'wether')"),
+        (
+            '[air]\nscanner_setting = "wether"\n',
+            "air.scanner_setting: should be 'weather' or a table of keys (given: 'wether')",
+        ),
+        (
+            '[inclination]\ncutoff_hz = "slow"\n',
+            "inclination.cutoff_hz: should be 'auto' or a number (given: 'slow')",
+        ),
+        (
+            '[[sop]]\nfrom = "yesterday"\nfile = "sop.dat"\n',
+            "sop.0.from: give a date and time in UTC, as 2025-07-14T23:00:00Z (given: 'yesterday')",
+        ),
         ('[[sop]]\nfrom = 2025-07-15T00:00:00Z\nfile = "s"\n' * 2, "two [[sop]] have the same from"),
     ],
 )

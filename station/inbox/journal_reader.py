@@ -134,11 +134,20 @@ class JournalReader:
         with self._store_errors():
             return [name for (name,) in self._connection.execute(query, (json.dumps(list(names)),))]
 
-    def epochs(self, state: State | None = None) -> dict[str, str]:
-        """Return the epoch file by scan name, for scans that have one and, if given, are in this state."""
-        query = "SELECT name, epoch FROM scan WHERE epoch IS NOT NULL AND state = coalesce(?, state)"
+    def epochs(self) -> dict[str, str]:
+        """Return the epoch file by scan name, for scans that have one."""
+        query = "SELECT name, epoch FROM scan WHERE epoch IS NOT NULL ORDER BY name"
         with self._store_errors():
-            return dict(self._connection.execute(f"{query} ORDER BY name", (state,)).fetchall())
+            return dict(self._connection.execute(query).fetchall())
+
+    def current_epochs(self) -> dict[str, str]:
+        """Return the epoch file by name of scans that are stored, or are unless their content has changed."""
+        query = (
+            "SELECT name, epoch FROM scan WHERE epoch IS NOT NULL AND 'stored' IN (state, outcome)"
+            " ORDER BY name"
+        )
+        with self._store_errors():
+            return dict(self._connection.execute(query).fetchall())
 
     def usable(self) -> list[str]:
         """Return the names of the scans stored with verdict `good`, in order of their start."""

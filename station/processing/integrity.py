@@ -281,11 +281,10 @@ def _check_derived(series: Series) -> list[tuple[str, str, str]]:
 
 def _check_series(series: Series, refs: list[EpochRef], *, is_complete: bool) -> list[tuple[str, str, str]]:
     """Return findings if `series.nc` does not contain the stored epochs in order of time."""
-    if not refs:
-        return []
     for path in (series.path, series.processing_path):
         if not path.is_file():
-            return [("fault", "series", f"{path.name} is missing: the service rebuilds it when it starts")]
+            message = f"{path.name} is missing: the service rebuilds it when it starts"
+            return [("fault", "series", message)] if refs else []
     if not is_intact(series):
         what = "series.nc or processing.nc is damaged"
         return [("fault", "series", f"{what}: the service rebuilds both with the next scan")]

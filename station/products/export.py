@@ -11,6 +11,8 @@ from pathlib import Path
 import numpy as np
 
 from station.archive.epochs import EpochRef
+from station.archive.netcdf_layout import Series
+from station.archive.reference_files import open_reference, valid_versions
 from station.archive.series.index import list_epochs, series_in
 from station.config import Site
 from station.errors import StationError
@@ -32,7 +34,8 @@ def export(site: Site, kind: str, span: Span | None, folder: Path, track: Track 
     series = series_in(site.station.data)
     table = read_epoch_table(series)
     if kind == "csv":
-        return _write_csv(site, table, span or Span.parse(None, None), folder)
+        versions_by_scan = _versions_by_scan(series)
+        return _write_csv(site, table, versions_by_scan, span or Span.parse(None, None), folder)
     versions = dict(zip(table.texts["epoch_file"], table.texts["reference_version"], strict=True))
     measured = [epoch for epoch in list_epochs(series) if versions.get(epoch.epoch_file)]
     chosen = measured[-1:] if span is None else [epoch for epoch in measured if epoch.start in span]
@@ -45,10 +48,24 @@ def export(site: Site, kind: str, span: Span | None, folder: Path, track: Track 
     return [path for epoch in track(chosen) for path in export_geotiff(series, epoch, folder, limit_m)]
 
 
-def _write_csv(site: Site, table: EpochTable, span: Span, folder: Path) -> list[Path]:
+def _versions_by_scan(series: Series) -> dict[str, list[str]]:
+    """Return the versions of the reference that each scan is part of, by scan."""
+    versions_by_scan: dict[str, list[str]] = {}
+    for version in valid_versions(series):
+        reference = open_reference(series, version)
+        for scan_id in reference.scan_ids if reference else ():
+            versions_by_scan.setdefault(scan_id, []).append(version)
+    return versions_by_scan
+
+
+def _write_csv(
+    site: Site, table: EpochTable, versions_by_scan: dict[str, list[str]], span: Span, folder: Path
+) -> list[Path]:
     stream = io.StringIO()
     writer = csv.writer(stream, lineterminator="\n")
-    writer.writerow(["time_utc", "start_utc", "end_utc", "scan", "verdict", "reason", *table.scalars])
+    writer.writerow(
+        ["time_utc", "start_utc", "end_utc", "scan", "verdict", "reason", *table.scalars, "in_reference"]
+    )
     for index, start_s in enumerate(table.start_s):
         start = datetime.fromtimestamp(float(start_s), UTC)
         if start in span:
@@ -60,6 +77,7 @@ def _write_csv(site: Site, table: EpochTable, span: Span, folder: Path) -> list[
                     table.verdict[index],
                     table.texts["verdict_reason"][index],
                     *(f"{number:.9g}" if np.isfinite(number) else "" for number in numbers),
+                    " ".join(versions_by_scan.get(table.texts["scan_id"][index], ())),
                 ]
             )
     files = {"scans.csv": stream.getvalue()}

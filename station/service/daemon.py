@@ -216,12 +216,12 @@ class Daemon:
                 self._due.discard(event)
                 self._guarded(event, task)
 
-    @staticmethod
-    def _guarded(event: LoopEvent, task: Callable[[], None]) -> None:
+    def _guarded(self, event: LoopEvent, task: Callable[[], None]) -> None:
         """Run a task and log any bug in it: housekeeping must not block the scans."""
         try:
             task()
         except StationError:
+            self._is_reconciled = False  # it may have stopped between two steps of a repair
             raise
         except Exception:
             log.exception(logfmt(failed=event.name.lower(), reason="a bug: please report it"))

@@ -12,7 +12,6 @@ from station.clock import Clock
 from station.config import Site
 from station.errors import ConfigError, StoreError
 from station.inbox.journal import Journal
-from station.inbox.journal_reader import State
 from station.logs import logfmt
 from station.processing.integrity import (
     add_checksums,
@@ -119,7 +118,7 @@ class StoreRepair:
         self._run(restore_tilt_offsets)
 
     def _requeue_missing(self) -> None:
-        for name in self._run(missing_epochs, self._journal.epochs(State.STORED)):
+        for name in self._run(missing_epochs, self._journal.current_epochs()):
             if (self._site.scans.inbox / name).is_file():
                 log.warning("%s", logfmt(scan=name, reason="epoch missing from the store: reprocessing"))
                 self._journal.requeue([name])

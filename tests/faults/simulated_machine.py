@@ -50,6 +50,7 @@ class Machine:
         self.is_disk_full = self.is_out_of_space = False
         self.start_error: OSError | None = None  # of every process that is to be started
         self.is_out_of_memory = self.is_socket_deleted = False
+        self.is_finished = False  # the service was idle, and nothing will happen any more
 
     def host(self) -> Host:
         """Return what the service needs of this machine."""
@@ -65,7 +66,11 @@ class Machine:
         )
 
     def is_over(self) -> bool:
-        """Return True when the service may stop."""
+        """Return True if the service, which is idle, may stop."""
+        raise NotImplementedError
+
+    def is_time_up(self) -> bool:
+        """Return True if the service has had its time, whatever it does."""
         raise NotImplementedError
 
     def stop_service(self) -> None:
@@ -121,7 +126,7 @@ class Machine:
     def hang(self) -> None:
         """Let time pass while a process hangs; systemd kills a service that does not feed its watchdog."""
         self.advance(HANG_STEP_S)
-        if self.elapsed_s > self.pinged_s + WATCHDOG_S or self.is_over():
+        if self.elapsed_s > self.pinged_s + WATCHDOG_S or self.is_time_up():
             raise DiedError("service")
 
     # ---- disk
@@ -215,15 +220,15 @@ class _Events:
     """The queue of the service, which waits by letting the time of its machine pass."""
 
     def __init__(self, machine):
-        self._machine, self._events, self._has_stopped = machine, deque(), False
+        self._machine, self._events = machine, deque()
 
     def put(self, event):
         self._events.append(event)
 
     def get(self, timeout):
         machine = self._machine
-        if not self._has_stopped and machine.is_over():
-            self._has_stopped = True
+        if not machine.is_finished and machine.is_over():
+            machine.is_finished = True
             machine.stop_service()
         until_s = machine.elapsed_s + (max(timeout, 1e-3) if timeout else 0.0)
         while not self._events:

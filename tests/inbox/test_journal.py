@@ -55,14 +55,14 @@ def test_new_scan_waits_until_it_is_stored(journal):
     assert journal.others_stored("another.laz", 11) == {}
 
 
-def test_epochs_by_state_and_unrecorded_names(journal):
+def test_epochs_and_unrecorded_names(journal):
     journal.record_seen([(name, 10, 20, "") for name in ("waiting.laz", "requeued.laz", NAME)])
     for name in (NAME, "requeued.laz"):
         store(journal, name, epoch=f"epochs/{name}.nc")
     journal.requeue(["requeued.laz"])
     expected = {"requeued.laz": "epochs/requeued.laz.nc", NAME: f"epochs/{NAME}.nc"}
     assert journal.epochs() == expected
-    assert journal.epochs(State.STORED) == {NAME: f"epochs/{NAME}.nc"}
+    assert journal.current_epochs() == {NAME: f"epochs/{NAME}.nc"}
     assert journal.unrecorded([NAME, "z.laz", "waiting.laz", "odd 'name\".laz"]) == [
         "odd 'name\".laz",
         "z.laz",
@@ -350,3 +350,17 @@ def test_journal_without_tables_reads_as_empty(tmp_path, content):
         path.write_bytes(content)
     with JournalReader(path) as reader:
         assert reader.rows() == []
+
+
+def test_current_epochs_are_those_of_scans_that_are_or_were_stored(journal):
+    """A scan that waits because it was touched is restored as stored later: its epoch must not be missed."""
+    for name in ("stored", "touched", "unusable", "queued"):
+        journal.record_seen([(name, 1, 1, "")])
+        journal.record_stored(
+            name, sha256="0", verdict="good", epoch=f"{name}.nc", start_utc_s=1e9, revision=1
+        )
+    journal.record_seen([("touched", 1, 2, ""), ("unusable", 2, 2, ""), ("new", 1, 1, "")])
+    journal.set_aside("unusable", "cut off")
+    journal.requeue(["queued"])
+    assert journal.current_epochs() == {"stored": "stored.nc", "touched": "touched.nc"}
+    assert set(journal.epochs()) == {"stored", "touched", "unusable", "queued"}

@@ -7,6 +7,7 @@ from types import SimpleNamespace
 import pytest
 
 from station.archive import epochs
+from station.archive.series.virtual import build_series
 from station.processing import integrity
 
 OBJECT_HEADER = b"OHDR"  # signature in HDF5, one for each variable
@@ -32,3 +33,17 @@ def test_a_damaged_description_of_any_variable_is_found(series, epoch, site):
         damaged[at + 12] ^= 0xFF
         path.write_bytes(damaged)
         assert integrity.unreadable_files(site, lambda: None) == (str(path.relative_to(series.folder)),), at
+
+
+@pytest.mark.parametrize("is_epoch_damaged", [False, True])
+def test_damage_of_the_series_is_reported_also_without_an_intact_epoch(series, epoch, site, is_epoch_damaged):
+    path = epochs.write_epoch(series, epoch(1)).path
+    build_series(series)
+    with series.path.open("r+b") as file:
+        file.seek(100)
+        file.write(b"x")
+    checksums = {}
+    if is_epoch_damaged:
+        checksums = {str(path.relative_to(series.folder)): "of other bytes"}
+    findings = integrity.check_store(site, [], checksums, lambda: None)
+    assert any(level == "fault" and "series.nc is damaged" in text for level, _, text in findings)

@@ -7,6 +7,7 @@ import shutil
 import subprocess
 import warnings
 import xml.etree.ElementTree as ET
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -15,6 +16,8 @@ from PIL import Image
 from support.programs import readers_python, run
 
 import station
+from station.archive.reference_files import open_reference, write_reference
+from station.archive.series.index import series_in
 from station.products.area_tables import Span
 from station.products.export import export
 from station.products.stac import PROJECTION, TOPO4D, _adjustment
@@ -177,6 +180,13 @@ def test_csv_of_scans(site, tmp_path, small):
     assert [row["verdict"] for row in rows] == ["degraded", "good"] * 3
     assert rows[3]["scan"] == small.EVIL
     assert float(rows[2]["platform_roll"]) == pytest.approx(0.12)
+    assert [row["in_reference"] for row in rows] == [""] * 6  # it was given as a surface
+    series = series_in(site.station.data)
+    reference = open_reference(series)
+    write_reference(series, replace(reference, version="2", scan_ids=(rows[1]["scan"], rows[5]["scan"])))
+    scans, _ = export(site, "csv", None, tmp_path / "csv")
+    rows = list(csv.DictReader(io.StringIO(scans.read_text())))
+    assert [row["in_reference"] for row in rows] == ["", "2", "", "", "", "2"]
     assert len(areas.read_text().splitlines()) == 13
 
 

@@ -56,6 +56,29 @@ def test_folder_that_the_first_start_creates_is_remembered_at_once(write_site, m
         daemon.Daemon(site_path, FakeWorker, daemon.LoopTiming(), Host()).serve()
 
 
+def test_journal_and_store_are_reconciled_again_after_a_failed_task_on_the_store(write_site):
+    """It may have moved a damaged epoch away and not queued its scan yet."""
+    service = daemon.Daemon(write_site(), FakeWorker, daemon.LoopTiming(), Host())
+    failures = [StoreError("the disk is full")]
+
+    class Worker(FakeWorker):
+        def recover(self):
+            self.record_call("recover")
+            if not failures:
+                service.stop()
+
+        def run_maintenance(self):
+            self.record_call("maintenance")
+            if failures:
+                raise failures.pop()
+
+    service._make_worker = Worker
+    service._timing = daemon.LoopTiming(first_pause_s=0.01)
+    service.serve()
+    path = service._site.path
+    assert calls(path)[:4] == ["recover", "compact", "maintenance", "recover"]
+
+
 class Service:
     """A running service, its notifications to systemd and its log."""
 
