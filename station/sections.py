@@ -349,6 +349,7 @@ class ProductsSection(Section):
     geotiff: bool = False
     quicklook_width_px: Annotated[int, Field(ge=400, le=4000)] = 1200
     change_limit_m: Positive | None = None
+    cf_uncertainty: bool = False
 
 
 class MirrorSection(Section):

@@ -20,7 +20,7 @@ from station.products.area_tables import Span
 from station.products.exports.formats import FORMATS
 from station.products.exports.selection import pending, select, split
 
-PERIODS = {"references": "1D"}  # of each file: one for all days would be written anew with each epoch
+PERIODS = {"references": "1D"}  # of each file: one for all days would be written again with each epoch
 
 
 def update_mirror(site: Site, progress: Progress) -> str:
