@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from datetime import UTC, datetime
+from ipaddress import ip_address
 from typing import Annotated, Any
 
 from pydantic import AfterValidator, AwareDatetime, BaseModel, ConfigDict, Field
@@ -51,6 +52,19 @@ def require_time_pattern(pattern: str) -> str:
     except (ValueError, re.error, OverflowError) as error:
         raise ValueError(f"not a pattern of times, such as %y%m%d_%H%M%S: {error}") from error
     return pattern
+
+
+def on_loopback(address: str) -> str:
+    """Return an address and port; raise ValueError unless they are of this machine only."""
+    host, _, port = address.rpartition(":")
+    try:
+        is_loopback = host == "localhost" or ip_address(host.strip("[]")).is_loopback
+        is_port = 0 < int(port) < 65536
+    except ValueError:
+        is_loopback = is_port = False
+    if not (is_loopback and is_port):
+        raise ValueError('give a loopback address and a port: "127.0.0.1:9750"')
+    return address
 
 
 Utc = Annotated[AwareDatetime, AfterValidator(_in_utc)]

@@ -71,9 +71,7 @@ def test_an_export_says_where_its_variances_are(folder, tmp_path, variables):
     parts = split(selection, tmp_path / "all.nc", ".nc", None)
     (path,) = FORMATS["netcdf"].write(selection, parts, lambda _: None, lambda _: None)
     with xr.open_dataset(path) as exported:
-        with pytest.raises(
-            StationError, match=r"all\.nc: has no reference .* station\.variance\(folder"
-        ):
+        with pytest.raises(StationError, match=r"all\.nc: has no reference .* station\.variance\(folder"):
             exported.station.variance(np.ones(GRID.shape, bool))
         cells = np.ones(GRID.shape, bool)
         expected = station.variance(folder, cells, 1)
