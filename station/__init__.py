@@ -96,21 +96,22 @@ def volume(
     return volumes.volume_change(to_mask(area, volumes.series), volumes.find_epoch(epoch), other)
 
 
-def point_covariance(site: str | Path, points_m: npt.ArrayLike, epoch: Epoch) -> npt.NDArray[np.float64]:
+def point_covariance(
+    site_or_folder: str | Path, points_m: npt.ArrayLike, epoch: Epoch
+) -> npt.NDArray[np.float64]:
     """Return the covariance (n, 3, 3) of map points (n, 3) as measured by the scan of an epoch [m²].
 
     It is the sum of the independent error of each shot (range, beam, encoder) and the error all shots share
-    (pose, tilt, range, air): the posterior of the epoch's adjustment, relative to the reference. `site` must
-    be a site file, because the scanner model is read from it. `beam.error_ellipse` turns the result into
-    error ellipses. Raises StoreError if there is no series.
+    (pose, tilt, range, air): the posterior of the epoch's adjustment, relative to the reference. The scanner
+    is that of the site file, or of `series.nc`. `beam.error_ellipse` turns the result into error ellipses.
+    Raises StoreError if there is no series, or if an older version wrote it and no site file is given.
     Source: Hartzell et al. (2015), Eq. 9; equations.md, 6.2.
     """
     import numpy as np
 
     from station.archive.series.index import series_in
-    from station.config import read_site
     from station.queries.volumes import Volumes
 
-    volumes = Volumes(series_in(site))
+    volumes = Volumes(series_in(site_or_folder))
     points = np.atleast_2d(np.asarray(points_m, dtype=np.float64))
-    return volumes.point_covariance(points, volumes.find_epoch(epoch), read_site(site).instrument)
+    return volumes.point_covariance(points, volumes.find_epoch(epoch))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from datetime import UTC, datetime
+from ipaddress import ip_address
 from typing import Annotated, Any
 from zoneinfo import ZoneInfo, ZoneInfoNotFoundError
 
@@ -64,6 +65,19 @@ def _require_zone(zone: str) -> str:
     except (ZoneInfoNotFoundError, ValueError, OSError) as error:
         raise ValueError('no time zone: give its name, such as "Europe/Vienna", or "UTC"') from error
     return zone
+
+
+def on_loopback(address: str) -> str:
+    """Return an address and port; raise ValueError unless they are of this machine only."""
+    host, _, port = address.rpartition(":")
+    try:
+        is_loopback = host == "localhost" or ip_address(host.strip("[]")).is_loopback
+        is_port = 0 < int(port) < 65536
+    except ValueError:
+        is_loopback = is_port = False
+    if not (is_loopback and is_port):
+        raise ValueError('give a loopback address and a port: "127.0.0.1:9750"')
+    return address
 
 
 Zone = Annotated[str, AfterValidator(_require_zone)]

@@ -6,7 +6,6 @@ The commented files in `config/` explain the keys.
 from __future__ import annotations
 
 import math
-from ipaddress import ip_address
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -23,6 +22,7 @@ from station.section_types import (
     Section,
     Utc,
     Zone,
+    on_loopback,
     require_projected,
     require_time_pattern,
     without_required,
@@ -341,23 +341,11 @@ class RetentionSection(Section):
         return self
 
 
-def _on_loopback(address: str) -> str:
-    host, _, port = address.rpartition(":")
-    try:
-        is_loopback = host == "localhost" or ip_address(host.strip("[]")).is_loopback
-        is_port = 0 < int(port) < 65536
-    except ValueError:
-        is_loopback = is_port = False
-    if not (is_loopback and is_port):
-        raise ValueError('give a loopback address and a port: "127.0.0.1:9750"')
-    return address
-
-
 class ServiceSection(Section):
     """The running service."""
 
     memory_gb: Annotated[float, Field(ge=0.5, le=1024)] = 5.0
-    metrics: Annotated[str, AfterValidator(_on_loopback)] | None = None
+    metrics: Annotated[str, AfterValidator(on_loopback)] | None = None
     metrics_file: Path | None = None
 
 
@@ -396,6 +384,7 @@ class ProductsSection(Section):
     geotiff: bool = False
     quicklook_width_px: Annotated[int, Field(ge=400, le=4000)] = 1200
     change_limit_m: Positive | None = None
+    cf_uncertainty: bool = False
 
 
 class MirrorSection(Section):

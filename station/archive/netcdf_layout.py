@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -13,12 +14,14 @@ from pyproj import CRS
 
 from station.archive import discovery
 from station.archive.schema import CHANGE_LENGTH, FILL, TEXT_LENGTH, Variable
-from station.quantities import Grid
+from station.quantities import Grid, Scanner
 
 CHUNK = 128  # rows and columns of a chunk
 TIMES_PER_CHUNK = 512  # epochs per chunk of a variable that is small per scan, in a file of many epochs
 CONVENTIONS = "CF-1.11, ACDD-1.3"
 ENCODING = "utf-8"  # of texts; older files declare ascii, a subset
+SCANNER_ATTRIBUTE = "scanner"  # specifications as JSON
+UNCERTAINTY_ATTRIBUTE = "uncertainty_variables"
 RENAMED_PARAMETERS = {"refraction_moving": "refraction_ice"}  # older names of shared parameters
 
 
@@ -34,6 +37,8 @@ class Series:
     name: str = ""
     institution: str = ""
     metadata: tuple[tuple[str, str], ...] = ()  # global attributes that the site file gives
+    scanner: Scanner | None = None
+    cf_uncertainty: bool = False  # write the attributes of CF's draft on uncertainty
 
     @property
     def has_ellipsoidal_heights(self) -> bool:
@@ -91,8 +96,23 @@ def write_global_attrs(file: netCDF4.Dataset, series: Series, title: str) -> Non
             **discovery.descriptive_attributes(name, series.institution, dict(series.metadata)),
             **discovery.extent(series.grid, series.crs),
             **({"geospatial_bounds_vertical_crs": "EPSG:4979"} if series.has_ellipsoidal_heights else {}),
+            **_scanner_attributes(series.scanner),
         }
     )
+
+
+def _scanner_attributes(scanner: Scanner | None) -> dict[str, str]:
+    if scanner is None:
+        return {}
+    return {"instrument": scanner.model, SCANNER_ATTRIBUTE: json.dumps(asdict(scanner))}
+
+
+def read_scanner(file: netCDF4.Dataset) -> Scanner | None:
+    """Return the scanner that a file names; None in files of older versions."""
+    if SCANNER_ATTRIBUTE not in file.ncattrs():
+        return None
+    values = json.loads(file.getncattr(SCANNER_ATTRIBUTE))
+    return Scanner(**values | {"beam_origin_m": tuple(values["beam_origin_m"])})
 
 
 def _create_axis(file: netCDF4.Dataset, series: Series, axis: str, coordinate: np.ndarray[Any, Any]) -> None:
@@ -240,6 +260,8 @@ def attributes(spec: Variable, series: Series) -> dict[str, Any]:
     attrs["coverage_content_type"] = _content_type(spec)
     if spec.ancillary:
         attrs["ancillary_variables"] = " ".join(spec.ancillary)
+    if series.cf_uncertainty:
+        attrs |= _uncertainty_attributes(spec)
     if spec.standard_name == "surface_altitude" and series.has_ellipsoidal_heights:
         attrs["standard_name"] = "height_above_reference_ellipsoid"
     if spec.is_raster and series.crs is not None:
@@ -249,6 +271,21 @@ def attributes(spec: Variable, series: Series) -> dict[str, Any]:
     if spec.dtype == "S1":
         attrs["_Encoding"] = ENCODING
     return attrs
+
+
+def _uncertainty_attributes(spec: Variable) -> dict[str, Any]:
+    """Return the attributes of a draft of CF on uncertainty, as far as they are undisputed.
+
+    Source: https://github.com/cf-convention/cf-conventions/pull/661, of August 2026.
+    """
+    if spec.name.endswith("_uncertainty"):
+        return {
+            "coverage_interval": "standard_deviation",
+            "coverage_probability": 0.6827,
+            "probability_distribution": "gaussian",
+        }
+    named = [name for name in spec.ancillary if name.endswith("_uncertainty")]
+    return {UNCERTAINTY_ATTRIBUTE: " ".join(named)} if named else {}
 
 
 def _content_type(spec: Variable) -> str:

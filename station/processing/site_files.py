@@ -36,6 +36,8 @@ def series_for(site: Site) -> Series:
             *site.metadata.attributes.items(),
             ("time_coverage_resolution", f"PT{site.scans.expected_every_s:.0f}S"),
         ),
+        scanner=site.instrument,
+        cf_uncertainty=site.products.cf_uncertainty,
     )
 
 

@@ -49,8 +49,8 @@ class StationAccessor:
             )
         if Path(source).name != "series.nc":
             raise StationError(
-                f"{source}: has neither the reference surface nor the covariances from which the variance of"
-                " a sum follows: use ds.station on station.open(folder of the station), or call"
+                f"{source}: has no reference surface, without which the variance of a sum cannot be computed:"
+                " use ds.station on station.open(folder of the station), or call"
                 " station.variance(folder, weights, ds.time[0]); boxes.nc and daily.nc have the uncertainty"
                 " of blocks, and the comment of elevation_change_uncertainty a safe bound"
             )

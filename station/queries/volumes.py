@@ -8,7 +8,7 @@ import xarray as xr
 
 from station.archive.epochs import EpochRef
 from station.errors import StoreError
-from station.quantities import Bools, Floats, Scanner
+from station.quantities import Bools, Floats
 from station.queries.aggregates import Aggregates, common_error_covariance, observed_in_all
 from station.queries.epoch_cells import CHANGE, RANDOM, EpochCells, read_cells_of
 from station.science.analysis.voids import area_weights
@@ -131,12 +131,18 @@ class Volumes(Aggregates):
             shared_part -= common_contributions(weights, (jacobians[0], jacobians[1]), common_covariance)
         return random_part, shared_part
 
-    def point_covariance(self, points_m: Floats, epoch: EpochRef, scanner: Scanner) -> Floats:
+    def point_covariance(self, points_m: Floats, epoch: EpochRef) -> Floats:
         """Return the covariance (n, 3, 3) of map points (n, 3) in an epoch [m²]: shot, pose, tilt, air.
 
-        Raises StoreError if the epoch has no shared parameters.
+        Raises StoreError if the epoch has no shared parameters, or the store does not name its scanner.
         """
-        epoch_cells = self.read_cells(epoch, np.zeros(self.grid.shape, np.bool_))
+        scanner = self.series.scanner
+        if scanner is None:
+            raise StoreError(
+                f"{self.series.path}: an older version, which did not name the scanner, has written it: give"
+                " the site file instead of the folder"
+            )
+        epoch_cells = self.read_shared(epoch)
         if epoch_cells.shared is None:
             raise StoreError(
                 f"{epoch.path}: no scanner pose is stored, because the scan is in map coordinates"

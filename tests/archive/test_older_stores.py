@@ -12,9 +12,12 @@ from station.archive import epochs, reference_files
 from station.archive.schema import VARIABLES
 from station.archive.series import virtual
 from station.archive.series.epoch_reader import read_source
+from station.archive.series.index import series_in
 from station.archive.series.virtual import build_series
+from station.errors import StoreError
 from station.products.epoch_table import read_epoch_table
 from station.quantities import Reference, VarianceComponents
+from station.sections import ScannerSection
 
 
 def with_older_name(path):
@@ -62,6 +65,16 @@ def test_a_series_that_contained_everything_is_read_until_the_next_scan(series, 
         assert "shared_parameter_covariance" not in ds
         assert ds.station.processing.shared_parameter_covariance.load().identical(covariance)
     assert read_epoch_table(series).scalars["platform_roll"].tolist() == [0.12, 0.12]
+
+
+def test_a_store_that_does_not_name_its_scanner_asks_for_the_site_file(series, epoch):
+    epochs.write_epoch(series, epoch(3))
+    build_series(series)
+    with pytest.raises(StoreError, match="give the site file instead of the folder"):
+        station.point_covariance(series.folder, [[632_100.0, 5_185_500.0, 2800.0]], 0)
+    scanner = replace(ScannerSection().instrument, range_sigma_m=0.1 + 0.2)
+    build_series(replace(series, scanner=scanner, name="a changed header, so that the file is written again"))
+    assert series_in(series.folder).scanner == scanner
 
 
 def test_a_reference_of_an_older_version_keeps_its_refraction_over_ice(series):

@@ -1,7 +1,6 @@
 """The files of the store as other programs read them: CF checker, ncdump, CDO, NCO, GDAL, xarray."""
 
 import dataclasses
-import json
 import pickle
 import subprocess
 import sys
@@ -12,7 +11,15 @@ import numpy as np
 import pytest
 import shapely
 import xarray as xr
-from support.programs import findings, run, tool
+from support.programs import (
+    assert_acdd_misses_only_what_is_not_computed,
+    assert_gdal_knows_the_place,
+    filled_metadata,
+    findings,
+    gdal_value,
+    run,
+    tool,
+)
 
 from station.archive import epochs, reference_files
 from station.archive.areas import AreaChange, update_areas
@@ -20,15 +27,8 @@ from station.archive.compaction import compact
 from station.archive.series.virtual import build_series
 from station.quantities import Reference
 from station.queries.blocks import BlockQueries, update_boxes
-from station.sections import MetadataSection
 
 pytestmark = pytest.mark.integration
-
-
-def gdal_value(path):
-    """Return the elevation change of the fourth epoch at a map position, as GDAL reads it."""
-    name, position = f"NETCDF:{path}:elevation_change", ("632055", "5185955")
-    return float(run(tool("gdallocationinfo"), "-valonly", "-b", "4", "-geoloc", name, *position).stdout)
 
 
 @pytest.fixture
@@ -50,28 +50,9 @@ def test_compliance_checker_accepts_epoch_series_and_reference(built, tmp_path):
 
 
 def test_data_discovery_checker_misses_only_what_is_not_computed(series, epoch, tmp_path):
-    """ACDD 1.3. The checker takes projected coordinates for degrees, and wants standard names everywhere."""
-    texts = dict.fromkeys(MetadataSection.model_fields, "text") | {
-        "keywords": ("ice", "laser"),
-        "license": "CC-BY-4.0",
-        "creator_email": "a@example.org",
-        "creator_orcid": "0000-0002-1825-0097",
-        "publisher_email": "b@example.org",
-        "publisher_url": "https://example.org",
-        "doi": "10.5281/zenodo.1",
-    }
-    metadata = (*MetadataSection(**texts).attributes.items(), ("time_coverage_resolution", "PT3600S"))
-    described = dataclasses.replace(series, metadata=metadata, vertical_datum="")
+    described = dataclasses.replace(series, metadata=filled_metadata(), vertical_datum="")
     epochs.write_epoch(described, epoch(0))
-    found = findings(tmp_path / "report.json", build_series(described), convention="acdd:1.3")
-    of_file = {name: messages for _, name, messages in found if not name.startswith("variable")}
-    missing = of_file.pop("Global Attributes")
-    assert missing == ["geospatial_vertical_min not present", "geospatial_vertical_max not present"]
-    assert set(of_file) == {"geospatial_lat_extents_match", "geospatial_lon_extents_match"}
-    of_variables = {
-        message for _, name, messages in found if name.startswith("variable") for message in messages
-    }
-    assert of_variables <= {"standard_name", "units"}
+    assert_acdd_misses_only_what_is_not_computed(tmp_path / "report.json", build_series(described))
 
 
 def test_compliance_checker_accepts_compacted_files(built, series, tmp_path):
@@ -132,10 +113,7 @@ def test_nco_averages_over_time(built, tmp_path, chunking):
 
 
 def test_gdal_reads_position_orientation_and_projection(built):
-    info = json.loads(run(tool("gdalinfo"), "-json", f"NETCDF:{built}:elevation_change").stdout)
-    assert info["geoTransform"] == [632000.0, 10.0, 0.0, 5186000.0, 0.0, -10.0]
-    assert 'ID["EPSG",32632]' in info["coordinateSystem"]["wkt"]
-    assert len(info["bands"]) == 4
+    assert_gdal_knows_the_place(built)
     assert gdal_value(built) == pytest.approx(0.03, abs=1e-3)
 
 
@@ -278,9 +256,8 @@ def test_other_programs_read_boxes(box_files, tmp_path):
     run(tool("ncks"), "-O", "-d", "time,1", "-v", "elevation_change", boxes, tmp_path / "one.nc")
     with xr.open_dataset(tmp_path / "one.nc") as ds:
         assert float(ds.elevation_change[0, 3, 3]) == pytest.approx(0.02, abs=1e-4)
-    name, position = f"NETCDF:{boxes}:elevation_change_uncertainty", ("632055", "5185955")
-    value = run(tool("gdallocationinfo"), "-valonly", "-b", "1", "-geoloc", name, *position).stdout
-    assert float(value) == pytest.approx(0.05 / 10, rel=1e-2)
+    value = gdal_value(boxes, "elevation_change_uncertainty", band=1)
+    assert value == pytest.approx(0.05 / 10, rel=1e-2)
     mean = run(
         tool("cdo"), "-s", "outputf,%.4f,1", "-selindexbox,1,1,1,1", "-selname,elevation_change", daily
     )

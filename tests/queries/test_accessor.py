@@ -1,8 +1,10 @@
 """`ds.station`, and arrays as users have them: flipped, transposed, cut out, with NaN."""
 
+import shutil
 from dataclasses import replace
 from datetime import UTC, datetime
 
+import netCDF4
 import numpy as np
 import pytest
 import shapely
@@ -16,7 +18,7 @@ from station.archive.netcdf_layout import Series
 from station.archive.reference_files import write_reference
 from station.archive.series.index import series_in
 from station.archive.series.virtual import build_series
-from station.errors import StationError
+from station.errors import StationError, StoreError
 from station.quantities import Reference
 from station.queries.aggregates import Aggregates
 from station.queries.grid_arrays import to_mask
@@ -69,11 +71,23 @@ def test_an_export_says_where_its_variances_are(folder, tmp_path, variables):
     parts = split(selection, tmp_path / "all.nc", ".nc", None)
     (path,) = FORMATS["netcdf"].write(selection, parts, lambda _: None, lambda _: None)
     with xr.open_dataset(path) as exported:
-        with pytest.raises(StationError, match=r"all\.nc: has neither .* station\.variance\(folder, weights"):
+        with pytest.raises(StationError, match=r"all\.nc: has no reference .* station\.variance\(folder"):
             exported.station.variance(np.ones(GRID.shape, bool))
         cells = np.ones(GRID.shape, bool)
         expected = station.variance(folder, cells, 1)
         assert station.variance(folder, cells, exported.time[1]) == expected
+
+
+def test_a_copy_with_the_newest_reference_only_answers_queries(folder, tmp_path):
+    copied = shutil.copytree(folder, tmp_path / "copy")
+    (copied / "reference_1.nc").unlink()
+    cells = np.ones(GRID.shape, bool)
+    assert station.variance(copied, cells, 1) == station.variance(folder, cells, 1)
+    assert station.open(copied).station.variance(cells)[1] == station.variance(folder, cells, 1)
+    with netCDF4.Dataset(copied / "reference.nc", "r+") as file:
+        file.reference_version = "2"  # the copy of another version is no substitute
+    with pytest.raises(StoreError, match="no reference 1"):
+        station.variance(copied, cells, 1)
 
 
 @pytest.fixture

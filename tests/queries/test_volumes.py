@@ -136,6 +136,8 @@ def test_the_covariance_of_points_along_the_beam_is_that_of_the_range(site, box)
     names = [str(name) for name in processing.parameter_name.values]
     points_m = np.stack([x[column], y[row], height_m], axis=-1)
     actual = station.point_covariance(site, points_m, LAST)
+    copied = station.point_covariance(site.parent / "data", points_m, LAST)  # the scanner is in the store
+    assert copied.tobytes() == actual.tobytes()
     assert actual.shape == (3, 3, 3)
     assert np.linalg.eigvalsh(actual).min() > 0
     scanner = read_site(site).instrument

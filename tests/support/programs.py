@@ -9,6 +9,8 @@ from pathlib import Path
 
 import pytest
 
+from station.sections import MetadataSection
+
 
 def tool(name):
     """Return the path of a program; without it, skip the test."""
@@ -51,3 +53,44 @@ def findings(report, *paths, convention="cf:1.11"):
         for check in result[convention][priority]
         if check["msgs"]
     ]
+
+
+def filled_metadata():
+    """Return the global attributes of a site that fills in every key of [metadata]."""
+    texts = dict.fromkeys(MetadataSection.model_fields, "text") | {
+        "keywords": ("ice", "laser"),
+        "license": "CC-BY-4.0",
+        "creator_email": "a@example.org",
+        "creator_orcid": "0000-0002-1825-0097",
+        "publisher_email": "b@example.org",
+        "publisher_url": "https://example.org",
+        "doi": "10.5281/zenodo.1",
+    }
+    return (*MetadataSection(**texts).attributes.items(), ("time_coverage_resolution", "PT3600S"))
+
+
+def assert_acdd_misses_only_what_is_not_computed(report, path):
+    """ACDD 1.3. The checker takes projected coordinates for degrees, and wants standard names everywhere."""
+    found = findings(report, path, convention="acdd:1.3")
+    of_file = {name: messages for _, name, messages in found if not name.startswith("variable")}
+    missing = of_file.pop("Global Attributes")
+    assert missing == ["geospatial_vertical_min not present", "geospatial_vertical_max not present"]
+    assert set(of_file) == {"geospatial_lat_extents_match", "geospatial_lon_extents_match"}
+    of_variables = {
+        message for _, name, messages in found if name.startswith("variable") for message in messages
+    }
+    assert of_variables <= {"standard_name", "units"}
+
+
+def gdal_value(path, variable="elevation_change", band=4):
+    """Return a value at a map position, as GDAL reads it."""
+    place = "-valonly", "-b", str(band), "-geoloc", f"NETCDF:{path}:{variable}", "632055", "5185955"
+    return float(run(tool("gdallocationinfo"), *place).stdout)
+
+
+def assert_gdal_knows_the_place(path):
+    """Position, orientation and projection of the grid of the tests of the archive."""
+    info = json.loads(run(tool("gdalinfo"), "-json", f"NETCDF:{path}:elevation_change").stdout)
+    assert info["geoTransform"] == [632000.0, 10.0, 0.0, 5186000.0, 0.0, -10.0]
+    assert 'ID["EPSG",32632]' in info["coordinateSystem"]["wkt"]
+    assert len(info["bands"]) == 4

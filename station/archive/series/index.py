@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from bisect import bisect_right
 from collections.abc import Sequence
+from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import overload
+from typing import TYPE_CHECKING, overload
 
 import h5py
 import netCDF4
@@ -23,12 +24,15 @@ from station.archive.epochs import (
     list_files,
     parse_epoch_filename,
 )
-from station.archive.netcdf_layout import Series
+from station.archive.netcdf_layout import Series, read_scanner
 from station.archive.read_errors import read_errors
 from station.archive.schema import TEXT_LENGTH
 from station.archive.series.epoch_reader import middle
 from station.errors import StationError, StoreError
 from station.quantities import Grid
+
+if TYPE_CHECKING:
+    from station.config import Site
 
 NEAREST_TOLERANCE_S = 12 * 3600.0  # so that a date finds the first or last epoch of its day
 MAX_TRIED = 5  # files of the store, if the newest are damaged
@@ -164,20 +168,31 @@ def data_folder(site_or_folder: str | Path) -> Path:
     path = Path(site_or_folder)
     if path.name == "series.nc" and not path.is_dir():
         return path.parent
-    if path.is_file() and path.suffix == ".toml":
-        from station.config import read_site  # noqa: PLC0415 - a folder does not need pydantic
+    site = _site(path)
+    return path if site is None else site.station.data
 
-        return read_site(path).station.data
-    return path
+
+def _site(path: Path) -> Site | None:
+    """Return the site of a site file; None for a folder."""
+    if not path.is_file() or path.suffix != ".toml":
+        return None
+    from station.config import read_site  # noqa: PLC0415 - a folder does not need pydantic
+
+    return read_site(path)
 
 
 def series_in(site_or_folder: str | Path) -> Series:
-    """Return the store of a site file or data folder; raise StoreError if there is no series yet."""
-    folder = data_folder(site_or_folder)
+    """Return the store of a site file or data folder; raise StoreError if there is no series yet.
+
+    The scanner is that of the site file, or of the series.
+    """
+    site = _site(Path(site_or_folder))
+    folder = data_folder(site_or_folder) if site is None else site.station.data
     try:
-        return _read_header(folder, folder / "series.nc")
+        series = _read_header(folder, folder / "series.nc")
     except StoreError as error:
         raise StoreError(f"{folder}: holds no readable series (see station status): {error}") from error
+    return series if site is None else replace(series, scanner=site.instrument)
 
 
 def stored_series(series: Series) -> Series | None:
@@ -201,4 +216,4 @@ def _read_header(folder: Path, path: Path) -> Series:
         west_m, north_m = float(x_bounds.min()), float(y_bounds.max())
         grid = Grid(west_m, north_m, float(np.ptp(x_bounds)), len(x_m), len(y_m))
         crs = str(file["crs"].crs_wkt) if "crs" in file.variables else None
-        return Series(folder, str(file.station_id), grid, crs)
+        return Series(folder, str(file.station_id), grid, crs, scanner=read_scanner(file))

@@ -16,7 +16,7 @@ import numpy as np
 
 from station._version import __version__
 from station.archive.discovery import time_coverage
-from station.archive.netcdf_layout import create_file, create_variable
+from station.archive.netcdf_layout import UNCERTAINTY_ATTRIBUTE, create_file, create_variable
 from station.archive.schema import FILL, VARIABLES, Variable
 from station.archive.series.epoch_reader import EpochSource, Parameters, contiguous_runs, read_source
 from station.errors import StoreError
@@ -24,6 +24,7 @@ from station.products.exports.selection import FINGERPRINT, Part, Selection
 
 BLOCK_BYTES = 2**26  # of a raster in memory: a month in chunks of 32 x 32 still covers those of the store
 EPOCHS_AT_ONCE = 64  # of the other variables
+ANCILLARY_ATTRIBUTES = {"ancillary_variables", UNCERTAINTY_ATTRIBUTE}  # name other variables
 MAX_OPEN_FILES = 48  # the epochs of a day and more, at some 5 MB each
 
 Array = np.ndarray[Any, Any]
@@ -79,10 +80,11 @@ class PartContents:
         for spec in self.variables:
             chunks = self.selection.chunks if spec.is_raster else None
             variable = create_variable(file, spec, series, times, chunks)
-            if absent := set(spec.ancillary) - names:
-                variable.delncattr("ancillary_variables")
-                if present := [name for name in spec.ancillary if name not in absent]:
-                    variable.ancillary_variables = " ".join(present)
+            for attribute in ANCILLARY_ATTRIBUTES & set(variable.ncattrs()):
+                present = [name for name in variable.getncattr(attribute).split() if name in names]
+                variable.delncattr(attribute)
+                if present:
+                    variable.setncattr(attribute, " ".join(present))
             if not spec.is_raster:
                 self._write_values(variable)
         start_s, end_s = file["time_bnds"][0, 0], file["time_bnds"][-1, 1]

@@ -74,6 +74,23 @@ def test_attributes_of_variables_are_those_of_the_series(stored, tmp_path):
                 assert np.array_equal(file[name].getncattr(attr), variable.getncattr(attr)), (name, attr)
 
 
+def test_the_attributes_of_the_draft_on_uncertainty_are_an_option(stored, epoch, tmp_path):
+    with netCDF4.Dataset(stored.path) as file:
+        assert "uncertainty_variables" not in file["elevation_change"].ncattrs()
+    drafted = dataclasses.replace(stored, cf_uncertainty=True)
+    epochs.write_epoch(drafted, epoch(27))
+    build_series(drafted)
+    (all_path,) = write(select(drafted, ALWAYS), tmp_path / "all.nc")
+    selected = select(drafted, ALWAYS, variables="elevation_change,elevation_change_random_uncertainty")
+    (part_path,) = write(selected, tmp_path / "part.nc")
+    both = "elevation_change_uncertainty elevation_change_random_uncertainty"
+    for path, named in ((drafted.path, both), (all_path, both), (part_path, both.split()[1])):
+        with netCDF4.Dataset(path) as file:
+            assert file["elevation_change"].uncertainty_variables == named
+            assert file["elevation_change_random_uncertainty"].coverage_interval == "standard_deviation"
+            assert "uncertainty_variables" not in file["verdict"].ncattrs()
+
+
 def test_values_that_were_never_seen_take_no_space(stored, tmp_path):
     (path,) = write(select(stored, ALWAYS, chunks="1,70,75"), tmp_path / "all.nc")
     import h5py

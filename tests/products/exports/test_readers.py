@@ -1,19 +1,26 @@
 """Exported files as other programs read them; the expected numbers are those that the scans were made of."""
 
 import dataclasses
-import json
 
 import numpy as np
 import pytest
 import xarray as xr
-from support.programs import findings, readers_python, run, tool
+from support.programs import (
+    assert_acdd_misses_only_what_is_not_computed,
+    assert_gdal_knows_the_place,
+    filled_metadata,
+    findings,
+    gdal_value,
+    readers_python,
+    run,
+    tool,
+)
 
 from station.archive import epochs
 from station.archive.series.virtual import build_series
 from station.products.area_tables import Span
 from station.products.exports.formats import FORMATS
 from station.products.exports.selection import select, split
-from station.sections import MetadataSection
 
 pytestmark = pytest.mark.integration
 VALUES = (0.0, 0.01, 0.02, 0.03)  # change of the four epochs [m], in the western half of 150 x 140 cells
@@ -64,12 +71,8 @@ def test_cdo_averages(exported, tmp_path):
 
 
 def test_gdal_reads_value_place_and_projection(exported):
-    name = f"NETCDF:{exported}:elevation_change"
-    info = json.loads(run(tool("gdalinfo"), "-json", name).stdout)
-    assert info["geoTransform"] == [632000.0, 10.0, 0.0, 5186000.0, 0.0, -10.0]
-    assert 'ID["EPSG",32632]' in info["coordinateSystem"]["wkt"]
-    place = "-valonly", "-b", "4", "-geoloc", name, "632055", "5185955"
-    assert float(run(tool("gdallocationinfo"), *place).stdout) == pytest.approx(0.03, abs=1e-6)
+    assert_gdal_knows_the_place(exported)
+    assert gdal_value(exported) == pytest.approx(0.03, abs=1e-6)
 
 
 R = {
@@ -83,6 +86,13 @@ R = {
         stopifnot(as.vector(ext(change)) == c(632000, 633500, 5184600, 5186000))
         stopifnot(crs(change, describe = TRUE)$code == "32632")
         cat(global(change, "mean", na.rm = TRUE)[[1]], sum(global(change, "notNA")[[1]]))
+    """,
+    "stars": """
+        change <- read_mdim(path, variable = "elevation_change")
+        stopifnot(st_crs(change)$epsg == 32632, names(dim(change))[3] == "time")
+        stopifnot(as.vector(st_bbox(change)) == c(632000, 5184600, 633500, 5186000))
+        values <- change[[1]]  # x, y, time
+        cat(apply(values, 3, mean, na.rm = TRUE), sum(!is.na(values)))
     """,
 }
 
@@ -151,25 +161,11 @@ def test_compliance_checker_finds_nothing(exported, tmp_path):
 
 
 def test_data_discovery_checker_misses_only_what_is_not_computed(series, epoch, tmp_path):
-    """ACDD 1.3. The checker takes projected coordinates for degrees, and wants standard names everywhere."""
-    texts = dict.fromkeys(MetadataSection.model_fields, "text") | {
-        "keywords": ("ice", "laser"),
-        "license": "CC-BY-4.0",
-        "creator_email": "a@example.org",
-        "creator_orcid": "0000-0002-1825-0097",
-        "publisher_email": "b@example.org",
-        "publisher_url": "https://example.org",
-        "doi": "10.5281/zenodo.1",
-    }
-    metadata = (*MetadataSection(**texts).attributes.items(), ("time_coverage_resolution", "PT3600S"))
     epochs.write_epoch(series, epoch(0))
     build_series(series)
-    path = write(dataclasses.replace(series, metadata=metadata), tmp_path / "all.nc")  # filled in afterwards
-    found = findings(tmp_path / "report.json", path, convention="acdd:1.3")
-    of_file = {name: messages for _, name, messages in found if not name.startswith("variable")}
-    missing = of_file.pop("Global Attributes")
-    assert missing == ["geospatial_vertical_min not present", "geospatial_vertical_max not present"]
-    assert set(of_file) == {"geospatial_lat_extents_match", "geospatial_lon_extents_match"}
+    described = dataclasses.replace(series, metadata=filled_metadata())  # filled in afterwards
+    path = write(described, tmp_path / "all.nc")
+    assert_acdd_misses_only_what_is_not_computed(tmp_path / "report.json", path)
     with xr.open_dataset(path) as ds:
         assert ds.attrs["license"] == "CC-BY-4.0"
         assert np.isnan(ds.elevation_change[0, 0, -1])
