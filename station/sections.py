@@ -66,6 +66,14 @@ def _require_time_pattern(pattern: str) -> str:
     return pattern
 
 
+def _require_suffix(suffix: str) -> str:
+    """Return a suffix with its dot; raise ValueError unless a file name can end with it."""
+    dotted = f".{suffix.removeprefix('.')}"
+    if not re.fullmatch(r"(\.[A-Za-z0-9]+){1,2}", dotted):
+        raise ValueError('no end of a file name: give one such as ".rxp"')
+    return dotted
+
+
 def _require_zone(zone: str) -> str:
     try:
         ZoneInfo(zone)
@@ -136,7 +144,7 @@ class ScansSection(Section):
     intensity: IntensityScale = "auto"
     settle_s: NotNegative = 60.0
     expected_every_s: Positive = 3600.0
-    suffix: Annotated[str, Field(pattern=r"^(\.[A-Za-z0-9]+){1,2}$")] | None = None
+    suffix: Annotated[str, AfterValidator(_require_suffix)] | None = None
     columns: tuple[str, ...] = ()
     convert: tuple[str, ...] | None = None
     polling: bool = False
