@@ -8,11 +8,11 @@ import re
 # (VZ-4000, LMS-Z390i). The papers give no range noise and no aperture for the VZ-6000, and nothing for the
 # VZ-400i: these values, and the ranges of the inclination sensors, are from the manufacturer's data sheets
 # (RIEGL: 10 mm and 3 mm precision; 0.35 mrad, 1.55 µm).
-# VZ-400, VZ-600i, VZ-1000 and Livox: beam and noise from the definitions of HELIOS++ (Winiwarter et al., 2022,
-# scanners_tls.xml), made from the data sheets; its accuracy stands for the noise of a shot, which is less.
-# Aperture, encoders and inclination sensor of these RIEGL are those of the VZ-400i; ranges are the makers'. The
-# beam of the Livox is 0.52 by 4.89 mrad, as wide as a round one of 3.5 mrad in the mean square. Its direction
-# is known to 0.1° (one sigma), as with an encoder of 0.35° a step. They have no inclination sensor.
+# VZ-400, VZ-600i, VZ-1000 and Livox: beam and noise from the definitions of HELIOS++ (Winiwarter et al.,
+# 2022, scanners_tls.xml), made from the data sheets; its accuracy stands for the noise of a shot, which is
+# less. Aperture, encoders and inclination sensor of these RIEGL are those of the VZ-400i; ranges are the
+# makers'. The beam of the Livox is 0.52 by 4.89 mrad, as wide as a round one of 3.5 mrad in the mean square.
+# Its direction is known to 0.1° (one sigma), as with an encoder of 0.35° a step; it has no inclination sensor.
 SCANNERS: dict[str, dict[str, float]] = {
     "riegl-vz-6000": {
         "wavelength_um": 1.064,
