@@ -12,7 +12,7 @@ import re
 # 2022, scanners_tls.xml), made from the data sheets; its accuracy stands for the noise of a shot, which is
 # less. Aperture, encoders and inclination sensor of these RIEGL are those of the VZ-400i; ranges are the
 # makers'. The beam of the Livox is 0.52 by 4.89 mrad, as wide as a round one of 3.5 mrad in the mean square.
-# Its direction is known to 0.1° (one sigma), as with an encoder of 0.35° a step; it has no inclination sensor.
+# Its direction is known to 0.1° (one sigma), as with an encoder of 0.35° a step; it has no tilt sensor.
 SCANNERS: dict[str, dict[str, float]] = {
     "riegl-vz-6000": {
         "wavelength_um": 1.064,
