@@ -315,6 +315,7 @@ class WeatherSection(Section):
     file: Path
     format: WeatherFormat = "toa5"
     columns: WeatherColumns | None = None
+    station: str | None = None
     names: tuple[str, ...] = ()
     units: WeatherUnits | None = None
     time_format: str | None = None
