@@ -7,11 +7,12 @@ import re
 # Published values: Voordendag et al. (2023), section 2.2 (VZ-6000); Hartzell et al. (2015), Table 1
 # (VZ-4000, LMS-Z390i). The papers give no range noise and no aperture for the VZ-6000, and nothing for the
 # VZ-400i: these values, and the ranges of the inclination sensors, are from the manufacturer's data sheets
-# (RIEGL: 10 mm and 3 mm precision; 0.35 mrad, 1.55 µm). VZ-400, VZ-1000 and Livox Mid-70: definitions of
-# HELIOS++ (Winiwarter et al., 2022, data/scanners_tls.xml), made from the data sheets; its accuracy stands
-# for the noise of a shot, which is less. The beam of the Mid-70 is 0.52 by 4.89 mrad, as wide as a round one
-# of 3.5 mrad in the mean square. Its direction is known to 0.1° (one sigma), as with an encoder of 0.35° a
-# step. It has no inclination sensor.
+# (RIEGL: 10 mm and 3 mm precision; 0.35 mrad, 1.55 µm).
+# VZ-400, VZ-600i, VZ-1000 and Livox: beam and noise from the definitions of HELIOS++ (Winiwarter et al.,
+# 2022, scanners_tls.xml), made from the data sheets; its accuracy stands for the noise of a shot, which is
+# less. Aperture, encoders and inclination sensor of these RIEGL are those of the VZ-400i; ranges are the
+# makers'. The beam of the Livox is 0.52 by 4.89 mrad, as wide as a round one of 3.5 mrad in the mean square.
+# Its direction is known to 0.1° (one sigma), as with an encoder of 0.35° a step; it has no tilt sensor.
 SCANNERS: dict[str, dict[str, float]] = {
     "riegl-vz-6000": {
         "wavelength_um": 1.064,
@@ -63,6 +64,16 @@ SCANNERS: dict[str, dict[str, float]] = {
         "inclination_range_deg": 10.0,
         "range_max_m": 600.0,
     },
+    "riegl-vz-600i": {
+        "wavelength_um": 1.55,
+        "beam_divergence_mrad": 0.35,
+        "exit_diameter_m": 0.007,
+        "range_sigma_m": 0.005,
+        "angle_resolution_deg": 0.0005,
+        "inclination_sigma_deg": 0.008,
+        "inclination_range_deg": 10.0,
+        "range_max_m": 1000.0,
+    },
     "riegl-vz-1000": {
         "wavelength_um": 1.55,
         "beam_divergence_mrad": 0.30,
@@ -72,6 +83,16 @@ SCANNERS: dict[str, dict[str, float]] = {
         "inclination_sigma_deg": 0.008,
         "inclination_range_deg": 10.0,
         "range_max_m": 1400.0,
+    },
+    "livox-mid-40": {
+        "wavelength_um": 0.905,
+        "beam_divergence_mrad": 3.5,
+        "exit_diameter_m": 0.0,
+        "range_sigma_m": 0.020,
+        "angle_resolution_deg": 0.35,
+        "inclination_sigma_deg": 0.1,
+        "inclination_range_deg": 10.0,
+        "range_max_m": 260.0,
     },
     "livox-mid-70": {
         "wavelength_um": 0.905,

@@ -67,6 +67,14 @@ def _require_zone(zone: str) -> str:
     return zone
 
 
+def require_suffix(suffix: str) -> str:
+    """Return a suffix with its dot; raise ValueError unless a file name can end with it."""
+    dotted = f".{suffix.removeprefix('.')}"
+    if not re.fullmatch(r"(\.[A-Za-z0-9]+){1,2}", dotted):
+        raise ValueError('no end of a file name: give one such as ".rxp"')
+    return dotted
+
+
 def on_loopback(address: str) -> str:
     """Return an address and port; raise ValueError unless they are of this machine only."""
     host, _, port = address.rpartition(":")

@@ -24,6 +24,7 @@ from station.section_types import (
     Zone,
     on_loopback,
     require_projected,
+    require_suffix,
     require_time_pattern,
     without_required,
 )
@@ -81,7 +82,7 @@ class ScansSection(Section):
     intensity: IntensityScale = "auto"
     settle_s: NotNegative = 60.0
     expected_every_s: Positive = 3600.0
-    suffix: Annotated[str, Field(pattern=r"^(\.[A-Za-z0-9]+){1,2}$")] | None = None
+    suffix: Annotated[str, AfterValidator(require_suffix)] | None = None
     columns: tuple[str, ...] = ()
     convert: tuple[str, ...] | None = None
     polling: bool = False
@@ -252,6 +253,7 @@ class WeatherSection(Section):
     file: Path
     format: WeatherFormat = "toa5"
     columns: WeatherColumns | None = None
+    station: str | None = None
     names: tuple[str, ...] = ()
     units: WeatherUnits | None = None
     time_format: str | None = None

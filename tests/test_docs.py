@@ -11,7 +11,7 @@ from pydantic import BaseModel
 
 from station import config
 from station.config import read_site, write_site
-from station.scanners import SCANNERS
+from station.scanners import SCANNERS, scanner_model
 from station.sections import SiteFile
 
 ROOT = Path(__file__).parents[1]
@@ -71,6 +71,26 @@ def test_instrument_values_equal_those_of_the_papers():
     )  # fmt: skip
     z390 = SCANNERS["riegl-lms-z390i"]
     assert (z390["beam_divergence_mrad"], z390["range_sigma_m"]) == (0.30, 0.004)
+
+
+def test_instrument_values_equal_those_of_helios():
+    """HELIOS++, scanners_tls.xml: accuracy_m and beamDivergence_rad; 0.03° by 0.28° for the Livox."""
+    expected = {"riegl-vz-400": (0.005, 0.3), "riegl-vz-600i": (0.005, 0.35), "riegl-vz-1000": (0.008, 0.3)}
+    rms_mrad = (((0.000523598**2 + 0.004887**2) / 2) ** 0.5) * 1e3
+    expected |= {name: (0.02, pytest.approx(rms_mrad, rel=0.01)) for name in ("livox-mid-40", "livox-mid-70")}
+    for name, values in expected.items():
+        assert (SCANNERS[name]["range_sigma_m"], SCANNERS[name]["beam_divergence_mrad"]) == values
+
+
+@pytest.mark.parametrize(
+    ("name", "model"),
+    [
+        ("VZ-6000", "riegl-vz-6000"), ("Riegl VZ 6000", "riegl-vz-6000"), ("RIEGL_VZ-400i", "riegl-vz-400i"),
+        ("vz400", "riegl-vz-400"), ("Livox Mid-70", "livox-mid-70"), ("VZ-9000", None), ("", None),
+    ],
+)  # fmt: skip
+def test_scanners_are_known_by_the_names_that_people_write(name, model):
+    assert scanner_model(name) == model
 
 
 @pytest.fixture(scope="module")

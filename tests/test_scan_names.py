@@ -61,6 +61,10 @@ def test_patterns_and_zones_of_the_site_file_are_checked(tmp_path):
     for zone in ("Europe/Atlantis", "../etc/passwd", "Europe"):
         with pytest.raises(ValidationError, match="no time zone"):
             ScansSection(inbox=tmp_path, zone=zone)
+    assert ScansSection(inbox=tmp_path, suffix="rxp").suffix == ".rxp"
+    for suffix in ("", "a/b", "..", ".a.b.c"):
+        with pytest.raises(ValidationError, match="no end of a file name"):
+            ScansSection(inbox=tmp_path, suffix=suffix)
     with pytest.raises(ValidationError, match="needs suffix"):
         ScansSection(inbox=tmp_path, convert=("pdal", "{in}", "{out}"))
     with pytest.raises(ValidationError, match=r"lacks \{out\}"):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shutil
 from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
@@ -43,8 +44,10 @@ def inbox_findings(site: Site) -> Iterator[LevelAndMessage]:
     if deeper:
         example = deeper[0].relative_to(site.scans.inbox)
         message = f"{len(deeper)} scans lie in folders below it, such as {example}: only the inbox itself is"
-        yield "warning", f"{message} watched; move or link them, see {MANUAL}"
+        yield "warning", f"{message} watched; move or hard-link them, see {MANUAL}"
     yield from _names(site, scans or deeper)
+    if site.scans.convert is not None and shutil.which(site.scans.convert[0]) is None:
+        yield "fault", f"scans.convert: {site.scans.convert[0]} is not found, or may not be run"
 
 
 def files_below(folder: Path) -> Iterator[Path]:

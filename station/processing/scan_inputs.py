@@ -90,7 +90,9 @@ def load_scan_inputs(
     warnings: list[str] = []
     track = reader.azimuth_track() if site.scans.point_time == "auto" else None
     if track is None and site.scans.point_time == "auto":
-        warnings.append("no time per point: one mean tilt for the whole scan")
+        has_time = reader.time_range_s() is not None
+        cause = "azimuth does not follow time" if has_time else "no time per point"
+        warnings.append(f"{cause}: one mean tilt for the whole scan")
     rotation = transform.to_local[:3, :3]
     log = _load_log(site, log_path or _converted_log(site, reader), track, rotation, warnings)
     faults = _static_tilt_faults(site, log)

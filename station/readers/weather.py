@@ -50,8 +50,9 @@ def read_weather(section: WeatherSection, window_utc_s: tuple[float, float] | No
     in that window are read, so that years of log cost nothing; a file must then be in time order, the oldest
     or the newest row first. A last line still being written is ignored. Units that the file states are
     converted. Of several files each may have some of the quantities.
-    Raises ScanError if a column is missing, no row is complete, no time can be read or humidity is a
-    fraction; NotReadyError if the disk fails, access is denied or there is no file.
+
+    Raises ScanError if a column is missing, no row is complete, no time can be read, humidity is a fraction,
+    or the rows are of several stations; NotReadyError if a file cannot be read or there is none.
     """
     files = log_files(section.file)
     tables = [_read_file(path, section, window_utc_s, is_part=len(files) > 1) for path in files]
@@ -72,13 +73,18 @@ def _read_file(
     """Return the rows (k, 4) of one file in a window."""
     with decoder_errors(f"{path.name} cannot be read"), open_regular(path) as file:
         header = read_header(file, section, path.name, is_part=is_part)
-        parse = _parser(header)
-        newest_first = _is_newest_first(file, header, parse, path.name)
+        stations: set[str] = set()
+        parse = _parser(header, section.station, stations)
+        whose = f"{path.name}: no row" + (f" of station {section.station}" if section.station else "")
+        newest_first = _is_newest_first(file, header, parse, whose)
         file.seek(header.first_row)
         window = window_utc_s or (-math.inf, math.inf)
         if window_utc_s is not None:
             _seek_time(file, window[1 if newest_first else 0], parse, newest_first=newest_first)
         rows = list(_rows_in_window(file, parse, window, newest_first=newest_first))
+    if len(stations) > 1:
+        some = ", ".join(sorted(stations)[:3])
+        raise ScanError(f"{path.name}: has rows of {len(stations)} stations ({some}, …): set weather.station")
     table = np.array(rows, dtype=np.float64).reshape(-1, 4)
     if not header.is_percent:
         _require_percent(table[:, 3], path.name)
@@ -111,7 +117,7 @@ def interpolate_air(weather: WeatherLog, time_utc_s: float, max_age_s: float) ->
     return Air(temperature_c, pressure_hpa, humidity_pct)
 
 
-def _is_newest_first(file: BinaryIO, header: Header, parse: ParseRow, name: str) -> bool:
+def _is_newest_first(file: BinaryIO, header: Header, parse: ParseRow, whose: str) -> bool:
     """Return True if the newest rows of a file come first; raise ScanError if no time can be read."""
     size = file.seek(0, 2)
     file.seek(header.first_row)
@@ -127,7 +133,7 @@ def _is_newest_first(file: BinaryIO, header: Header, parse: ParseRow, name: str)
         fields = next((row for row in rows if len(row) > max(header.time_indices)), None)
         if fields is not None:
             raise ScanError(
-                f"{name}: no row has a readable time: the first one is {header.time_text(fields)!r}, but"
+                f"{whose} has a readable time: the first one is {header.time_text(fields)!r}, but"
                 " times must be ISO 8601, such as 2025-07-15 00:10:00, or as weather.time_format says"
             )
     return False
@@ -142,8 +148,11 @@ def _require_percent(humidity_pct: Floats, name: str) -> None:
         )
 
 
-def _parser(header: Header) -> ParseRow:
-    """Return a function that parses a line into a row, or into None if it is not one."""
+def _parser(header: Header, station: str | None, stations: set[str]) -> ParseRow:
+    """Return a function that parses a line into a row, or into None if it is not one.
+
+    Rows of other stations than `station` are not; without it, the stations are added to `stations`.
+    """
     has_comma = header.delimiter != ","  # then one in a number is that of decimals
 
     def parse(line: bytes) -> WeatherRow | None:
@@ -153,9 +162,14 @@ def _parser(header: Header) -> ParseRow:
             fields = split_line(decode(line), header.delimiter)
             if len(fields) != header.width:
                 return None
+            named = None if header.station_index is None else fields[header.station_index]
+            if None not in (station, named) and named != station:
+                return None
             time_utc_s = header.to_utc_s(header.time_text(fields))
         except (ValueError, csv.Error, OverflowError):
             return None
+        if station is None and named is not None:
+            stations.add(named)
         temperature_c, pressure_hpa, humidity_pct = (
             math.nan if index is None else _parse_value(fields[index], *scale, *limits, has_comma=has_comma)
             for index, scale, limits in zip(header.indices, header.scales, VALID_RANGES, strict=True)

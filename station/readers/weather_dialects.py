@@ -52,6 +52,7 @@ class Dialect:
     pressure_hpa: tuple[str, ...] = ()
     humidity_pct: tuple[str, ...] = ()
     time_formats: tuple[str, ...] = ()
+    station: tuple[str, ...] = ()  # column that tells the rows of several stations apart
 
 
 _ANY = Dialect(time=(("TIMESTAMP",),))
@@ -61,13 +62,13 @@ DIALECTS = {
     "smet": Dialect((("timestamp",),), ("TA",), ("P",), ("RH",)),
     "dwd": Dialect(
         (("MESS_DATUM",),), ("TT_10", "TT_TU"), ("PP_10", "P0"), ("RF_10", "RF_TU"),
-        ("%Y%m%d%H%M", "%Y%m%d%H"),
+        ("%Y%m%d%H%M", "%Y%m%d%H"), ("STATIONS_ID",),
     ),
     "meteoswiss": Dialect(
         (("reference_timestamp",), ("Date",), ("time",)), ("tre200s0",), ("prestas0",), ("ure200s0",),
-        ("%d.%m.%Y %H:%M", "%Y%m%d%H%M"),
+        ("%d.%m.%Y %H:%M", "%Y%m%d%H%M"), ("station_abbr", "Station/Location", "stn"),
     ),
-    "geosphere": Dialect((("time",),), ("tl", "TL"), ("p", "P"), ("rf", "RF")),
+    "geosphere": Dialect((("time",),), ("tl", "TL"), ("p", "P"), ("rf", "RF"), station=("station",)),
     "davis": Dialect(
         (("Date", "Time"), ("Date & Time",)), ("Temp Out", "Temp"), ("Abs Pres", "Abs Press", "Bar"),
         ("Out Hum", "Hum"), ("%d/%m/%y %H:%M", "%d.%m.%y %H:%M"),
@@ -93,6 +94,7 @@ class Header:
     time_indices: tuple[int, ...]
     indices: tuple[int | None, ...]  # of QUANTITIES; None if the file has no such column
     scales: tuple[tuple[float, float], ...]  # factor and offset of each
+    station_index: int | None  # of the column that names the station
     is_percent: bool  # humidity is known not to be a fraction
     first_row: int  # position in the file [bytes]
     to_utc_s: Callable[[str], float]
@@ -158,6 +160,9 @@ def read_header(file: BinaryIO, section: WeatherSection, name: str, *, is_part: 
         time_indices=time_indices,
         indices=indices,
         scales=tuple(scales),
+        station_index=next(
+            (i for name in dialect.station if (i := _index_of(name, found.names)) is not None), None
+        ),
         is_percent=found.to_si is not None or units[2] in UNITS[2],
         first_row=file.tell(),
         to_utc_s=_time_parser(section, dialect.time_formats, _stated_offset_h(found, time_indices)),

@@ -132,6 +132,22 @@ def test_files_of_a_pattern_are_one_log(tmp_path):
         read_weather(section.model_copy(update={"file": tmp_path / "2026*.csv"}))
 
 
+@pytest.mark.parametrize("window", [None, (FIRST_S - 60, FIRST_S + 660)])
+def test_rows_of_several_stations_are_refused_or_selected(tmp_path, window):
+    (tmp_path / "all.csv").write_text(
+        "Station/Location;Date;tre200s0;ure200s0;prestas0\n"
+        "BER;202507150010;18.2;70;950\nJUN;202507150010;-1.5;51;684.5\n"
+        "BER;202507150020;18.0;71;950\nJUN;202507150020;-1.4;50;684.6\n"
+    )
+    section = WeatherSection(file=tmp_path / "all.csv", format="meteoswiss")
+    with pytest.raises(ScanError, match=r"rows of 2 stations \(BER, JUN, …\): set weather.station"):
+        read_weather(section, window)
+    log = read_weather(section.model_copy(update={"station": "JUN"}), window)
+    assert log.temperature_c.tolist() == [-1.5, -1.4]
+    with pytest.raises(ScanError, match="no row of station ZER has a readable time"):
+        read_weather(section.model_copy(update={"station": "ZER"}), window)
+
+
 def test_a_file_without_any_quantity_or_time_is_named(tmp_path):
     (tmp_path / "a.csv").write_text("time,t,rh,p\n2025-07-15T00:10Z,1,50,700\n")
     (tmp_path / "b.csv").write_text("Zeit;Wind\n15.07.2025;3\n")
