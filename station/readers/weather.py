@@ -51,7 +51,7 @@ def read_weather(section: WeatherSection, window_utc_s: tuple[float, float] | No
     or the newest row first. A last line still being written is ignored. Units that the file states are
     converted. Of several files each may have some of the quantities.
     Raises ScanError if a column is missing, no row is complete, no time can be read, humidity is a fraction
-    or the rows are of several stations; NotReadyError if the disk fails, access is denied or there is no file.
+    or the rows are of several stations; NotReadyError if the disk fails, access is denied or no file exists.
     """
     files = log_files(section.file)
     tables = [_read_file(path, section, window_utc_s, is_part=len(files) > 1) for path in files]

@@ -53,7 +53,8 @@ LOGS = {
         "2025-07-15T00:20+00:00,11343,,50.0,684.6\n"),
     ),
     "davis": (
-        {"format": "davis", "time_format": "%d/%m/%y %H:%M", "units": {"temperature_c": "F", "pressure_hpa": "inHg"}},
+        {"format": "davis", "time_format": "%d/%m/%y %H:%M",
+         "units": {"temperature_c": "F", "pressure_hpa": "inHg"}},
         DAVIS,
     ),
     "hobo": (
