@@ -269,6 +269,8 @@ class WeatherSection(Section):
             missing = [key for key in ("temperature_c", "humidity_pct", "pressure_hpa") if key not in given]
             if missing:
                 raise ValueError(f'format = "{self.format}" needs columns.{", columns.".join(missing)}')
+        if self.format == "davis" and self.time_format is None:  # day or month first, as the computer was set
+            raise ValueError('format = "davis" needs time_format, such as "%d/%m/%y %H:%M"')
         if self.zone is not None and self.utc_offset_h:
             raise ValueError("zone and utc_offset_h both say what the clock of the logger shows: keep one")
         return self

@@ -71,11 +71,11 @@ DIALECTS = {
     "geosphere": Dialect((("time",),), ("tl", "TL"), ("p", "P"), ("rf", "RF"), station=("station",)),
     "davis": Dialect(
         (("Date", "Time"), ("Date & Time",)), ("Temp Out", "Temp"), ("Abs Pres", "Abs Press", "Bar"),
-        ("Out Hum", "Hum"), ("%d/%m/%y %H:%M", "%d.%m.%y %H:%M"),
+        ("Out Hum", "Hum"),
     ),
     "hobo": Dialect(
         (("Date Time",),), ("Temp",), ("Abs Pres", "Pressure"), ("RH",),
-        ("%m/%d/%y %I:%M:%S %p", "%m/%d/%y %H:%M:%S"),
+        ("%m/%d/%y %I:%M:%S %p",),
     ),
     "lufft": Dialect(
         (("Date time",), ("Datum Zeit",)), ("Temperature", "Lufttemperatur", "Temperatur"),

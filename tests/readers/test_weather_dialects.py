@@ -53,7 +53,8 @@ LOGS = {
         "2025-07-15T00:20+00:00,11343,,50.0,684.6\n"),
     ),
     "davis": (
-        {"format": "davis", "units": {"temperature_c": "F", "pressure_hpa": "inHg"}},
+        {"format": "davis", "time_format": "%d/%m/%y %H:%M",
+         "units": {"temperature_c": "F", "pressure_hpa": "inHg"}},
         DAVIS,
     ),
     "hobo": (
@@ -178,6 +179,8 @@ def test_settings_that_contradict_or_lack_something_are_refused(tmp_path):
     path = tmp_path / "w.csv"
     with pytest.raises(ValidationError, match=r'"csv" needs columns.temperature_c, columns.humidity_pct'):
         WeatherSection(file=path, format="csv")
+    with pytest.raises(ValidationError, match=r'"davis" needs time_format, such as "%d/%m/%y'):
+        WeatherSection(file=path, format="davis")
     with pytest.raises(ValidationError, match="keep one"):
         WeatherSection(file=path, format="dwd", zone="Europe/Berlin", utc_offset_h=1)
     with pytest.raises(ValidationError, match="no time zone"):
