@@ -188,7 +188,9 @@ def test_any_flipped_bit_is_noticed(growing, epoch, rng):
     series, update = growing
     epochs.write_epoch(series, epoch(1, grid=SMALL_GRID))
     update()
-    intact = {name: (series.folder / name).read_bytes() for name in ("series.nc", "processing.nc", "areas.nc")}
+    intact = {
+        name: (series.folder / name).read_bytes() for name in ("series.nc", "processing.nc", "areas.nc")
+    }
     for _ in range(100):
         for name, content in intact.items():
             flip_bits(series.folder / name, rng)
