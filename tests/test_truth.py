@@ -52,7 +52,8 @@ class ProcessedStation:
         reference_tasks.build_reference_version(self.site, scans[:REFERENCE], "1", lambda: None)
         self.results = [scan_tasks.process(self.site, scan, lambda: None) for scan in scans[first:]]
         store_tasks.update_series(self.site, lambda: None)
-        self.series = open_with_processing(self.site.station.data).load()
+        with open_with_processing(self.site.station.data) as series:
+            self.series = series.load()
         truth = xr.open_dataset(folder / "truth.nc").load()
         before = truth.change[:REFERENCE].mean("time")
         self.true_change = (truth.change[first:] - before).values

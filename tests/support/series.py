@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+from contextlib import contextmanager
+from pathlib import Path
+
 import station
+from station.archive.series.lazy import open_virtual
 
 WHEN_WRITTEN = ("date_created", "history")
 
@@ -12,7 +16,8 @@ def without_dates(dataset):
     return dataset.assign_attrs(dict.fromkeys(WHEN_WRITTEN, ""))
 
 
+@contextmanager
 def open_with_processing(folder):
-    """Return `series.nc` and `processing.nc` as one dataset."""
-    ds = station.open(folder)
-    return ds.assign(ds.station.processing.data_vars)
+    """Yield `series.nc` and `processing.nc` as one dataset."""
+    with station.open(folder) as ds, open_virtual(Path(folder) / "processing.nc") as processing:
+        yield ds.assign(processing.data_vars)

@@ -10,6 +10,7 @@ import pytest
 
 from station.archive import areas, epochs, netcdf_layout
 from station.archive.areas import AreaChange, update_areas
+from station.archive.atomic_files import atomic_write
 from station.archive.compaction import compact
 from station.archive.derived import fingerprints
 from station.archive.series import epoch_reader, manifest, virtual
@@ -82,7 +83,7 @@ def describe(dataset):
 
 
 def contents(series):
-    return [file_contents(series.folder / name) for name in ("series.nc", "areas.nc")]
+    return [file_contents(series.folder / name) for name in ("series.nc", "processing.nc", "areas.nc")]
 
 
 def rebuild(series, update):
@@ -159,14 +160,14 @@ def test_damaged_derived_files_are_rebuilt(growing, epoch, rng, kind):
     epochs.write_epoch(series, epoch(1, grid=SMALL_GRID))
     update()
     expected = contents(series)
-    for name in ("series.nc", "areas.nc"):
+    for name in ("series.nc", "processing.nc", "areas.nc"):
         DAMAGES[kind](series.folder / name, rng)
     update()
     assert contents(series) == expected
 
 
 @pytest.mark.integration
-@pytest.mark.parametrize("name", ["series.nc", "areas.nc", manifest.MANIFEST, ".areas.json"])
+@pytest.mark.parametrize("name", ["series.nc", "processing.nc", "areas.nc", manifest.MANIFEST, ".areas.json"])
 def test_damaged_derived_files_are_rebuilt_with_the_next_epoch(growing, epoch, rng, name):
     series, update = growing
     for hour in range(5):
@@ -187,7 +188,9 @@ def test_any_flipped_bit_is_noticed(growing, epoch, rng):
     series, update = growing
     epochs.write_epoch(series, epoch(1, grid=SMALL_GRID))
     update()
-    intact = {name: (series.folder / name).read_bytes() for name in ("series.nc", "areas.nc")}
+    intact = {
+        name: (series.folder / name).read_bytes() for name in ("series.nc", "processing.nc", "areas.nc")
+    }
     for _ in range(100):
         for name, content in intact.items():
             flip_bits(series.folder / name, rng)
@@ -216,10 +219,35 @@ def test_only_the_new_epoch_of_a_long_series_is_opened(growing, epoch, monkeypat
         written = epochs.write_epoch(series, epoch(hour, grid=SMALL_GRID))
         update()
         if hour > 1:
-            assert set(opened) == {written.path.name, "series.nc"}
+            assert set(opened) == {written.path.name, "series.nc", "processing.nc"}
     opened.clear()
     update()
     assert not opened
+
+
+def test_a_kill_between_the_two_files_is_repaired(growing, epoch, monkeypatch):
+    series, update = growing
+    epochs.write_epoch(series, epoch(1, grid=SMALL_GRID))
+    update()
+    epochs.write_epoch(series, epoch(2, grid=SMALL_GRID))
+
+    def killed(path):
+        if path == series.path:
+            raise KeyboardInterrupt
+        return atomic_write(path)
+
+    with monkeypatch.context() as killing:
+        killing.setattr(virtual, "atomic_write", killed)
+        with pytest.raises(KeyboardInterrupt):
+            build_series(series)
+    with h5py.File(series.processing_path) as processing, h5py.File(series.path) as results:
+        assert (len(processing["scan_id"]), len(results["scan_id"])) == (2, 1)
+    assert not manifest.is_intact(series)
+    build_series(series)
+    assert manifest.is_intact(series)
+    with h5py.File(series.processing_path) as processing, h5py.File(series.path) as results:
+        assert (processing["scan_id"][:] == results["scan_id"][:]).all()
+        assert len(results["scan_id"]) == 2
 
 
 @pytest.mark.integration
@@ -237,7 +265,7 @@ def test_a_file_replaced_under_its_name_is_read_again(growing, epoch):
         written.path.unlink()
         written.path.write_bytes(file_bytes)
         update()
-        with h5py.File(series.path) as file:
+        with h5py.File(series.processing_path) as file:
             assert file["platform_roll"][:].tolist() == [0.12, 0.12, roll]
 
 
