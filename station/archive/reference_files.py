@@ -89,7 +89,12 @@ class ReferenceProvenance:
     base: str
     science_hash: str = ""
     replaces: tuple[str, ...] = ()  # superseded versions with the same base
-    scan_provenance: tuple[dict[str, str], ...] = ()  # epoch provenance of each of its scans
+    scan_provenance: tuple[dict[str, str], ...] = ()  # epoch provenance of each of its scans, values as JSON
+
+    @property
+    def scan_ids(self) -> list[str]:
+        """Scans that this version was built from."""
+        return [json.loads(provenance["scan_id"]) for provenance in self.scan_provenance]
 
 
 def version_path(series: Series, version: str) -> Path:

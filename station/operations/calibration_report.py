@@ -53,13 +53,13 @@ def calibration_report(
     memory_gb, timeout_s = site.service.memory_gb, site.scans.timeout_s
     report: CalibrationReport = {}
     if series.path.is_file():
-        report |= isolation.run_isolated(
+        report |= isolation.TaskRunner().run(
             sigma_report, site, max_epochs, memory_gb=memory_gb, timeout_s=timeout_s, on_progress=progress
         )
     chosen = sorted(scans)[-COMPARED_SCANS:] or _newest_scans(site)
     if site.scans.frame == "scanner" and chosen:
         try:
-            report["precision"] = isolation.run_isolated(
+            report["precision"] = isolation.TaskRunner().run(
                 precision_report, site, chosen, memory_gb=memory_gb, timeout_s=timeout_s
             )
         except ScanError as error:

@@ -45,7 +45,7 @@ from station.processing.store_tasks import MAX_STORE_TASK_S
 from station.processing.usable_inputs import usable_site
 from station.processing.workers.dask_executor import DaskExecutor
 from station.processing.workers.executors import Executor, LocalExecutor
-from station.processing.workers.isolation import run_isolated
+from station.processing.workers.isolation import TaskRunner
 from station.processing.workers.worker_process import Progress as Tick
 from station.readers.scan import utc_interval
 from station.readers.sop import valid_sop
@@ -114,7 +114,7 @@ class _Planning:
 
     def _run_task(self, task: Callable[..., T], *args: object) -> T:
         memory_gb = self._site.service.memory_gb
-        return run_isolated(task, self._site, *args, memory_gb=memory_gb, timeout_s=MAX_STORE_TASK_S)
+        return TaskRunner().run(task, self._site, *args, memory_gb=memory_gb, timeout_s=MAX_STORE_TASK_S)
 
 
 class Reprocessing(_Planning):

@@ -32,7 +32,9 @@ def sensitivity_report(site: Site, epoch: int | str, maps: Path | None) -> Sensi
     """
     Aggregates(series_for(site)).find_epoch(epoch)
     memory_gb, timeout_s = site.service.memory_gb, site.scans.timeout_s
-    return isolation.run_isolated(compute_shares, site, epoch, maps, memory_gb=memory_gb, timeout_s=timeout_s)
+    return isolation.TaskRunner().run(
+        compute_shares, site, epoch, maps, memory_gb=memory_gb, timeout_s=timeout_s
+    )
 
 
 def compute_shares(

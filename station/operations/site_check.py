@@ -86,7 +86,7 @@ def store_findings(site_path: Path) -> list[Finding]:
 def _check_store_isolated(site: Site) -> list[tuple[str, str, str]]:
     with JournalReader(site.station.data / "journal.sqlite") as journal:
         entries, known = journal.rows(), journal.checksums()
-    return isolation.run_isolated(
+    return isolation.TaskRunner().run(
         check_store, site, entries, known, memory_gb=site.service.memory_gb, timeout_s=math.inf
     )
 
@@ -283,7 +283,7 @@ def _newest_scan(site: Site) -> Iterator[Finding]:
         return
     scan = scan_file(site, scans[-1])
     try:
-        verdict, reason, metrics = isolation.run_isolated(
+        verdict, reason, metrics = isolation.TaskRunner().run(
             dry_run,
             site,
             scan,

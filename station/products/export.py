@@ -12,7 +12,7 @@ import numpy as np
 
 from station.archive.epochs import EpochRef
 from station.archive.netcdf_layout import Series
-from station.archive.reference_files import open_reference, valid_versions
+from station.archive.reference_files import valid_versions
 from station.archive.series.index import list_epochs, series_in
 from station.config import Site
 from station.errors import StationError
@@ -51,9 +51,8 @@ def export(site: Site, kind: str, span: Span | None, folder: Path, track: Track 
 def _versions_by_scan(series: Series) -> dict[str, list[str]]:
     """Return the versions of the reference that each scan is part of, by scan."""
     versions_by_scan: dict[str, list[str]] = {}
-    for version in valid_versions(series):
-        reference = open_reference(series, version)
-        for scan_id in reference.scan_ids if reference else ():
+    for version, provenance in valid_versions(series).items():
+        for scan_id in provenance.scan_ids:
             versions_by_scan.setdefault(scan_id, []).append(version)
     return versions_by_scan
 

@@ -264,7 +264,7 @@ import isolated_tasks
 from station.processing.workers import fork_server, isolation
 if __name__ == "__main__":
     fork_server.ensure_running(("station.processing.workers.isolation",))
-    isolation.run_isolated(isolated_tasks.hang_ignoring_signals, sys.argv[2], memory_gb=1, timeout_s=60)
+    isolation.TaskRunner().run(isolated_tasks.hang_ignoring_signals, sys.argv[2], memory_gb=1, timeout_s=60)
 """
 
 

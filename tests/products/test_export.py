@@ -16,7 +16,7 @@ from PIL import Image
 from support.programs import readers_python, run
 
 import station
-from station.archive.reference_files import open_reference, write_reference
+from station.archive.reference_files import ReferenceProvenance, open_reference, write_reference
 from station.archive.series.index import series_in
 from station.products.area_tables import Span
 from station.products.export import export
@@ -183,7 +183,10 @@ def test_csv_of_scans(site, tmp_path, small):
     assert [row["in_reference"] for row in rows] == [""] * 6  # it was given as a surface
     series = series_in(site.station.data)
     reference = open_reference(series)
-    write_reference(series, replace(reference, version="2", scan_ids=(rows[1]["scan"], rows[5]["scan"])))
+    provenance = tuple({"scan_id": json.dumps(rows[index]["scan"])} for index in (1, 5))
+    write_reference(
+        series, replace(reference, version="2"), ReferenceProvenance("2", scan_provenance=provenance)
+    )
     scans, _ = export(site, "csv", None, tmp_path / "csv")
     rows = list(csv.DictReader(io.StringIO(scans.read_text())))
     assert [row["in_reference"] for row in rows] == ["", "2", "", "", "", "2"]

@@ -38,7 +38,7 @@ class LocalExecutor:
     def start(self, site: Site, scan: ScanFile, history: ScanHistory) -> Future[StoredResult | Rejected]:
         """Start reprocessing a scan."""
         return self._threads.submit(
-            isolation.run_isolated,
+            isolation.TaskRunner().run,
             reprocess_scan,
             site,
             scan,

@@ -41,25 +41,6 @@ class _WorkerLostError(InconclusiveError):
     """The worker process was killed from outside or could not be started."""
 
 
-def run_isolated(
-    task: Callable[..., T],
-    *args: object,
-    memory_gb: float,
-    timeout_s: float,
-    on_progress: Callable[[], None] = lambda: None,
-    should_stop: Callable[[], bool] = lambda: False,
-) -> T:
-    """Return the result of a task; see `TaskRunner.run`."""
-    return TaskRunner().run(
-        task,
-        *args,
-        memory_gb=memory_gb,
-        timeout_s=timeout_s,
-        on_progress=on_progress,
-        should_stop=should_stop,
-    )
-
-
 class TaskRunner:
     """Runs tasks in worker processes, and knows since when none could be started; for several threads."""
 
