@@ -66,7 +66,7 @@ def export_points(site: Site, span: Span | None, folder: Path, track: Track = it
         if scan is None:
             raise StationError(f"{epoch.epoch_file}: its scan {scan_id} is neither in the inbox nor archived")
         path = folder / f"{Path(epoch.epoch_file).stem}.laz"
-        isolation.run_isolated(
+        isolation.TaskRunner().run(
             write_points,
             usable,
             scan,

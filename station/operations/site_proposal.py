@@ -61,7 +61,7 @@ def propose_site(source: Path, folder: Path) -> list[Path]:
         return import_riscan(projects[0], folder)
     found = _look_into(source)
     try:
-        header = isolation.run_isolated(_header, found.scan, memory_gb=MEMORY_GB, timeout_s=TIMEOUT_S)
+        header = isolation.TaskRunner().run(_header, found.scan, memory_gb=MEMORY_GB, timeout_s=TIMEOUT_S)
     except StationError as error:
         raise ConfigError(f"{found.scan}: cannot be read: {error}") from error
     on_map = float(np.abs([header.low_m[:2], header.high_m[:2]]).min()) > MAX_SCANNER_FRAME_M

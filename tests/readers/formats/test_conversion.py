@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from station.errors import InconclusiveError, NotReadyError, ScanError
-from station.processing.workers.isolation import run_isolated
+from station.processing.workers.isolation import TaskRunner
 from station.readers.formats.conversion import convert, open_site_scan
 from station.sections import ScansSection
 
@@ -92,7 +92,7 @@ open({str(pids)!r}, 'w').write(f'{{os.getpid()}} {{child.pid}}')
 time.sleep(60)
 """
     with pytest.raises(InconclusiveError, match="took longer than 3 s"):
-        run_isolated(_open, source, settings(tmp_path, script), memory_gb=1.0, timeout_s=3.0)
+        TaskRunner().run(_open, source, settings(tmp_path, script), memory_gb=1.0, timeout_s=3.0)
     for _ in range(50):
         running = [pid for pid in pids.read_text().split() if is_running(pid)]
         if not running:
@@ -111,7 +111,7 @@ def test_a_command_has_the_memory_of_its_worker(tmp_path):
     source.write_bytes(b"scan")
     script = "bytearray(3 << 30)"
     with pytest.raises(InconclusiveError, match="MemoryError"):
-        run_isolated(_open, source, settings(tmp_path, script), memory_gb=1.0, timeout_s=30.0)
+        TaskRunner().run(_open, source, settings(tmp_path, script), memory_gb=1.0, timeout_s=30.0)
 
 
 def _open(path, scans, _progress):
