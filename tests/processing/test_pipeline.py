@@ -33,7 +33,7 @@ from station.science.adjustment.prior import line_times, log_only_covariance
 from station.science.geometry.air import air_correction
 from station.science.geometry.inclination import NO_CYCLIC_ERROR
 from station.science.geometry.pose import scanner_to_local_map, scanner_to_map_by_origin
-from station.science.gridding import cell_estimates, viewing_geometry
+from station.science.gridding import cell_estimates, reference_cells
 from station.science.gridding.reference_surface import build_surface, centre_reference
 from station.science.gridding.scan_stack import ScanStack
 from station.science.uncertainty import budget
@@ -299,7 +299,7 @@ def test_adjustment_to_a_sample_of_stable_ground_agrees_with_all_of_it(monkeypat
     monkeypatch.setattr(SnowTest, "changed", lambda _, intensity, *__: np.zeros(len(intensity), bool))
     adjustments = {}
     for step in (1, 2, 3, 13):
-        monkeypatch.setattr(viewing_geometry, "MAX_STABLE_CELLS", stable.size // step + 1)
+        monkeypatch.setattr(reference_cells, "MAX_STABLE_CELLS", stable.size // step + 1)
         _, gridder, scan_geometry, viewing = process_shots(raised_shots, reference, stable=stable)
         observed = gridder.rasters().count > 0
         adjustments[step] = adjust_to_reference(gridder, scan_geometry, inputs, viewing)
