@@ -12,7 +12,7 @@ from station.errors import NotReadyError, ScanError
 from station.inbox.inbox import ScanFile, start_from_name
 from station.inbox.journal import Journal
 from station.inbox.journal_reader import State
-from station.inbox.scan_files import find_scan
+from station.inbox.scan_files import find_scan, is_present
 from station.logs import logfmt
 from station.processing.reference_tasks import (
     build_reference_version,
@@ -94,7 +94,7 @@ class ReferenceBuilder:
             for row in self._journal.rows()
             if row.epoch and row.outcome is not State.SET_ASIDE and row.reference != version
             if update_s is None
-            or ((row.start_utc_s or 0.0) > update_s and (self._site.scans.inbox / row.name).is_file())
+            or ((row.start_utc_s or 0.0) > update_s and is_present(self._site.scans.inbox / row.name))
         )
         self._journal.requeue(outdated, keep_reference=False)
 
@@ -122,14 +122,14 @@ class ReferenceBuilder:
         names = [
             name
             for name in self._journal.without_reference()
-            if name in self._processed or (inbox / name).is_file()
+            if name in self._processed or is_present(inbox / name)
         ]
         self._journal.requeue(names)
 
     def _find_scan(self, name: str) -> ScanFile | None:
         """Return a scan file from where it was processed, the inbox or the archive; None if it is gone."""
         scan = self._processed.get(name)
-        if scan is not None and scan.path.is_file():
+        if scan is not None and is_present(scan.path):
             return scan
         entry = self._journal.entry(name)
         return find_scan(self._site, name, entry.start_utc_s if entry else None)

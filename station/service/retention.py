@@ -15,7 +15,7 @@ from station.errors import NotReadyError, ScanError
 from station.inbox.file_hash import file_identity, sha256_file
 from station.inbox.inbox import ScanFile
 from station.inbox.journal_reader import Entry
-from station.inbox.scan_files import archive_path, scan_file
+from station.inbox.scan_files import archive_path, is_present, scan_file
 from station.processing.site_files import series_for, sha256_log
 from station.processing.workers.worker_process import Progress
 from station.scan_names import scan_stem
@@ -43,7 +43,7 @@ def expired_scans(site: Site, entries: Iterable[Entry], reserved: set[str], now_
         and entry.outcome is not None
         and scan_stem(entry.name) not in sop_scans
         and (settings.raw == "move" or entry.name not in reserved)
-        and (site.scans.inbox / entry.name).is_file()
+        and is_present(site.scans.inbox / entry.name)
     ]
     return [name for _, name in sorted(candidates)[:MAX_PER_RUN]]
 

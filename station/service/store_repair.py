@@ -12,6 +12,7 @@ from station.clock import Clock
 from station.config import Site
 from station.errors import ConfigError, StoreError
 from station.inbox.journal import Journal
+from station.inbox.scan_files import is_present
 from station.logs import logfmt
 from station.processing.integrity import (
     add_checksums,
@@ -119,7 +120,7 @@ class StoreRepair:
 
     def _requeue_missing(self) -> None:
         for name in self._run(missing_epochs, self._journal.current_epochs()):
-            if (self._site.scans.inbox / name).is_file():
+            if is_present(self._site.scans.inbox / name):
                 log.warning("%s", logfmt(scan=name, reason="epoch missing from the store: reprocessing"))
                 self._journal.requeue([name])
             else:

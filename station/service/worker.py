@@ -11,6 +11,7 @@ from station.errors import InconclusiveError, NotReadyError, ScanError, StationE
 from station.inbox.inbox import ScanFile
 from station.inbox.journal import Journal
 from station.inbox.journal_reader import Entry, State
+from station.inbox.scan_files import is_present
 from station.logs import logfmt
 from station.monitoring.daily_digest import write_digest, yesterday
 from station.processing.integrity import holds_epochs
@@ -231,7 +232,7 @@ class Worker:
             self._mirror_is_due = self._site.mirror is not None  # a fault may have gone
         self._journal.drop_checksums(self.store.with_repair(delete_expired, now_s))
         affected = self.store.with_repair(late_inputs, self._journal.rows(State.STORED))
-        names = [name for name in affected if (self._site.scans.inbox / name).is_file()]
+        names = [name for name in affected if is_present(self._site.scans.inbox / name)]
         for name in names:
             log.info("%s", logfmt(scan=name, reason="its log or weather arrived late: reprocessing"))
         self._journal.requeue(names)
@@ -284,14 +285,14 @@ class Worker:
     def _judge_again(self) -> None:
         """Queue scans that were set aside or failed under other settings, limits or another version."""
         names = self._journal.judged_otherwise(self._site.judging_conditions)
-        names = [name for name in names if (self._site.scans.inbox / name).is_file()]
+        names = [name for name in names if is_present(self._site.scans.inbox / name)]
         reason = "settings, limits or version have changed since it was set aside or failed"
         for name in names:
             log.info("%s", logfmt(scan=name, verdict="waiting", reason=reason))
         self._journal.requeue(names, reason)
         reason = "rejected for now a week ago: one more attempt"
         for name in self._journal.rejected_for_now():
-            if (self._site.scans.inbox / name).is_file():
+            if is_present(self._site.scans.inbox / name):
                 log.info("%s", logfmt(scan=name, verdict="waiting", reason=reason))
                 self._journal.try_once(name, reason, self._site.judging_conditions)
 

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import shutil
 import time
 from dataclasses import replace
+from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
@@ -210,6 +212,26 @@ def test_reference_does_not_wait_without_end(pretend):
     assert worker.references == []
     worker.process(scan(site, 1))
     assert worker.references == [[f"{scan_name(0)}.laz", f"{scan_name(2)}.laz"]]
+
+
+def test_an_inbox_that_cannot_be_searched_pauses_the_reference_and_is_no_bug(pretend, monkeypatch):
+    site, _, worker = pretend("[reference]\nscans = 2")
+    scans = [scan(site, hour) for hour in (0, 1)]
+    worker.process(scans[0])
+    usual = Path.stat
+
+    def denied(path, **options):
+        if path.parent == site.scans.inbox:
+            raise PermissionError(errno.EACCES, "Permission denied")
+        return usual(path, **options)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Path, "stat", denied)
+        with pytest.raises(NotReadyError, match=r"250715_000000\.laz: cannot be read: Permission denied"):
+            worker.process(scans[1])
+    assert worker.references == []
+    worker._reference.build_if_due()
+    assert worker.references == [[scan.name for scan in scans]]
 
 
 # ---- values, with real tasks
