@@ -156,6 +156,8 @@ def process(
         progress()
         reference = load_reference(site, history.reference)
         epoch = _compute_epoch(site, scan, scan_sha256, reference, history, progress)
+    del reference
+    trim_heap()
     if not history.revision:
         _require_new_start(site, epoch.start_s)
     version, epoch_file = epoch.provenance["reference_version"], _identical_epoch(series, epoch)

@@ -35,7 +35,7 @@ from station.readers.scan import (
 
 POSITION_AND_TIME = DecompressionSelection.base().decompress_z().decompress_gps_time()  # of formats 6 and up
 GROUND = POSITION_AND_TIME.decompress_flags().decompress_classification()
-BLOCKS_PER_BUFFER = 8  # decoded together, several chunks per core; converted one by one, in the cache
+BLOCKS_PER_BUFFER = 4  # decoded together, two chunks per core; converted one by one, in the cache
 SAMPLE_COUNT = 200  # points sampled from a scan with no or few chunks
 SKIP_POINTS = 50_000  # points decoded at a time to skip them
 BRIGHTNESS_POINTS = 1000  # points at the start of a scan that show whether its brightness varies
