@@ -13,6 +13,16 @@ import re
 # less. Aperture, encoders and inclination sensor of these RIEGL are those of the VZ-400i; ranges are the
 # makers'. The beam of the Livox is 0.52 by 4.89 mrad, as wide as a round one of 3.5 mrad in the mean square.
 # Its direction is known to 0.1° (one sigma), as with an encoder of 0.35° a step; it has no tilt sensor.
+LIVOX_MID = {
+    "wavelength_um": 0.905,
+    "beam_divergence_mrad": 3.5,
+    "exit_diameter_m": 0.0,
+    "range_sigma_m": 0.020,
+    "angle_resolution_deg": 0.35,
+    "inclination_sigma_deg": 0.1,
+    "inclination_range_deg": 10.0,
+    "range_max_m": 260.0,
+}
 SCANNERS: dict[str, dict[str, float]] = {
     "riegl-vz-6000": {
         "wavelength_um": 1.064,
@@ -84,26 +94,8 @@ SCANNERS: dict[str, dict[str, float]] = {
         "inclination_range_deg": 10.0,
         "range_max_m": 1400.0,
     },
-    "livox-mid-40": {
-        "wavelength_um": 0.905,
-        "beam_divergence_mrad": 3.5,
-        "exit_diameter_m": 0.0,
-        "range_sigma_m": 0.020,
-        "angle_resolution_deg": 0.35,
-        "inclination_sigma_deg": 0.1,
-        "inclination_range_deg": 10.0,
-        "range_max_m": 260.0,
-    },
-    "livox-mid-70": {
-        "wavelength_um": 0.905,
-        "beam_divergence_mrad": 3.5,
-        "exit_diameter_m": 0.0,
-        "range_sigma_m": 0.020,
-        "angle_resolution_deg": 0.35,
-        "inclination_sigma_deg": 0.1,
-        "inclination_range_deg": 10.0,
-        "range_max_m": 260.0,
-    },
+    "livox-mid-40": LIVOX_MID,
+    "livox-mid-70": LIVOX_MID,
 }
 
 

@@ -299,7 +299,8 @@ def z_of_others(tmp_path_factory):
             z[method, "100 m"].append(error / sigma)
             z[method, "area"].append(processed.area_z())
             trends = [record.trend for record in trend_records(processed.site, None, Span.parse(None, None))]
-            z[method, "rate"].append([trend.rate / trend.rate_sigma for trend in trends])  # nothing changes
+            true_m_d = 0.0  # nothing changes
+            z[method, "rate"].append([(trend.rate_m_d - true_m_d) / trend.rate_sigma_m_d for trend in trends])
     return {key: np.concatenate(values) for key, values in z.items()}
 
 

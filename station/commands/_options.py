@@ -6,12 +6,21 @@ import math
 import sys
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
+from enum import StrEnum
 from pathlib import Path
 from typing import Annotated, TypeVar
 
 import typer
 
 T = TypeVar("T")
+
+
+class Period(StrEnum):
+    """A period of a series (UTC): of each exported file, or of each rate."""
+
+    day = "1D"
+    month = "1M"
+
 
 SiteArgument = Annotated[
     Path, typer.Argument(metavar="SITE", help="The site file (TOML).", show_default=False)

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from station.commands._options import FromOption, SiteArgument, ToOption, amount_bar, progress_bar
+from station.commands._options import FromOption, Period, SiteArgument, ToOption, amount_bar, progress_bar
 
 if TYPE_CHECKING:
     from station.config import Site
@@ -41,13 +41,6 @@ OF_EPOCHS = {
 }  # the others are of the series
 
 
-class ExportPeriod(StrEnum):
-    """The period of each file of an export."""
-
-    day = "1D"
-    month = "1M"
-
-
 @dataclass(frozen=True)
 class SeriesOptions:
     """Options of the formats that contain or describe the series."""
@@ -73,7 +66,7 @@ def export(
     first: FromOption = None,
     last: ToOption = None,
     every: Annotated[
-        ExportPeriod | None,
+        Period | None,
         typer.Option(help="NetCDF, Zarr: one file for each day or month.", show_default=False),
     ] = None,
     area: Annotated[

@@ -13,6 +13,7 @@ from station.commands._options import (
     Against,
     CsvOption,
     FromOption,
+    Period,
     Polygons,
     SiteArgument,
     ToOption,
@@ -22,13 +23,6 @@ from station.commands._options import (
 
 if TYPE_CHECKING:
     from station.config import Site
-
-
-class Period(StrEnum):
-    """A period for which `station trend` gives a rate."""
-
-    day = "1D"
-    month = "1M"
 
 
 class PlotKind(StrEnum):

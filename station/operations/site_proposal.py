@@ -177,12 +177,12 @@ def _map_frame_lines(header: ScanHeader) -> list[str]:
 
 
 def _code(header: ScanHeader) -> str:
-    """Return the EPSG code of the CRS that a scan declares, without one that of a UTM zone to correct."""
+    """Return the EPSG code of the CRS that a scan declares, else one that `station check` refuses."""
     try:
         code = CRS.from_user_input(header.crs_wkt).to_epsg() if header.crs_wkt else None
     except CRSError:
         code = None
-    return f"EPSG:{code or 32632}"
+    return f"EPSG:{code or '…'}"
 
 
 def _more_lines(found: _Found, *, mode: str) -> list[str]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 import io
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass
+from dataclasses import astuple, dataclass
 from datetime import datetime
 from itertools import groupby
 from pathlib import Path
@@ -17,12 +17,12 @@ from station.archive.series.index import list_epochs, series_in
 from station.config import Site
 from station.errors import StationError
 from station.products.area_tables import REFERENCE, AreaRecord, Span, area_cells, area_records, text_table
+from station.products.exports.selection import PERIODS
 from station.queries.aggregates import Aggregates
 from station.queries.error_correlation import area_error_correlation
 from station.science.analysis.trend import MIN_EPOCHS, Trend, error_covariance, fit_trend
 from station.science.geometry.robust_statistics import NORMAL_95
 
-PERIODS = {"1D": "%Y-%m-%d", "1M": "%Y-%m"}
 SIGNIFICANT = NORMAL_95  # an acceleration, or a rate whose inverse is given, is at least so many sigma
 
 
@@ -42,8 +42,10 @@ class TrendRecord:
 
         Before a slope fails it falls in a straight line to zero (Fukuzono, 1985).
         """
-        rate, sigma = abs(self.trend.rate), self.trend.rate_sigma
-        return (1 / rate, sigma / rate**2) if rate > SIGNIFICANT * sigma else (np.nan, np.nan)
+        speed_m_d, sigma_m_d = abs(self.trend.rate_m_d), self.trend.rate_sigma_m_d
+        if speed_m_d <= SIGNIFICANT * sigma_m_d:
+            return np.nan, np.nan
+        return 1 / speed_m_d, sigma_m_d / speed_m_d**2
 
 
 def trend_records(
@@ -112,9 +114,8 @@ def as_csv(records: Iterable[TrendRecord]) -> str:
          "acceleration_sigma_m_d2", "inverse_velocity_d_m", "inverse_velocity_sigma_d_m"]
     )  # fmt: skip
     for record in records:
-        trend = record.trend
-        values = (trend.rate, trend.rate_sigma, trend.acceleration, trend.acceleration_sigma)
-        texts = [f"{v:.6g}" if np.isfinite(v) else "" for v in (*values, *record.inverse_velocity_d_m)]
+        values = (*astuple(record.trend), *record.inverse_velocity_d_m)
+        texts = [f"{value:.6g}" if np.isfinite(value) else "" for value in values]
         times = [f"{time:%Y-%m-%dT%H:%M:%SZ}" for time in (record.first, record.last)]
         writer.writerow([record.area, *times, record.epochs, *texts])
     return stream.getvalue()
@@ -126,19 +127,20 @@ def as_text(records: Iterable[TrendRecord]) -> str:
     body = []
     for record in records:
         trend, accelerates = record.trend, ""
-        moves = abs(trend.rate) > SIGNIFICANT * trend.rate_sigma
-        if moves and abs(trend.acceleration) > SIGNIFICANT * trend.acceleration_sigma:
-            accelerates = "speeds up" if trend.acceleration * trend.rate > 0 else "slows down"
+        has_acceleration = np.isfinite(trend.acceleration_m_d2)
+        moves = abs(trend.rate_m_d) > SIGNIFICANT * trend.rate_sigma_m_d
+        if moves and abs(trend.acceleration_m_d2) > SIGNIFICANT * trend.acceleration_sigma_m_d2:
+            accelerates = "speeds up" if trend.acceleration_m_d2 * trend.rate_m_d > 0 else "slows down"
         body.append(
             (
                 record.area,
                 f"{record.first:%Y-%m-%d %H:%M}",
                 f"{record.last:%Y-%m-%d %H:%M}",
                 str(record.epochs),
-                f"{trend.rate:+.4f}",
-                f"±{NORMAL_95 * trend.rate_sigma:.4f}",
-                f"{trend.acceleration:+.4f}" if np.isfinite(trend.acceleration) else "",
-                f"±{NORMAL_95 * trend.acceleration_sigma:.4f}" if np.isfinite(trend.acceleration) else "",
+                f"{trend.rate_m_d:+.4f}",
+                f"±{NORMAL_95 * trend.rate_sigma_m_d:.4f}",
+                f"{trend.acceleration_m_d2:+.4f}" if has_acceleration else "",
+                f"±{NORMAL_95 * trend.acceleration_sigma_m_d2:.4f}" if has_acceleration else "",
                 accelerates,
             )
         )

@@ -71,7 +71,11 @@ def test_scans_on_the_map_and_other_names(tmp_path):
     source.mkdir()
     lines = [" ".join(f"{value:.3f}" for value in point) for point in points_m.T]
     (source / "hut_2025-07-15_09-00-00.xyz").write_text("\n".join(lines) + "\n")
-    site = read_site(propose_site(source, tmp_path / "site")[0])
+    path = propose_site(source, tmp_path / "site")[0]
+    with pytest.raises(ConfigError, match="unknown to PROJ: name a projected CRS"):  # the file declares none
+        read_site(path)
+    path.write_text(path.read_text().replace("EPSG:…", "EPSG:32632"))
+    site = read_site(path)
     assert (site.scans.frame, site.scans.name) == ("map", "*%Y-%m-%d_%H-%M-%S")
     assert site.grid.bounds_m.west == 600_000.0
     assert not site.sop

@@ -23,12 +23,12 @@ def test_rate_of_a_known_rise(site):
     assert [record.epochs for record in records] == [6, 6]
     for record, true_m_d in zip(records, (1.2, -1.2), strict=True):
         trend = record.trend
-        assert abs(trend.rate - true_m_d) < 3 * trend.rate_sigma
-        assert trend.rate_sigma < 0.05
-        assert abs(trend.acceleration) < 3 * trend.acceleration_sigma
+        assert abs(trend.rate_m_d - true_m_d) < 3 * trend.rate_sigma_m_d
+        assert trend.rate_sigma_m_d < 0.05
+        assert abs(trend.acceleration_m_d2) < 3 * trend.acceleration_sigma_m_d2
         inverse, sigma = record.inverse_velocity_d_m
-        assert inverse == pytest.approx(1 / abs(trend.rate))
-        assert sigma / inverse == pytest.approx(trend.rate_sigma / abs(trend.rate))
+        assert inverse == pytest.approx(1 / abs(trend.rate_m_d))
+        assert sigma / inverse == pytest.approx(trend.rate_sigma_m_d / abs(trend.rate_m_d))
 
 
 def test_unusable_epochs_are_left_out(site, monkeypatch):

@@ -1,4 +1,4 @@
-"""The mirror: renewed with new epochs, in the background; its faults are told and stop nothing."""
+"""The mirror: renewed with new epochs, in the background; its faults are reported and stop nothing."""
 
 import json
 import time

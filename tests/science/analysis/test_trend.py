@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 from scipy import optimize
 
-from station.science.analysis.trend import WEATHER_S, error_correlation, error_covariance, fit_trend
+from station.science.analysis.trend import error_correlation, error_covariance, fit_trend
+from station.science.gridding.reference_surface import REFRACTION_CORRELATION_S
 
 HOUR_S = 3600.0
 TIME_S = 1.7e9 + HOUR_S * np.delete(np.arange(60.0), [7, 8, 30, 41])  # hourly, with gaps
@@ -15,7 +16,7 @@ def drawn_errors(correlation, count, seed=1):
     """Errors (count, n) as the reference, the weather and the scans themselves make them."""
     rng = np.random.default_rng(seed)
     common, weather = correlation
-    step = np.exp(-np.diff(TIME_S, prepend=-np.inf) / WEATHER_S)  # an autoregressive process
+    step = np.exp(-np.diff(TIME_S, prepend=-np.inf) / REFRACTION_CORRELATION_S)  # an autoregressive process
     air = np.zeros((count, len(TIME_S)))
     for index, kept in enumerate(step):
         before = air[:, index - 1] if index else 0.0
@@ -33,9 +34,8 @@ def test_errors_of_rate_and_acceleration_have_their_sigma(correlation):
     for errors in drawn_errors(correlation, 2000):
         trend = fit_trend(TIME_S, 0.3 - 0.12 * day + errors, covariance)
         bent = fit_trend(TIME_S, 0.3 - 0.12 * day + 0.05 * day**2 / 2 + errors, covariance)
-        z.append(
-            ((trend.rate + 0.12) / trend.rate_sigma, (bent.acceleration - 0.05) / bent.acceleration_sigma)
-        )
+        z_rate = (trend.rate_m_d + 0.12) / trend.rate_sigma_m_d
+        z.append((z_rate, (bent.acceleration_m_d2 - 0.05) / bent.acceleration_sigma_m_d2))
     assert np.mean(z, axis=0) == pytest.approx(0, abs=0.08)
     assert np.std(z, axis=0) == pytest.approx(1, abs=0.05)
 
@@ -52,22 +52,24 @@ def test_trend_equals_that_of_scipy():
         lambda t, a, b, c: a + b * t + c * t**2 / 2, day, values_m, sigma=covariance, absolute_sigma=True
     )
     trend = fit_trend(TIME_S, values_m, covariance)
-    assert (trend.rate, trend.rate_sigma) == pytest.approx((line[1], np.sqrt(line_cov[1, 1])), rel=1e-5)
+    assert (trend.rate_m_d, trend.rate_sigma_m_d) == pytest.approx(
+        (line[1], np.sqrt(line_cov[1, 1])), rel=1e-5
+    )
     expected = arc[2], np.sqrt(arc_cov[2, 2])
-    assert (trend.acceleration, trend.acceleration_sigma) == pytest.approx(expected, rel=1e-5)
+    assert (trend.acceleration_m_d2, trend.acceleration_sigma_m_d2) == pytest.approx(expected, rel=1e-5)
 
 
 def test_two_epochs_have_no_rate_and_three_no_acceleration():
     covariance = np.diag(SIGMA_M[:3] ** 2)
     with pytest.raises(ValueError, match="a rate needs 3 epochs, there are 2"):
         fit_trend(TIME_S[:2], np.zeros(2), covariance[:2, :2])
-    assert np.isnan(fit_trend(TIME_S[:3], np.zeros(3), covariance).acceleration)
+    assert np.isnan(fit_trend(TIME_S[:3], np.zeros(3), covariance).acceleration_m_d2)
 
 
 @pytest.mark.parametrize("correlation", [(0.0, 0.0), (0.5, 0.0), (0.1, 0.6), (0.0, 0.95)])
 def test_parts_of_the_correlation_are_found(correlation):
     lag_s = HOUR_S * np.repeat(2.0 ** np.arange(10), 3)
-    values = correlation[0] + correlation[1] * np.exp(-lag_s / WEATHER_S)
+    values = correlation[0] + correlation[1] * np.exp(-lag_s / REFRACTION_CORRELATION_S)
     noise = np.random.default_rng(4).normal(0, 0.02, len(lag_s))
     assert error_correlation(lag_s, values + noise) == pytest.approx(correlation, abs=0.04)
 
