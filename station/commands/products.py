@@ -75,8 +75,8 @@ def trend(
 ) -> None:
     """Print how fast areas change, and whether they speed up, with 95 % intervals.
 
-    The rate is that of the straight line through the mean change of the area. Its interval knows that the
-    epochs share the errors of the reference and of the weather. CSV has the inverse velocity too.
+    The rate is that of the straight line through the mean change of the area. Its interval
+    allows for errors that last for hours. CSV has the inverse velocity too.
     """
     from station.config import read_site
     from station.products.area_tables import Span

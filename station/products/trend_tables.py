@@ -19,8 +19,8 @@ from station.errors import StationError
 from station.products.area_tables import REFERENCE, AreaRecord, Span, area_cells, area_records, text_table
 from station.products.exports.selection import PERIODS
 from station.queries.aggregates import Aggregates
-from station.queries.error_correlation import area_error_correlation
-from station.science.analysis.trend import MIN_EPOCHS, Trend, error_covariance, fit_trend
+from station.queries.common_errors import common_error_share
+from station.science.analysis.trend import MIN_EPOCHS, Trend, fit_trend
 from station.science.geometry.robust_statistics import NORMAL_95
 
 SIGNIFICANT = NORMAL_95  # an acceleration, or a rate whose inverse is given, is at least so many sigma
@@ -76,14 +76,14 @@ def trend_records(
         if len(observed) < MIN_EPOCHS:
             continue
         epochs = [by_start[round(record.start.timestamp())] for record in observed]
-        correlation = area_error_correlation(aggregates, cells[name], epochs)
+        common_share = common_error_share(aggregates, cells[name], epochs)
         for _, group in groupby(
             observed, lambda record: f"{record.start:{PERIODS[period]}}" if period else ""
         ):
             members = list(group)
             if len(members) >= MIN_EPOCHS:
                 found = True
-                yield _trend_record(name, members, correlation)
+                yield _trend_record(name, members, common_share)
     if not found:
         raise StationError(f"a rate needs {MIN_EPOCHS} usable epochs: there are fewer in this span")
 
@@ -94,14 +94,14 @@ def _by_period(records: list[AreaRecord], period_format: str) -> Iterator[list[A
         yield list(members)
 
 
-def _trend_record(name: str, records: list[AreaRecord], correlation: tuple[float, float]) -> TrendRecord:
+def _trend_record(name: str, records: list[AreaRecord], common_share: float) -> TrendRecord:
     middles = [record.start + (record.end - record.start) / 2 for record in records]
     time_s = np.array([middle.timestamp() for middle in middles])
     change_m, sigma_m = (
         np.array([record.statistics[variable] for record in records])
         for variable in ("mean_change", "mean_change_uncertainty")
     )
-    trend = fit_trend(time_s, change_m, error_covariance(time_s, sigma_m, correlation))
+    trend = fit_trend(time_s, change_m, sigma_m, common_share)
     return TrendRecord(name, middles[0], middles[-1], len(records), trend)
 
 

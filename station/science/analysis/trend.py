@@ -1,16 +1,14 @@
-"""Rate and acceleration of a series whose errors are correlated, by generalised least squares."""
+"""Rate and acceleration of a change whose errors are correlated in time, by least squares."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
 import numpy as np
-from scipy import linalg, optimize
 
 from station.quantities import Floats
 from station.science.gridding.reference_surface import REFRACTION_CORRELATION_S
 
-MAX_CORRELATION = 0.999  # a scan has noise of its own
 MIN_EPOCHS = 3
 
 
@@ -27,50 +25,28 @@ class Trend:
     acceleration_sigma_m_d2: float
 
 
-def error_correlation(lag_s: Floats, correlation: Floats) -> tuple[float, float]:
-    """Return the parts of the error variance that all epochs share, and that those of six hours share [1].
+def fit_trend(time_s: Floats, change_m: Floats, sigma_m: Floats, common_share: float) -> Trend:
+    """Return rate and acceleration of a change (n,) with errors of sigma (n,).
 
-    They are fitted to the correlation (n,) of errors of epochs that are `lag_s` (n,) apart; neither is
-    negative and the rest is white, so that it is the correlation of a covariance at every lag. Source:
-    equations.md, 6.10.
-    """
-    if not len(lag_s):
-        return 0.0, 0.0
-    design = np.stack([np.ones_like(lag_s), np.exp(-lag_s / REFRACTION_CORRELATION_S)], axis=1)
-    common, weather = optimize.nnls(design, np.clip(correlation, 0.0, 1.0))[0]
-    scale = min(1.0, MAX_CORRELATION / max(common + weather, 1e-9))
-    return float(common * scale), float(weather * scale)
-
-
-def error_covariance(time_s: Floats, sigma_m: Floats, correlation: tuple[float, float]) -> Floats:
-    """Return the covariance (n, n) of errors with sigma (n,) [m²], by the parts of `error_correlation`.
-
-    Source: equations.md, 6.10.
-    """
-    common, weather = correlation
-    lag_s = np.abs(np.subtract.outer(time_s, time_s))
-    shared = common + weather * np.exp(-lag_s / REFRACTION_CORRELATION_S)
-    np.fill_diagonal(shared, 1.0)
-    return np.asarray(sigma_m[:, None] * shared * sigma_m)
-
-
-def fit_trend(time_s: Floats, change_m: Floats, covariance_m2: Floats) -> Trend:
-    """Return rate and acceleration of a change (n,) with an error covariance (n, n).
-
-    The rate is that of the straight line, whatever the series does between its ends, and its sigma is that of
-    the measurement. Raises ValueError for fewer than `MIN_EPOCHS` epochs. Source: equations.md, 6.10.
+    All epochs have the same weight: the rate is the slope of the plain line through the change, whatever the
+    surface does between its ends. Its sigma is that of the measurement. `common_share` is the share of the
+    variance that all epochs have in common [1]. How long the rest lasts is not known, so sigma is the larger
+    of two: independent from scan to scan, and correlated over hours as refraction is. Raises ValueError for
+    fewer than `MIN_EPOCHS` epochs. Source: equations.md, 6.10.
     """
     if len(time_s) < MIN_EPOCHS:
         raise ValueError(f"a rate needs {MIN_EPOCHS} epochs, there are {len(time_s)}")
     day = (time_s - time_s.mean()) / 86_400
-    whitener = linalg.cholesky(covariance_m2, lower=True)
+    lag_s = np.abs(np.subtract.outer(time_s, time_s))
+    covariances_m2 = [
+        np.outer(sigma_m, sigma_m) * (common_share + (1 - common_share) * correlation)
+        for correlation in (np.eye(len(day)), np.exp(-lag_s / REFRACTION_CORRELATION_S))
+    ]
 
     def last_coefficient(degree: int) -> tuple[float, float]:
-        design = np.stack([day**power for power in range(degree + 1)], axis=1)
-        whitened = linalg.solve_triangular(whitener, np.column_stack([design, change_m]), lower=True)
-        factor = np.asarray(np.linalg.qr(whitened, mode="r"))  # last row: coefficient over sigma
-        corner = factor[degree, degree]
-        return float(factor[degree, degree + 1] / corner), float(1 / abs(corner))
+        weights = np.linalg.pinv(np.vander(day, degree + 1, increasing=True))[degree]
+        variance = max(float(weights @ covariance_m2 @ weights) for covariance_m2 in covariances_m2)
+        return float(weights @ change_m), float(np.sqrt(variance))
 
     rate_m_d, rate_sigma_m_d = last_coefficient(1)
     if len(time_s) <= MIN_EPOCHS:
