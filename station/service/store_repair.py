@@ -116,7 +116,7 @@ class StoreRepair:
         if missing:
             log.warning("%s", logfmt(journal="completed", epochs=len(missing), reason="missing in it"))
         self._journal.import_entries(missing)
-        self._run(restore_tilt_offsets)
+        self.with_repair(restore_tilt_offsets)
 
     def _requeue_missing(self) -> None:
         for name in self._run(missing_epochs, self._journal.current_epochs()):

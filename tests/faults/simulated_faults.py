@@ -147,14 +147,18 @@ class Faults(Machine):
         return repair
 
     def fault_bits_rot(self) -> None:
-        """Damage a derived file. Epochs are proved by `station check --store`, not by the service."""
+        """Damage a derived file.
+
+        Epochs, also in files of days and months, are proved by `station check --store`, not by the service,
+        and a file that is being written gets its checksum afterwards.
+        """
         files = [
             path
             for path in self.data.rglob("*")
-            if path.is_file() and path.suffix != ".damaged"
+            if path.is_file() and path.suffix not in {".damaged", ".part"}
             and path.name != IDENTITY
             and not path.name.startswith(("journal", "reference"))
-            and path.relative_to(self.data).parts[0] not in {"epochs", "reference", "set_aside"}
+            and path.relative_to(self.data).parts[0] not in {"epochs", "days", "months", "set_aside"}
         ]  # fmt: skip
         if files:
             self._damage(self.rng.choice(sorted(files)))

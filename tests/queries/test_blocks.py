@@ -11,7 +11,7 @@ from support.shared_parameters import SCANNER, random_shared
 
 import station
 from station.archive import epochs
-from station.archive.derived.fingerprints import is_intact
+from station.archive.derived.fingerprints import is_intact, write_fingerprints
 from station.archive.netcdf_layout import Series
 from station.archive.reference_files import write_reference
 from station.archive.series.index import SeriesIndex, list_epochs
@@ -241,4 +241,16 @@ def test_a_damaged_file_is_computed_again(stored):
     assert not is_intact(path)
     update_boxes(stored, BlockQueries(stored), lambda: None)
     assert is_intact(path)
+    xr.testing.assert_equal(read(stored, "boxes.nc"), expected)
+
+
+def test_a_file_damaged_while_it_was_written_is_computed_again(stored):
+    """Its fingerprint is that of the damaged file, and the checksum of a variable's description fails."""
+    path = stored.folder / "boxes.nc"
+    expected, content = read(stored, "boxes.nc"), bytearray(path.read_bytes())
+    content[content.index(b"uncertainty of the elevation change")] ^= 1
+    path.write_bytes(content)
+    write_fingerprints(path, path)
+    assert is_intact(path)
+    update_boxes(stored, BlockQueries(stored), lambda: None)
     xr.testing.assert_equal(read(stored, "boxes.nc"), expected)

@@ -29,7 +29,9 @@ from station.archive.netcdf_layout import (
     encode_text,
     write_global_attrs,
 )
+from station.archive.read_errors import read_errors
 from station.archive.schema import BY_NAME, FILL, RASTER, SAFE_BOUND, TEXT, TEXT_LENGTH, Variable
+from station.errors import StoreError
 from station.quantities import Floats, Grid
 
 Array = np.ndarray[Any, Any]
@@ -191,13 +193,19 @@ def update_blocks(
 
 
 def _stored_keys(path: Path, blocks: Series) -> Array:
-    """Return the keys of the entries in a file; none if it is of another grid."""
-    with h5py.File(path, "r") as file:
-        is_same_grid = all(
-            np.array_equal(file[axis][:], centres_m)
-            for axis, centres_m in (("x", blocks.grid.x_m), ("y", blocks.grid.y_m))
-        )
-        columns = [read_column(file[spec.name]) for spec in _KEYS]
+    """Return the keys of the entries in a file; none if it is of another grid, or damaged.
+
+    A file can match its fingerprint and be damaged all the same: by a fault while it was written.
+    """
+    try:
+        with read_errors(path), netCDF4.Dataset(path), h5py.File(path, "r") as file:
+            is_same_grid = all(
+                np.array_equal(file[axis][:], centres_m)
+                for axis, centres_m in (("x", blocks.grid.x_m), ("y", blocks.grid.y_m))
+            )
+            columns = [read_column(file[spec.name]) for spec in _KEYS]
+    except StoreError:
+        return np.array([], "S1")
     texts = [np.ascontiguousarray(column).view(f"S{column.shape[1]}")[:, 0] for column in columns]
     return _joined(*texts)[: None if is_same_grid else 0]
 

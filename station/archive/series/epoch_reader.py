@@ -14,8 +14,8 @@ import numpy as np
 
 from station.archive.epochs import EpochRef
 from station.archive.netcdf_layout import decode_parameters
+from station.archive.read_errors import read_errors
 from station.archive.schema import VARIABLES
-from station.errors import StoreError
 
 Parameters = dict[str, str]  # unit of each shared parameter, by name
 
@@ -55,29 +55,26 @@ def contiguous_runs(epochs: list[EpochRef]) -> list[tuple[Path, int, int, int]]:
 
 def read_source(path: Path, file_start: int, series_start: int, count: int) -> EpochSource:
     """Read the small variables of `count` epochs of a file; raise StoreError if it is damaged."""
-    try:
-        with h5py.File(path, "r") as file:
-            names = set(file)
-            small_names = {"time_bnds", *(spec.name for spec in SMALL_VARIABLES)} & names
-            parameter_texts = [
-                decode_parameters(_read(file, name))
-                for name in ("parameter_name", "parameter_unit")
-                if name in names
-            ]
-            scalars = {name: _read_epochs(file, name, file_start, count) for name in small_names}
-            return EpochSource(
-                path=path,
-                file_start=file_start,
-                series_start=series_start,
-                count=count,
-                scalars=scalars | {"time": middle(scalars["time_bnds"])},
-                raster_shapes={
-                    spec.name: _open(file, spec.name).shape for spec in LARGE_VARIABLES if spec.name in names
-                },
-                parameters=dict(zip(*parameter_texts, strict=True)) if parameter_texts else {},
-            )
-    except (OSError, RuntimeError, KeyError) as error:
-        raise StoreError(f"{path}: damaged, cannot be read: {error}") from error
+    with read_errors(path), h5py.File(path, "r") as file:
+        names = set(file)
+        small_names = {"time_bnds", *(spec.name for spec in SMALL_VARIABLES)} & names
+        parameter_texts = [
+            decode_parameters(_read(file, name))
+            for name in ("parameter_name", "parameter_unit")
+            if name in names
+        ]
+        scalars = {name: _read_epochs(file, name, file_start, count) for name in small_names}
+        return EpochSource(
+            path=path,
+            file_start=file_start,
+            series_start=series_start,
+            count=count,
+            scalars=scalars | {"time": middle(scalars["time_bnds"])},
+            raster_shapes={
+                spec.name: _open(file, spec.name).shape for spec in LARGE_VARIABLES if spec.name in names
+            },
+            parameters=dict(zip(*parameter_texts, strict=True)) if parameter_texts else {},
+        )
 
 
 def middle(bounds_s: np.ndarray[Any, Any]) -> np.ndarray[Any, Any]:

@@ -85,6 +85,14 @@ def build_series(series: Series) -> Path:
     manifest, new_sources = pending
     if not new_sources:
         return series.path
+    try:
+        return _append(series, manifest, new_sources)
+    except StoreError:  # a file is damaged although it matches its fingerprint, or cannot be written
+        return _rebuild(series)
+
+
+def _append(series: Series, manifest: SeriesManifest, new_sources: list[EpochSource]) -> Path:
+    """Add later epochs to both files; raise StoreError if one is damaged or cannot be written."""
     unchanged = manifest.count // TIMES_PER_CHUNK * TIMES_PER_CHUNK
     for virtual in _virtual_files(series):
         last_chunk = read_source(virtual.path, unchanged, unchanged, manifest.count - unchanged)

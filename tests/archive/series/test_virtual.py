@@ -184,6 +184,21 @@ def test_damaged_derived_files_are_rebuilt_with_the_next_epoch(growing, epoch, r
         assert fingerprints.is_intact(series.folder / "areas.nc")
 
 
+@pytest.mark.parametrize("name", ["series.nc", "processing.nc"])
+def test_file_damaged_while_it_was_written_is_rebuilt_with_the_next_epoch(growing, epoch, rng, name):
+    """Its fingerprint is that of the damaged file."""
+    series, update = growing
+    epochs.write_epoch(series, epoch(1, grid=SMALL_GRID))
+    update()
+    known, _ = manifest.pending_epochs(series)
+    DAMAGES["halved"](series.folder / name, rng)
+    manifest.write_manifest(series, known)
+    assert manifest.is_intact(series)
+    epochs.write_epoch(series, epoch(2, grid=SMALL_GRID))
+    update()
+    assert len(SeriesIndex(series)) == 2
+
+
 def test_any_flipped_bit_is_noticed(growing, epoch, rng):
     series, update = growing
     epochs.write_epoch(series, epoch(1, grid=SMALL_GRID))
