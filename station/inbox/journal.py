@@ -27,6 +27,7 @@ MAX_FAILURES = 12  # attempts until a scan is no longer waited for: 17 h, the la
 REJECTED_FOR_NOW = "rejected for now"
 RETRY_REJECTED_S = 7 * 86_400.0  # the machine may have recovered: one attempt, which costs little
 LONGEST_RETRY_S = FIRST_RETRY_S * 2.0 ** (MAX_FAILURES - 2)
+JUST_TRIED_S = 600.0  # after a failure the machine is still as it was then
 SETTLING_S = 6 * 3600.0  # a scan that is not ready for so long, as one that stays open, delays no others
 
 _EPOCH_COLUMNS = (
@@ -196,6 +197,20 @@ class Journal(JournalReader):
         self._retry_in(delay_s, name, reason, attempts, "")
         return delay_s
 
+    def defer_behind(self, name: str, earlier: str, reason: str) -> float:
+        """Defer a scan that waits for an earlier one; return the delay until its next attempt [s].
+
+        If the earlier one has failed so often that its next attempt is hours away, it is tried at once: the
+        machine may have recovered. If it fails again, this scan waits for it no longer.
+        """
+        entry = self.entry(earlier)
+        if entry is None or entry.attempts < MAX_FAILURES or not entry.judged_under:
+            return self.defer(name, reason)
+        own = self.entry(name)
+        self._retry_in(0.0, earlier, entry.waiting_reason, entry.attempts, entry.judged_under)
+        self._retry_in(FIRST_RETRY_S, name, reason, own.attempts if own else 0, "")
+        return FIRST_RETRY_S
+
     def record_failure(self, name: str, reason: str, judged_under: str) -> float | None:
         """Defer a scan whose attempt failed for a reason that may not be its own; return the delay [s].
 
@@ -319,15 +334,18 @@ class Journal(JournalReader):
     def unsettled(self, *, however_often_failed: bool = False) -> dict[str, float | None]:
         """Return the starts [s], if known, of scans that will be judged soon, for which others may wait.
 
-        `however_often_failed`: include those that may fail because of the machine until they are rejected.
+        Scans that have failed often, perhaps because of the machine, are among them until they have just been
+        tried again; with `however_often_failed` until they are rejected.
         """
         query = (
             "SELECT name, start_utc_s FROM scan"
             " WHERE (state = 'waiting' AND (waiting_reason = '' OR abs(changed_utc_s - ?) < ?))"
-            " OR (state = 'later' AND (attempts < ? OR (? AND judged_under IS NOT ''))) ORDER BY name"
+            " OR (state = 'later' AND (attempts < ?"
+            " OR (judged_under IS NOT '' AND (? OR abs(changed_utc_s - ?) > ?)))) ORDER BY name"
         )
         with self._store_errors():
-            parameters = self._now_s(), SETTLING_S, MAX_FAILURES, however_often_failed
+            now_s = self._now_s()
+            parameters = now_s, SETTLING_S, MAX_FAILURES, however_often_failed, now_s, JUST_TRIED_S
             return dict(self._connection.execute(query, parameters).fetchall())
 
     # ---- SQLite

@@ -126,7 +126,7 @@ class Worker:
         except InconclusiveError as error:
             return record_failure(self._journal, self._site, scan.name, str(error))
         except NotReadyError as error:
-            pause_s = self._journal.defer(scan.name, str(error))
+            pause_s = self._journal.defer_behind(scan.name, history.waiting_before, str(error))
             log.info("%s", logfmt(scan=scan.name, verdict="later", reason=error, retry_s=round(pause_s)))
             return False
         if isinstance(result, Rejected):

@@ -135,10 +135,32 @@ def test_scan_is_not_rejected_while_no_other_is_stored(tmp_path):
         for failure in range(1, 20):
             now_s[0] += 3600
             assert journal.record_failure(NAME, "no memory", "0.1 a") == 30 * 2 ** min(failure - 1, 10)
-        assert journal.unsettled() == {}
+        assert journal.unsettled() == {}  # just tried
         assert journal.unsettled(however_often_failed=True) == {NAME: None}
         store(journal, "other.laz")
         assert journal.record_failure(NAME, "no memory", "0.1 a") is None
+
+
+def test_scan_behind_one_that_failed_for_a_day_waits_until_that_is_tried_again(tmp_path):
+    """Otherwise a night without memory decides which scan is the first under an SOP."""
+    now_s, later = [1000.0], "later.laz"
+    with Journal(tmp_path / "journal.sqlite", now_s=lambda: now_s[0]) as journal:
+        for _ in range(MAX_FAILURES):
+            journal.record_failure(NAME, "no memory", "0.1 a")
+        assert journal.unsettled() == {}
+        now_s[0] += 7 * 3600
+        assert journal.unsettled() == {NAME: None}
+        assert journal.defer_behind(later, NAME, f"waits for {NAME}") == 30
+        assert (journal.entry(NAME).next_try_utc_s, journal.entry(NAME).waiting_reason) == (
+            now_s[0],
+            "no memory",
+        )
+        now_s[0] += 10
+        journal.record_failure(NAME, "no memory", "0.1 a")
+        now_s[0] += 20
+        assert list(journal.unsettled()) == [later]
+        assert journal.defer_behind("other.laz", later, "permission denied") == 30
+        assert [journal.defer_behind("other.laz", "", "permission denied") for _ in range(2)] == [60, 120]
 
 
 def test_scans_set_aside_whatever_the_settings_are_not_judged_again(journal):
