@@ -9,7 +9,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from station.config import Site
-from station.inbox.inbox import is_scan
+from station.inbox.listing import is_scan
 from station.operations.site_plausibility import LevelAndMessage
 from station.readers.formats.conversion import scan_suffixes
 from station.readers.scan import TEXT_SUFFIXES, suffixes

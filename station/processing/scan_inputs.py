@@ -1,12 +1,14 @@
-"""Inputs of a scan other than its shots: SOP, tilt, air; and warnings about what is missing."""
+"""Inputs of a scan other than its shots: SOP, tilt, air; and warnings about what is missing.
+
+Scans from several positions are placed by the inputs of each, and are one cloud on the map from there on.
+"""
 
 from __future__ import annotations
 
 import json
 import math
-from collections.abc import Callable
-from dataclasses import asdict, dataclass
-from datetime import datetime
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
 
@@ -15,29 +17,37 @@ import numpy as np
 from station.archive.tilt_offsets import read_tilt_offset, stored_tilt_offsets, write_tilt_offset
 from station.config import Site
 from station.errors import NotReadyError, ScanError
-from station.processing.pipeline import AdjustmentInputs, Pose
+from station.processing.pipeline import AdjustmentInputs, Pose, to_map
 from station.processing.scan_air import air_of_scan
-from station.processing.scanner_pose import map_position, scan_geometry, scanner_to_map, sop_identity
+from station.processing.scanner_pose import (
+    map_position,
+    scan_geometry,
+    scanner_to_map,
+    sop_identity,
+    sop_identity_at,
+)
+from station.processing.scans.open_scans import OpenScan, PositionScan
 from station.quantities import (
     Air,
     AzimuthTrack,
     Floats,
     InclinationLog,
+    IntensityScale,
     ScanGeometry,
     SharedParameters,
+    Shots,
     VarianceComponents,
 )
 from station.readers.formats.conversion import open_site_scan
 from station.readers.inclination import align_gps_week, read_inclination
 from station.readers.scan import ScanReader
 from station.readers.sop import valid_sop
-from station.scan_names import scan_stem
+from station.scan_names import folder_depth, scan_id, scan_stem
 from station.science.adjustment import prior
 from station.science.geometry import inclination
 from station.science.geometry.air import air_correction
 from station.science.geometry.inclination import NO_CYCLIC_ERROR, CyclicError, TiltRecord
 from station.science.uncertainty import parameters
-from station.sections import SopSection
 
 MIN_LOG_COVERAGE = 0.97  # of the scan duration that a complete log covers
 MIN_LOG_ROWS = 20  # a shorter log is not filtered
@@ -60,6 +70,18 @@ class ScanInputs:
     warnings: tuple[str, ...]
     provenance: dict[str, str]
     faults: tuple[str, ...] = ()  # that make the scan unusable
+    position_poses: tuple[Pose, ...] = ()  # of several positions, whose shots come on the map
+
+    def shots(self, scan: OpenScan, intensity: IntensityScale) -> Iterator[Shots]:
+        """Yield the shots of a scan, to be placed by `pose`; decoding starts with this call."""
+        if not self.position_poses:
+            return scan.positions[0].reader.blocks(intensity=intensity)
+        return self._shots_on_map(scan, intensity)
+
+    def _shots_on_map(self, scan: OpenScan, intensity: IntensityScale) -> Iterator[Shots]:
+        for position, pose in zip(scan.positions, self.position_poses, strict=True):
+            for shots in position.reader.blocks(intensity=intensity):
+                yield Shots(to_map(shots, pose), shots.time_s, shots.intensity)
 
     def log_only_shared(self, components: VarianceComponents) -> SharedParameters | None:
         """Return the systematic errors of all points without an adjustment, from SOP and log."""
@@ -68,10 +90,7 @@ class ScanInputs:
 
 def load_scan_inputs(
     site: Site,
-    reader: ScanReader,
-    log_path: Path | None,
-    start: datetime,
-    end: datetime,
+    scan: OpenScan,
     *,
     save_tilt_offset: bool = True,
     wait_for_weather: bool = False,
@@ -83,9 +102,90 @@ def load_scan_inputs(
     that offset is to be of an earlier scan, the one in `waiting_before`; and, with `wait_for_weather`, if
     there is no weather yet.
     """
+    inputs = _inputs_by_frame(
+        site,
+        scan,
+        save_tilt_offset=save_tilt_offset,
+        wait_for_weather=wait_for_weather,
+        waiting_before=waiting_before,
+    )
+    if site.epoch is None or site.epoch.files is None or scan.file_count >= site.epoch.files:
+        return inputs
+    warning = f"{scan.file_count} of {site.epoch.files} files of the epoch"
+    return replace(inputs, warnings=(warning, *inputs.warnings))
+
+
+def _inputs_by_frame(
+    site: Site, scan: OpenScan, *, save_tilt_offset: bool, wait_for_weather: bool, waiting_before: str
+) -> ScanInputs:
     if site.scans.frame == "map":
-        return _inputs_in_map_frame(site, start.timestamp())
-    sop = valid_sop(site.sop, start)
+        return _inputs_in_map_frame(site, scan.start.timestamp())
+    inputs = [
+        _position_inputs(
+            site,
+            position,
+            save_tilt_offset=save_tilt_offset,
+            wait_for_weather=wait_for_weather,
+            waiting_before=waiting_before,
+        )
+        for position in scan.positions
+    ]
+    return inputs[0] if len(inputs) == 1 else _inputs_of_positions(site, scan, inputs)
+
+
+def _inputs_of_positions(site: Site, scan: OpenScan, each: list[ScanInputs]) -> ScanInputs:
+    """Return the inputs of scans from several positions, which are adjusted as one rigid cloud.
+
+    The first position of the site file is that of the adjustment, whichever positions a scan has.
+    """
+    sop = valid_sop(site.sop, scan.start)
+    transform = scanner_to_map(site, sop)
+    rotation = transform.to_local[:3, :3]
+    axis = (float(rotation[0, 2]), float(rotation[1, 2]), float(rotation[2, 2]))
+    warnings = [
+        f"{position.name}: {warning}"
+        for position, inputs in zip(scan.positions, each, strict=True)
+        for warning in inputs.warnings
+        if not warning.startswith("weather")
+    ]
+    air, weather_known = air_of_scan(
+        site, scan.start + (scan.end - scan.start) / 2, transform.position_m[2], warnings
+    )
+    geometry = scan_geometry(site, transform.position_m, axis)
+    params = parameters.parameter_layout(geometry.grid, transform.position_m, axis)
+    lines = prior.line_times(params, rotation, None)
+    return ScanInputs(
+        geometry,
+        Pose(None, None),
+        partial(prior.log_only_covariance, params, lines, None, NO_CYCLIC_ERROR, weather_known=weather_known),
+        AdjustmentInputs(
+            params,
+            lines,
+            np.zeros((3, params.line_groups)),
+            None,
+            scan.start.timestamp(),
+            weather_known=weather_known,
+        ),
+        None,
+        air if weather_known else None,
+        tuple(warnings),
+        {"sop_id": sop_identity_at(site, scan.start), "sop_tilt_offset": ""},
+        tuple(dict.fromkeys(fault for inputs in each for fault in inputs.faults)),
+        tuple(inputs.pose for inputs in each),
+    )
+
+
+def _position_inputs(
+    site: Site,
+    position: PositionScan,
+    *,
+    save_tilt_offset: bool,
+    wait_for_weather: bool,
+    waiting_before: str,
+) -> ScanInputs:
+    """Return the inputs of what was scanned from one position; see `load_scan_inputs`."""
+    reader, start, end, sop = position.reader, position.start, position.end, position.sop
+    assert sop is not None  # noqa: S101 - of a scan in the scanner's frame
     transform, sop_id = scanner_to_map(site, sop), sop_identity(sop)
     warnings: list[str] = []
     track = reader.azimuth_track() if site.scans.point_time == "auto" else None
@@ -94,13 +194,14 @@ def load_scan_inputs(
         cause = "azimuth does not follow time" if has_time else "no time per point"
         warnings.append(f"{cause}: one mean tilt for the whole scan")
     rotation = transform.to_local[:3, :3]
-    log = _load_log(site, log_path or _converted_log(site, reader), track, rotation, warnings)
+    log_paths = position.logs or _converted_log(site, reader)
+    log = _load_log(site, log_paths, track, rotation, warnings)
     faults = _static_tilt_faults(site, log)
     tilt_offset = read_tilt_offset(site, sop_id)
     if tilt_offset is None:
         tilt_offset = stored_tilt_offsets(site).get(sop_id)
         if tilt_offset is None:
-            tilt_offset = _find_tilt_offset(site, sop, reader, log, track, warnings, waiting_before)
+            tilt_offset = _find_tilt_offset(site, position, log, track, warnings, waiting_before)
         # That of an absolute sensor is zero and need not be saved.
         if save_tilt_offset and tilt_offset is not None and tilt_offset != NO_CYCLIC_ERROR:
             write_tilt_offset(site, sop_id, tilt_offset)
@@ -171,29 +272,31 @@ def _inputs_in_map_frame(site: Site, start_s: float) -> ScanInputs:
     return ScanInputs(geometry, Pose(None, None), log_only_covariance, adjustment_inputs, None, None, (), {})
 
 
-def _converted_log(site: Site, reader: ScanReader) -> Path | None:
-    """Return the inclination log that the command which converted a scan wrote next to it, None without."""
+def _converted_log(site: Site, reader: ScanReader) -> tuple[Path, ...]:
+    """Return the inclination log that the command which converted a scan wrote next to it; () without."""
     if site.scans.convert is None or site.inclination is None:
-        return None
+        return ()
     path = reader.path.with_name(scan_stem(reader.path) + site.inclination.suffix)
-    return path if path.is_file() else None
+    return (path,) if path.is_file() else ()
 
 
 def _load_log(
-    site: Site, path: Path | None, track: AzimuthTrack | None, rotation: Floats, warnings: list[str]
+    site: Site, paths: Sequence[Path], track: AzimuthTrack | None, rotation: Floats, warnings: list[str]
 ) -> InclinationLog | None:
     """Return the cleaned inclination log of a scan, or None; append what is wrong with it to `warnings`.
+
+    Logs of several files are one, in order of their times.
 
     `rotation` (3, 3) of the SOP contains the tilt of the mount, which shows whether the axes are right.
     """
     if site.inclination is None:
         return None
-    if path is None:
+    if not paths:
         if site.inclination.required:
             warnings.append("inclination log missing")
         return None
     try:
-        log = _clean_log(site, read_inclination(path), warnings)
+        log = _clean_log(site, inclination.joined([read_inclination(path) for path in paths]), warnings)
     except ScanError as error:
         warnings.append(f"inclination log unusable: {error}")
         return None
@@ -291,8 +394,7 @@ def _tilt_record(
 
 def _find_tilt_offset(
     site: Site,
-    sop: SopSection,
-    reader: ScanReader,
+    position: PositionScan,
     log: InclinationLog | None,
     track: AzimuthTrack | None,
     warnings: list[str],
@@ -303,7 +405,8 @@ def _find_tilt_offset(
     Without `sop.scan`, that is the scan at hand, the first one under the SOP. Raises NotReadyError if an
     earlier one, `waiting_before`, is still to be processed.
     """
-    if site.inclination is None:
+    sop = position.sop
+    if site.inclination is None or sop is None:
         return None
     if site.inclination.mode == "absolute":
         return NO_CYCLIC_ERROR
@@ -311,7 +414,7 @@ def _find_tilt_offset(
         raise NotReadyError(
             f"waits for {waiting_before}: the first scan under an SOP defines its tilt offset"
         )
-    if sop.scan is not None and sop.scan != scan_stem(reader.path):
+    if sop.scan is not None and sop.scan not in {scan_id(position.name), scan_stem(position.name)}:
         log, track = _load_earlier_log(site, sop.scan)
         if log is None:
             warnings.append(f"log of {sop.scan}, the scan of the SOP, not found: tilt not corrected")
@@ -320,18 +423,22 @@ def _find_tilt_offset(
     return _fit_tilt_offset(log, track, site.instrument.inclination_sigma_rad)
 
 
-def _load_earlier_log(site: Site, stem: str) -> tuple[InclinationLog | None, AzimuthTrack | None]:
-    """Return log and azimuth track of an earlier scan in the inbox, (None, None) if they are missing."""
+def _load_earlier_log(site: Site, name: str) -> tuple[InclinationLog | None, AzimuthTrack | None]:
+    """Return log and azimuth track of an earlier scan in the inbox, (None, None) if they are missing.
+
+    `name` is that of the file without its suffix, with or without its folders.
+    """
     assert site.inclination is not None  # noqa: S101 - checked by the caller
-    log_path = site.scans.inbox / f"{stem}{site.inclination.suffix}"
-    scans = [path for path in site.scans.inbox.glob(f"{stem}.*") if path != log_path]
-    if not log_path.is_file() or not scans:
+    folders = folder_depth(site.scans.pattern) - name.count("/")
+    logs = sorted(site.scans.inbox.glob("*/" * folders + f"{name}{site.inclination.suffix}"))
+    scans = [path for path in logs[0].parent.glob(f"{Path(name).name}.*") if path not in logs] if logs else []
+    if not scans:
         return None, None
     with open_site_scan(
         scans[0], site.scans, range_max_m=site.scanner.range_max_m, work_folder=site.station.data
     ) as reader:
         track = reader.azimuth_track()
-    log, _ = inclination.clean(read_inclination(log_path), site.instrument.inclination_range_rad)
+    log, _ = inclination.clean(read_inclination(logs[0]), site.instrument.inclination_range_rad)
     if track is not None and len(log.time_s):
         log = align_gps_week(log, float(track.time_s[0]))
     return log, track

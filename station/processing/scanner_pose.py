@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+from datetime import datetime
 from pathlib import Path
 
 from pyproj import CRS, Transformer
@@ -10,7 +11,7 @@ from pyproj import CRS, Transformer
 from station.config import Site
 from station.errors import ConfigError
 from station.quantities import VERTICAL_AXIS, ScanGeometry
-from station.readers.sop import read_matrix
+from station.readers.sop import read_matrix, valid_sop
 from station.science.geometry import pose
 from station.sections import Origin, SopSection
 
@@ -37,6 +38,23 @@ def sop_identity(sop: SopSection) -> str:
     """Return an identifier that changes with the content of the SOP file and with `sop.scan`."""
     content = sop.file.read_bytes() + (f"\n{sop.scan}".encode() if sop.scan else b"")
     return f"{sop.file.stem}-{hashlib.sha256(content).hexdigest()[:8]}"
+
+
+def sop_identity_at(site: Site, time_utc: datetime) -> str:
+    """Return an identifier of the SOPs valid at a time: that of the only one, or of all positions together.
+
+    Raises ScanError if none has begun.
+    """
+    first = valid_sop(site.sop, time_utc)
+    started = [sop for sop in site.sop if sop.from_ <= time_utc]
+    patterns = sorted({sop.files or "" for sop in started})
+    if len(patterns) == 1:
+        return sop_identity(first)
+    valid = [
+        valid_sop([sop for sop in started if (sop.files or "") == files], time_utc) for files in patterns
+    ]
+    text = "\n".join(f"{sop.files} {sop_identity(sop)}" for sop in valid)
+    return f"positions-{hashlib.sha256(text.encode()).hexdigest()[:8]}"
 
 
 def scanner_to_map(site: Site, sop: SopSection) -> pose.ScannerToMap:
