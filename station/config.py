@@ -106,6 +106,7 @@ class Site(SiteFile):
                 "scans": {"frame", "name", "zone", "columns", "convert", "point_time", "intensity"}
                 | {"timeout_s"},
                 "service": {"memory_gb"},
+                "epoch": {"name"},
                 **dict.fromkeys(
                     ("scanner", "sop", "map", "grid", "inclination", "weather", "air", "adjustment",
                      "uncertainty", "reference"),

@@ -92,7 +92,7 @@ def _names(site: Site, scans: list[str]) -> Iterator[LevelAndMessage]:
     """
     starts = {name: start_in_name(name, site.scans.pattern) for name in scans}
     counts = Counter(start for start in starts.values() if start)
-    same = [name for name, start in starts.items() if counts[start] > 1][:2]
+    same = [name for name, start in starts.items() if start and counts[start] > 1][:2]
     if same and site.epoch is None:
         epoch = "%Y-%m-%d" if resolution_s(site.scans.pattern) > HOUR_S else "%Y%m%d_%H%M%S"
         message = f"{' and '.join(same)} have the same start: such files are one epoch"

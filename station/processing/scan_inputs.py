@@ -9,6 +9,7 @@ import json
 import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
+from fnmatch import fnmatchcase
 from functools import partial
 from pathlib import Path
 
@@ -26,7 +27,8 @@ from station.processing.scanner_pose import (
     sop_identity,
     sop_identity_at,
 )
-from station.processing.scans.open_scans import OpenScan, PositionScan
+from station.processing.scans.open_scans import OpenScan, PositionScan, open_files
+from station.processing.scans.scan_files import inbox_scans
 from station.quantities import (
     Air,
     AzimuthTrack,
@@ -38,16 +40,16 @@ from station.quantities import (
     Shots,
     VarianceComponents,
 )
-from station.readers.formats.conversion import open_site_scan
 from station.readers.inclination import align_gps_week, read_inclination
 from station.readers.scan import ScanReader
 from station.readers.sop import valid_sop
-from station.scan_names import folder_depth, scan_id, scan_stem
+from station.scan_names import scan_id, scan_stem
 from station.science.adjustment import prior
 from station.science.geometry import inclination
 from station.science.geometry.air import air_correction
 from station.science.geometry.inclination import NO_CYCLIC_ERROR, CyclicError, TiltRecord
 from station.science.uncertainty import parameters
+from station.sections import SopSection
 
 MIN_LOG_COVERAGE = 0.97  # of the scan duration that a complete log covers
 MIN_LOG_ROWS = 20  # a shorter log is not filtered
@@ -414,8 +416,8 @@ def _find_tilt_offset(
         raise NotReadyError(
             f"waits for {waiting_before}: the first scan under an SOP defines its tilt offset"
         )
-    if sop.scan is not None and sop.scan not in {scan_id(position.name), scan_stem(position.name)}:
-        log, track = _load_earlier_log(site, sop.scan)
+    if sop.scan is not None and sop.scan not in {position.scan, scan_stem(position.scan)}:
+        log, track = _load_earlier_log(site, sop)
         if log is None:
             warnings.append(f"log of {sop.scan}, the scan of the SOP, not found: tilt not corrected")
     if log is None:
@@ -423,22 +425,25 @@ def _find_tilt_offset(
     return _fit_tilt_offset(log, track, site.instrument.inclination_sigma_rad)
 
 
-def _load_earlier_log(site: Site, name: str) -> tuple[InclinationLog | None, AzimuthTrack | None]:
-    """Return log and azimuth track of an earlier scan in the inbox, (None, None) if they are missing.
+def _load_earlier_log(site: Site, sop: SopSection) -> tuple[InclinationLog | None, AzimuthTrack | None]:
+    """Return log and azimuth track of the scan of an SOP in the inbox, (None, None) if they are missing.
 
-    `name` is that of the file without its suffix, with or without its folders.
+    `sop.scan` is its name without suffix, with or without its folders.
     """
-    assert site.inclination is not None  # noqa: S101 - checked by the caller
-    folders = folder_depth(site.scans.pattern) - name.count("/")
-    logs = sorted(site.scans.inbox.glob("*/" * folders + f"{name}{site.inclination.suffix}"))
-    scans = [path for path in logs[0].parent.glob(f"{Path(name).name}.*") if path not in logs] if logs else []
-    if not scans:
+    scans = [scan for scan in inbox_scans(site) if sop.scan in {scan_id(scan.name), scan_stem(scan.name)}]
+    files = [
+        file
+        for scan in scans[:1]
+        for file in scan.files
+        if sop.files is None or fnmatchcase(file.name, sop.files)
+    ]
+    logs = list(dict.fromkeys(file.log for file in files if file.log is not None))
+    if not logs:
         return None, None
-    with open_site_scan(
-        scans[0], site.scans, range_max_m=site.scanner.range_max_m, work_folder=site.station.data
-    ) as reader:
+    with open_files(site, files) as reader:
         track = reader.azimuth_track()
-    log, _ = inclination.clean(read_inclination(logs[0]), site.instrument.inclination_range_rad)
+    log = inclination.joined([read_inclination(path) for path in logs])
+    log, _ = inclination.clean(log, site.instrument.inclination_range_rad)
     if track is not None and len(log.time_s):
         log = align_gps_week(log, float(track.time_s[0]))
     return log, track

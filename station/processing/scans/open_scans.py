@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from datetime import datetime
@@ -13,10 +13,10 @@ from station.errors import ScanError
 from station.inbox.file_hash import distinct_files
 from station.inbox.listing import ScanFile
 from station.readers.formats.conversion import open_site_scan
-from station.readers.formats.several_files import SeveralFiles
+from station.readers.formats.several_files import as_one
 from station.readers.scan import ScanReader, utc_interval
 from station.readers.sop import valid_sop
-from station.scan_names import start_in_name
+from station.scan_names import scan_id, start_in_name
 from station.science.geometry.pose import horizontal_crs, is_same_map
 from station.sections import SopSection
 
@@ -25,7 +25,8 @@ from station.sections import SopSection
 class PositionScan:
     """What was scanned from one position at one time: a file, or several that are its tiles."""
 
-    name: str  # of the scan, or of the first file of an epoch of several
+    scan: str  # the scan that it is part of, without suffix
+    name: str  # of its first file
     reader: ScanReader
     logs: tuple[Path, ...]
     sop: SopSection | None  # None if the points are on the map
@@ -80,16 +81,25 @@ def open_scan_for(site: Site, scan: ScanFile) -> Iterator[OpenScan]:
                     raise
                 raise type(error)(f"{file.name}: {error}") from error
             groups.setdefault(key, []).append((file, reader))
-        positions = tuple(_position(site, sop, files) for (sop, _), files in groups.items())
+        name = scan_id(scan.name)
+        positions = tuple(_position(site, name, sop, files) for (sop, _), files in groups.items())
         yield OpenScan(positions, len(kept))
 
 
-def _position(site: Site, sop: SopSection | None, files: list[tuple[ScanFile, ScanReader]]) -> PositionScan:
-    readers = [reader for _, reader in files]
-    reader = readers[0] if len(readers) == 1 else SeveralFiles(readers)
+def _position(
+    site: Site, scan: str, sop: SopSection | None, files: list[tuple[ScanFile, ScanReader]]
+) -> PositionScan:
+    reader = as_one([reader for _, reader in files])
     start, end, _ = utc_interval(reader, site.scans.pattern, files[0][0].name)
     logs = dict.fromkeys(file.log for file, _ in files if file.log is not None)
-    return PositionScan(files[0][0].name, reader, tuple(logs), sop, start, end)
+    return PositionScan(scan, files[0][0].name, reader, tuple(logs), sop, start, end)
+
+
+@contextmanager
+def open_files(site: Site, files: Sequence[ScanFile]) -> Iterator[ScanReader]:
+    """Yield a reader of files of one position; raises as `open_scan_for`."""
+    with ExitStack() as stack:
+        yield as_one([stack.enter_context(_open_file(site, file.path)) for file in files])
 
 
 @contextmanager

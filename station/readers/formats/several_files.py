@@ -73,3 +73,8 @@ class SeveralFiles:
         if track is None or np.ptp(track.time_s) > MAX_SCAN_S or np.ptp(track.azimuth_rad) > MAX_TURN_RAD:
             return None
         return track
+
+
+def as_one(readers: Sequence[ScanReader]) -> ScanReader:
+    """Return the open files of one scan as one reader: the only one, or one of all of them."""
+    return readers[0] if len(readers) == 1 else SeveralFiles(readers)
