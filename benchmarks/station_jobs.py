@@ -30,7 +30,7 @@ from station.inbox.journal_reader import JournalReader, State
 from station.processing import scan_tasks
 from station.processing.pipeline import Pose
 from station.processing.reference_tasks import build_reference_version
-from station.processing.scan_inputs import load_scan_inputs
+from station.processing.scans.epoch_inputs import load_scan_inputs
 from station.processing.scans.scan_files import scan_file
 from station.processing.workers.fork_server import PRELOAD
 from station.quantities import Shots

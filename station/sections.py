@@ -112,6 +112,17 @@ class EpochSection(Section):
     wait_s: NotNegative = 3600.0
 
 
+class RegistrationSection(Section):
+    """The owner's registration of each scan: a matrix beside it, or already applied to points on the map."""
+
+    suffix: Annotated[str, Field(min_length=2)] | None = None
+    into: Literal["project", "scanner"] = "project"
+    use: Literal["start", "given"] = "start"
+    sigma_m: Positive
+    sigma_deg: Positive
+    wait_s: NotNegative = 900.0
+
+
 class ScannerSection(Section):
     """The instrument: a known model; each of its values can be overridden."""
 
@@ -416,6 +427,7 @@ class SiteFile(Section):
     metadata: MetadataSection = MetadataSection()
     scans: ScansSection
     epoch: EpochSection | None = None
+    registration: RegistrationSection | None = None
     scanner: ScannerSection = ScannerSection.model_validate({})
     sop: tuple[SopSection, ...] = ()
     map: MapSection = MapSection()
@@ -443,6 +455,11 @@ class SiteFile(Section):
             raise ValueError("two [[sop]] have the same from: which of them is valid then?")
         if any(sop.files for sop in self.sop) and self.epoch is None:
             raise ValueError("sop.files, for several scan positions, needs [epoch]")
+        if self.registration and (self.registration.suffix is None) != (self.scans.frame == "map"):
+            raise ValueError(
+                'registration.suffix names the matrices beside scans: needed with scans.frame = "scanner",'
+                ' and none with "map"'
+            )
         if self.map.crs is None and (self.map.pop or self.map.origin):
             raise ValueError("map.pop and map.origin need map.crs, the map they refer to")
         if self.map.pop and self.map.origin and self.scans.frame == "scanner":

@@ -38,6 +38,7 @@ MAX_REJECTED = 1000  # per poll, so that thousands of odd files delay no scan an
 MAX_LOGGED = 10  # of them, one line each
 WAITING_TO_SETTLE = "size and mtime to be stable"
 WAITING_FOR_LOG = "its inclination log"
+WAITING_FOR_MATRIX = "its registration"
 WAITING_FOR_FILES = "the other files of its epoch"
 WAITING_TO_BE_CLOSED = "another process to close it"
 MAX_LIVE_INTERVALS = 2.0  # of the expected interval: a scan that began earlier is not live
@@ -206,6 +207,12 @@ class Inbox:
             remaining_s = inclination.wait_s - stable_s
             if remaining_s > 0 and not (scan.parts and scan.logs):  # one may serve all files of an epoch
                 return f"{WAITING_FOR_LOG} {scan_id(scan.files[0].name)}{inclination.suffix}", remaining_s
+        registration = self._site.registration
+        if registration and registration.suffix and len(scan.matrices) < len(scan.files):
+            remaining_s = registration.wait_s - stable_s
+            if remaining_s > 0:
+                missing = next(file for file in scan.files if file.matrix is None)
+                return f"{WAITING_FOR_MATRIX} {scan_id(missing.name)}{registration.suffix}", remaining_s
         retry_s = self._retry_delay_s(scan, summary)
         return "its next attempt" if retry_s else "", retry_s or math.inf
 

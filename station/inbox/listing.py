@@ -32,7 +32,7 @@ _FILE_TYPES = {
 
 @dataclass(frozen=True)
 class ScanFile:
-    """A scan as it lies in a folder, with its inclination log if there is one.
+    """A scan as it lies in a folder, with its inclination log and its registration if there are any.
 
     `parts` are the files of an epoch of several, in order of their names; path and log are then those of the
     first, the size is that of all, the mtime the latest.
@@ -44,6 +44,7 @@ class ScanFile:
     size: int
     mtime_ns: int
     parts: tuple[ScanFile, ...] = ()
+    matrix: Path | None = None  # the registration of this file
 
     @property
     def files(self) -> tuple[ScanFile, ...]:
@@ -60,6 +61,11 @@ class ScanFile:
         """The inclination logs of its files."""
         return list(dict.fromkeys(file.log for file in self.files if file.log is not None))
 
+    @property
+    def matrices(self) -> list[Path]:
+        """The registrations of its files."""
+        return [file.matrix for file in self.files if file.matrix is not None]
+
 
 class ScanListing:
     """The files of a folder at the depth of `scans.name`, listed once, and the scans that they are.
@@ -71,9 +77,11 @@ class ScanListing:
         self._site = site
         self._folder = folder
         self._log_suffix = site.inclination.suffix if site.inclination else ""
+        self._matrix_suffix = (site.registration and site.registration.suffix) or ""
+        beside = tuple(filter(None, (self._log_suffix, self._matrix_suffix)))
         self.files = dict(_list_files(folder, folder_depth(site.scans.pattern)))
         known = tuple(suffixes)
-        self._names = {name for name in self.files if is_scan(name, known, self._log_suffix)}
+        self._names = {name for name in self.files if is_scan(name, known, beside)}
 
     @cached_property
     def rejected(self) -> dict[str, str]:
@@ -98,8 +106,13 @@ class ScanListing:
     def identity(self, scan: str) -> tuple[tuple[object, ...], ...]:
         """Return what changes when one of the files of a scan does, or its log."""
         names = self.scans[scan]
-        logs = (log for name in names if self._is_log(log := self.log_name(name)))
-        return tuple((name, *file_key(self.files[name])) for name in (*names, *logs))
+        beside = (
+            companion
+            for name in names
+            for companion in (self._beside(name, self._log_suffix), self._beside(name, self._matrix_suffix))
+            if companion
+        )
+        return tuple((name, *file_key(self.files[name])) for name in (*names, *beside))
 
     def scan(self, scan: str) -> ScanFile:
         """Return a scan that was listed."""
@@ -108,19 +121,24 @@ class ScanListing:
             return parts[0]
         return ScanFile(scan, parts[0].path, parts[0].log, *self.size_and_mtime_ns(scan), parts)
 
-    def log_name(self, name: str) -> str:
-        """Return the name of the inclination log of a file; '' if the station has none."""
-        return f"{scan_id(name)}{self._log_suffix}" if self._log_suffix else ""
-
     def _file(self, name: str) -> ScanFile:
-        status, log_name = self.files[name], self.log_name(name)
-        log = self._folder / log_name if self._is_log(log_name) else None
-        return ScanFile(name, self._folder / name, log, status.st_size, status.st_mtime_ns)
+        status, folder = self.files[name], self._folder
+        log, matrix = (self._beside(name, suffix) for suffix in (self._log_suffix, self._matrix_suffix))
+        return ScanFile(
+            name,
+            folder / name,
+            folder / log if log else None,
+            status.st_size,
+            status.st_mtime_ns,
+            matrix=folder / matrix if matrix else None,
+        )
 
-    def _is_log(self, name: str) -> bool:
-        """Return True if a name is that of a regular file that is not empty."""
-        status = self.files.get(name)
-        return status is not None and stat.S_ISREG(status.st_mode) and status.st_size > 0
+    def _beside(self, name: str, suffix: str) -> str:
+        """Return the name of the file of a suffix beside a scan; '' without a regular one with content."""
+        companion = f"{scan_id(name)}{suffix}" if suffix else ""
+        status = self.files.get(companion)
+        is_usable = status is not None and stat.S_ISREG(status.st_mode) and status.st_size > 0
+        return companion if is_usable else ""
 
     def _rejection_reason(self, name: str) -> str:
         """Return why a file is rejected whatever its content, '' if it is not."""
@@ -172,14 +190,13 @@ def list_folder(folder: Path) -> dict[str, os.stat_result]:
     return files
 
 
-def is_scan(name: str, suffixes: tuple[str, ...], log_suffix: str = "") -> bool:
+def is_scan(name: str, suffixes: tuple[str, ...], beside: tuple[str, ...] = ()) -> bool:
     """Return True if a file name is that of a scan; hidden files are transfers in progress.
 
-    `log_suffix` is that of inclination logs, which may end like scans in text.
+    `beside` are the suffixes of inclination logs and matrices, which may end like scans in text.
     """
     base = name.rpartition(SEPARATOR)[2]
-    is_log = bool(log_suffix) and base.endswith(log_suffix)
-    return base.lower().endswith(suffixes) and not base.startswith(".") and not is_log
+    return base.lower().endswith(suffixes) and not base.startswith(".") and not base.endswith(beside)
 
 
 def safe_name(name: str) -> str:

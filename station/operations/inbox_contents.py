@@ -73,10 +73,9 @@ def files_below(folder: Path) -> Iterator[Path]:
 
 def _other_formats(site: Site, others: list[Path], *, has_scans: bool) -> Iterator[LevelAndMessage]:
     """Yield the files of formats that could be read, by their suffix."""
-    log_suffix = site.inclination.suffix if site.inclination else ""
-    counts = Counter(
-        path.suffix.lower() for path in others if not (log_suffix and path.name.endswith(log_suffix))
-    )
+    sections = (site.inclination, site.registration)
+    beside = tuple(section.suffix for section in sections if section and section.suffix)
+    counts = Counter(path.suffix.lower() for path in others if not path.name.endswith(beside))
     for suffix, count in counts.most_common():
         advice = CONVERTED.get(suffix, "")
         if suffix in suffixes() or (suffix in TEXT_SUFFIXES and not has_scans and count > 1):

@@ -21,8 +21,9 @@ from station.inbox.journal_reader import JournalReader
 from station.inbox.listing import ScanFile
 from station.processing.pipeline import grid_scan, new_gridder, stacking_inputs, to_map
 from station.processing.provenance import stored_epochs
-from station.processing.scan_inputs import ScanInputs, load_scan_inputs
+from station.processing.scan_inputs import ScanInputs
 from station.processing.scan_tasks import adjust_scan, load_viewing_geometry
+from station.processing.scans.epoch_inputs import load_scan_inputs
 from station.processing.scans.open_scans import OpenScan, open_scan_for
 from station.processing.scans.scan_files import find_scan
 from station.processing.site_files import series_for

@@ -35,9 +35,9 @@ from station.processing.reference_tasks import (
     scans_for_version,
     update_reference_version,
 )
-from station.processing.scan_inputs import load_scan_inputs
 from station.processing.scan_tasks import Rejected, ScanHistory, StoredResult, load_reference
 from station.processing.scanner_pose import sop_identity
+from station.processing.scans.epoch_inputs import load_scan_inputs
 from station.processing.scans.open_scans import open_scan_for
 from station.processing.scans.scan_files import ScanFinder
 from station.processing.site_files import series_for

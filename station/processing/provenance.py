@@ -48,6 +48,7 @@ class ScanProvenance:
     sop_tilt_offset: str
     flag: str
     air: tuple[float, ...]  # () if unknown
+    registration_sha256: str = ""
 
     def to_attrs(self) -> dict[str, str]:
         """Return the fields as text; `from_attrs` reads it."""
@@ -102,6 +103,7 @@ def _stored_epoch(
         sop_tilt_offset=text("sop_tilt_offset"),
         flag=text("flag"),
         air=tuple(air) if is_known else (),
+        registration_sha256=text("registration_sha256"),
     )
     verdict = int(scalars["verdict"][index]) if "verdict" in scalars else 0
     return StoredEpoch(
@@ -152,6 +154,9 @@ class CurrentConfig:
             changes.append(
                 "other inclination log" if provenance.log_sha256 else "inclination log arrived later"
             )
+        if scan.matrices and sha256_files(scan.matrices) != provenance.registration_sha256:
+            is_late = not provenance.registration_sha256
+            changes.append("registration arrived later" if is_late else "other registration")
         is_unchanged = entry is not None and (entry.size, entry.mtime_ns) == (scan.size, scan.mtime_ns)
         known_sha256 = entry.sha256 if entry is not None and is_unchanged and entry.sha256 else None
         if (known_sha256 or sha256_files(scan.paths)) != provenance.scan_sha256:

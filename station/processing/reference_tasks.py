@@ -32,8 +32,9 @@ from station.processing.pipeline import (
     stacking_inputs,
 )
 from station.processing.provenance import ScanProvenance
-from station.processing.scan_inputs import ScanInputs, load_scan_inputs
+from station.processing.scan_inputs import ScanInputs
 from station.processing.scan_tasks import adjust_scan, load_viewing_geometry, stable_cells
+from station.processing.scans.epoch_inputs import load_scan_inputs
 from station.processing.scans.open_scans import open_scan_for
 from station.processing.site_files import exclusion_reason, series_for, sha256_log
 from station.processing.workers.worker_process import Progress
@@ -270,5 +271,6 @@ def _add_scan(
         sop_tilt_offset=inputs.provenance.get("sop_tilt_offset", ""),
         flag=exclusion_reason(site, start.timestamp(), end.timestamp()),
         air=air_key(air_scalars(inputs)),
+        registration_sha256=sha256_files(scan.matrices),
     )
     return _StackedScan(inputs, adjustment, provenance)

@@ -1,14 +1,11 @@
-"""Inputs of a scan other than its shots: SOP, tilt, air; and warnings about what is missing.
-
-Scans from several positions are placed by the inputs of each, and are one cloud on the map from there on.
-"""
+"""Inputs of a scan other than its shots: SOP, tilt, air; and warnings about what is missing."""
 
 from __future__ import annotations
 
 import json
 import math
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict, dataclass
 from fnmatch import fnmatchcase
 from functools import partial
 from pathlib import Path
@@ -25,9 +22,14 @@ from station.processing.scanner_pose import (
     scan_geometry,
     scanner_to_map,
     sop_identity,
-    sop_identity_at,
 )
 from station.processing.scans.open_scans import OpenScan, PositionScan, open_files
+from station.processing.scans.registration import (
+    CovarianceOf,
+    is_given,
+    registered_covariance,
+    registration,
+)
 from station.processing.scans.scan_files import inbox_scans
 from station.quantities import (
     Air,
@@ -42,7 +44,6 @@ from station.quantities import (
 )
 from station.readers.inclination import align_gps_week, read_inclination
 from station.readers.scan import ScanReader
-from station.readers.sop import valid_sop
 from station.scan_names import scan_id, scan_stem
 from station.science.adjustment import prior
 from station.science.geometry import inclination
@@ -65,7 +66,7 @@ class ScanInputs:
 
     geometry: ScanGeometry
     pose: Pose
-    log_only_covariance: Callable[[VarianceComponents], SharedParameters] | None
+    log_only_covariance: CovarianceOf | None
     adjustment_inputs: AdjustmentInputs | None
     tilt_record: TiltRecord | None
     air: Air | None
@@ -73,6 +74,7 @@ class ScanInputs:
     provenance: dict[str, str]
     faults: tuple[str, ...] = ()  # that make the scan unusable
     position_poses: tuple[Pose, ...] = ()  # of several positions, whose shots come on the map
+    is_given: bool = False  # by the owner's registration, which is not to be changed
 
     def shots(self, scan: OpenScan, intensity: IntensityScale) -> Iterator[Shots]:
         """Yield the shots of a scan, to be placed by `pose`; decoding starts with this call."""
@@ -90,94 +92,7 @@ class ScanInputs:
         return self.log_only_covariance(components) if self.log_only_covariance else None
 
 
-def load_scan_inputs(
-    site: Site,
-    scan: OpenScan,
-    *,
-    save_tilt_offset: bool = True,
-    wait_for_weather: bool = False,
-    waiting_before: str = "",
-) -> ScanInputs:
-    """Return the inputs of a scan; raise ScanError or ConfigError if it cannot be georeferenced.
-
-    With `save_tilt_offset`, a tilt offset estimated here is saved for later scans. NotReadyError is raised if
-    that offset is to be of an earlier scan, the one in `waiting_before`; and, with `wait_for_weather`, if
-    there is no weather yet.
-    """
-    inputs = _inputs_by_frame(
-        site,
-        scan,
-        save_tilt_offset=save_tilt_offset,
-        wait_for_weather=wait_for_weather,
-        waiting_before=waiting_before,
-    )
-    if site.epoch is None or site.epoch.files is None or scan.file_count >= site.epoch.files:
-        return inputs
-    warning = f"{scan.file_count} of {site.epoch.files} files of the epoch"
-    return replace(inputs, warnings=(warning, *inputs.warnings))
-
-
-def _inputs_by_frame(
-    site: Site, scan: OpenScan, *, save_tilt_offset: bool, wait_for_weather: bool, waiting_before: str
-) -> ScanInputs:
-    if site.scans.frame == "map":
-        return _inputs_in_map_frame(site, scan.start.timestamp())
-    inputs = [
-        _position_inputs(
-            site,
-            position,
-            save_tilt_offset=save_tilt_offset,
-            wait_for_weather=wait_for_weather,
-            waiting_before=waiting_before,
-        )
-        for position in scan.positions
-    ]
-    return inputs[0] if len(inputs) == 1 else _inputs_of_positions(site, scan, inputs)
-
-
-def _inputs_of_positions(site: Site, scan: OpenScan, each: list[ScanInputs]) -> ScanInputs:
-    """Return the inputs of scans from several positions, which are adjusted as one rigid cloud.
-
-    The first position of the site file is that of the adjustment, whichever positions a scan has.
-    """
-    sop = valid_sop(site.sop, scan.start)
-    transform = scanner_to_map(site, sop)
-    rotation = transform.to_local[:3, :3]
-    axis = (float(rotation[0, 2]), float(rotation[1, 2]), float(rotation[2, 2]))
-    warnings = [
-        f"{position.name}: {warning}"
-        for position, inputs in zip(scan.positions, each, strict=True)
-        for warning in inputs.warnings
-        if not warning.startswith("weather")
-    ]
-    air, weather_known = air_of_scan(
-        site, scan.start + (scan.end - scan.start) / 2, transform.position_m[2], warnings
-    )
-    geometry = scan_geometry(site, transform.position_m, axis)
-    params = parameters.parameter_layout(geometry.grid, transform.position_m, axis)
-    lines = prior.line_times(params, rotation, None)
-    return ScanInputs(
-        geometry,
-        Pose(None, None),
-        partial(prior.log_only_covariance, params, lines, None, NO_CYCLIC_ERROR, weather_known=weather_known),
-        AdjustmentInputs(
-            params,
-            lines,
-            np.zeros((3, params.line_groups)),
-            None,
-            scan.start.timestamp(),
-            weather_known=weather_known,
-        ),
-        None,
-        air if weather_known else None,
-        tuple(warnings),
-        {"sop_id": sop_identity_at(site, scan.start), "sop_tilt_offset": ""},
-        tuple(dict.fromkeys(fault for inputs in each for fault in inputs.faults)),
-        tuple(inputs.pose for inputs in each),
-    )
-
-
-def _position_inputs(
+def position_inputs(
     site: Site,
     position: PositionScan,
     *,
@@ -185,11 +100,12 @@ def _position_inputs(
     wait_for_weather: bool,
     waiting_before: str,
 ) -> ScanInputs:
-    """Return the inputs of what was scanned from one position; see `load_scan_inputs`."""
+    """Return the inputs of what was scanned from one position; raises as `load_scan_inputs`."""
     reader, start, end, sop = position.reader, position.start, position.end, position.sop
     assert sop is not None  # noqa: S101 - of a scan in the scanner's frame
     transform, sop_id = scanner_to_map(site, sop), sop_identity(sop)
     warnings: list[str] = []
+    registered = registration(site, position, warnings)
     track = reader.azimuth_track() if site.scans.point_time == "auto" else None
     if track is None and site.scans.point_time == "auto":
         has_time = reader.time_range_s() is not None
@@ -198,9 +114,12 @@ def _position_inputs(
     rotation = transform.to_local[:3, :3]
     log_paths = position.logs or _converted_log(site, reader)
     log = _load_log(site, log_paths, track, rotation, warnings)
-    faults = _static_tilt_faults(site, log)
-    tilt_offset = read_tilt_offset(site, sop_id)
-    if tilt_offset is None:
+    faults = _static_tilt_faults(site, log) if registered is None else ()
+    if registered is not None:  # it contains the mean tilt of the scan
+        tilt_offset = _own_tilt_offset(site, log, track)
+    else:
+        tilt_offset = read_tilt_offset(site, sop_id)
+    if tilt_offset is None and registered is None:
         tilt_offset = stored_tilt_offsets(site).get(sop_id)
         if tilt_offset is None:
             tilt_offset = _find_tilt_offset(site, position, log, track, warnings, waiting_before)
@@ -218,30 +137,33 @@ def _position_inputs(
     assumed_rad, line_inclination = np.zeros((3, params.line_groups)), None
     if tilt_record is not None:
         assumed_rad = prior.tilt_rotation(tilt_record.tilt, rotation, lines.time_s)
-        if track is not None:
+        if track is not None and registered is None:
             line_inclination = prior.line_inclination(
                 params, lines, tilt_record, tilt_offset or NO_CYCLIC_ERROR, rotation
             )
+    placed = transform if registered is None else registered
     if site.air is not None:
         setting = site.air.scanner_setting
         assumed_air = air if setting == "weather" else setting.air
         correction = air_correction(
             air, assumed_air if site.air.scanner_corrects else None, site.instrument.wavelength_um
         )
-        transform = transform.with_correction(correction.apply, site.scanner.range_max_m)
-    provenance = {"sop_id": sop_id, "sop_tilt_offset": json.dumps(asdict(tilt_offset)) if tilt_offset else ""}
+        placed = placed.with_correction(correction.apply, site.scanner.range_max_m)
+    sop_offset = tilt_offset if registered is None else None
+    provenance = {"sop_id": sop_id, "sop_tilt_offset": json.dumps(asdict(sop_offset)) if sop_offset else ""}
     tilt = tilt_record.tilt if tilt_record is not None else None
+    covariance = partial(
+        prior.log_only_covariance,
+        params,
+        lines,
+        tilt_record,
+        tilt_offset or NO_CYCLIC_ERROR,
+        weather_known=weather_known,
+    )
     return ScanInputs(
         geometry,
-        Pose(transform, tilt),
-        partial(
-            prior.log_only_covariance,
-            params,
-            lines,
-            tilt_record,
-            tilt_offset or NO_CYCLIC_ERROR,
-            weather_known=weather_known,
-        ),
+        Pose(placed, tilt),
+        covariance if registered is None else registered_covariance(site, covariance),
         AdjustmentInputs(
             params, lines, assumed_rad, line_inclination, start.timestamp(), weather_known=weather_known
         ),
@@ -250,13 +172,22 @@ def _position_inputs(
         tuple(warnings),
         provenance,
         faults,
+        is_given=registered is not None and is_given(site),
     )
 
 
-def _inputs_in_map_frame(site: Site, start_s: float) -> ScanInputs:
+def _own_tilt_offset(
+    site: Site, log: InclinationLog | None, track: AzimuthTrack | None
+) -> CyclicError | None:
+    """Return the tilt of the scan itself, None without a log."""
+    return None if log is None else _fit_tilt_offset(log, track, site.instrument.inclination_sigma_rad)
+
+
+def inputs_in_map_frame(site: Site, start_s: float) -> ScanInputs:
     """Return the inputs of a scan that is already on the map."""
     position_m = map_position(site)
-    geometry, log_only_covariance, adjustment_inputs = scan_geometry(site, position_m), None, None
+    geometry, adjustment_inputs = scan_geometry(site, position_m), None
+    log_only_covariance: CovarianceOf | None = None
     if position_m is not None:  # registered elsewhere, with unknown accuracy
         params = parameters.parameter_layout(geometry.grid, position_m)
         lines = prior.line_times(params, np.eye(3), None)
@@ -271,7 +202,19 @@ def _inputs_in_map_frame(site: Site, start_s: float) -> ScanInputs:
             NO_CYCLIC_ERROR,
             weather_known=False,
         )
-    return ScanInputs(geometry, Pose(None, None), log_only_covariance, adjustment_inputs, None, None, (), {})
+        if site.registration is not None:
+            log_only_covariance = registered_covariance(site, log_only_covariance)
+    return ScanInputs(
+        geometry,
+        Pose(None, None),
+        log_only_covariance,
+        adjustment_inputs,
+        None,
+        None,
+        (),
+        {},
+        is_given=is_given(site),
+    )
 
 
 def _converted_log(site: Site, reader: ScanReader) -> tuple[Path, ...]:

@@ -36,8 +36,10 @@ from station.processing.pipeline import (
     usual_motion,
     variance_factors,
 )
-from station.processing.scan_inputs import ScanInputs, load_scan_inputs
+from station.processing.scan_inputs import ScanInputs
+from station.processing.scans.epoch_inputs import load_scan_inputs
 from station.processing.scans.open_scans import open_scan_for
+from station.processing.scans.registration import registration_difference
 from station.processing.site_files import (
     exclusion_reason,
     file_version,
@@ -237,10 +239,11 @@ def _compute_epoch(
         raise ScanError("no point falls on the grid: wrong scans.frame, SOP, CRS or units?")
     progress()
     brightness_known = not site.adjusts or has_brightness(gridder, viewing)
-    adjustment = adjust_scan(site, gridder, inputs, viewing)
+    adjustment = adjust_scan(site, gridder, inputs, viewing, even_if_given=True)
     flag = exclusion_reason(site, start.timestamp(), end.timestamp())
     attempt = adjustment[1] if adjustment else None
-    if adjustment is not None and adjustment[1].rejected_share > UNUSABLE_REJECTED_SHARE:
+    registration, registration_warnings = registration_difference(site, scan, attempt)
+    if adjustment is not None and (inputs.is_given or adjustment[1].rejected_share > UNUSABLE_REJECTED_SHARE):
         adjustment = None
     components = usual_motion(reference, start.timestamp()) if reference else VarianceComponents()
     shared, factors = inputs.log_only_shared(components), UNIT_FACTORS
@@ -265,7 +268,7 @@ def _compute_epoch(
         scalars |= dict(zip(LEVERAGE_VARIABLES, adjustment[1].leverage_m2, strict=True))
     verdict_name, reason = verdict.assess(
         flag,
-        [*inputs.warnings, *log_warnings],
+        [*inputs.warnings, *log_warnings, *registration_warnings],
         measurement,
         viewing,
         attempt,
@@ -284,10 +287,11 @@ def _compute_epoch(
         redundancy=adjustment[1].redundancy if adjustment else None,
         verdict=verdict_name,
         verdict_reason=reason,
-        scalars=scalars | clock_scalars,
+        scalars=scalars | clock_scalars | registration,
         provenance={
             "scan_sha256": scan_sha256,
             "log_sha256": sha256_log(scan),
+            "registration_sha256": sha256_files(scan.matrices),
             "flag": flag,
             "science_hash": site.science_hash,
             "reference_version": reference.version if reference else "",
@@ -312,9 +316,19 @@ def load_viewing_geometry(site: Site, geometry: ScanGeometry, reference: Referen
 
 
 def adjust_scan(
-    site: Site, gridder: Gridder, inputs: ScanInputs, viewing: ViewingGeometry | None
+    site: Site,
+    gridder: Gridder,
+    inputs: ScanInputs,
+    viewing: ViewingGeometry | None,
+    *,
+    even_if_given: bool = False,
 ) -> tuple[AdjustmentInputs, Adjustment] | None:
-    """Return the adjustment of a scan to the reference; None if it is disabled or there is no reference."""
+    """Return the adjustment of a scan to the reference; None if it is disabled or there is no reference.
+
+    Also None if its registration is given, unless `even_if_given`.
+    """
+    if inputs.is_given and not even_if_given:
+        return None
     if not site.adjusts or inputs.adjustment_inputs is None or viewing is None:
         return None
     adjustment = adjust_to_reference(gridder, inputs.geometry, inputs.adjustment_inputs, viewing)

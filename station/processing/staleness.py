@@ -22,7 +22,11 @@ from station.processing.site_files import file_version, series_for
 from station.processing.workers.worker_process import Progress
 from station.scan_names import scan_id
 
-LATE_INPUTS = {"inclination log arrived later", "weather arrived later"}  # the service reprocesses these
+LATE_INPUTS = {
+    "inclination log arrived later",
+    "weather arrived later",
+    "registration arrived later",
+}  # the service reprocesses these
 EPOCH_MISSING = "epoch damaged or missing"
 REFERENCE_OUTDATED = "reference built with other settings or inputs"
 
@@ -124,7 +128,8 @@ def late_inputs(site: Site, entries: list[Entry], progress: Progress) -> list[st
     for epoch in stored_epochs(series_for(site)):
         progress()
         entry = by_epoch.get(epoch.ref.epoch_file)
-        if entry is None or (epoch.provenance.log_sha256 and epoch.provenance.air):
+        has_registration = site.registration is None or bool(epoch.provenance.registration_sha256)
+        if entry is None or (epoch.provenance.log_sha256 and epoch.provenance.air and has_registration):
             continue
         scan = finder.find(entry.name, epoch.provenance.start_s)
         if scan is not None and LATE_INPUTS & set(config.changed_inputs(epoch.provenance, scan, entry)):

@@ -84,7 +84,7 @@ def _move_or_delete(
     _require_verified(site, scan, entry, files, verified, progress)
     inbox, archive = site.scans.inbox, site.retention.archive
     # The scans last; what an interrupted run has moved stays where it is.
-    paths = [path for path in (*scan.logs, *scan.paths) if path.is_relative_to(inbox)]
+    paths = [path for path in (*scan.logs, *scan.matrices, *scan.paths) if path.is_relative_to(inbox)]
     try:
         for folder in {path.parent for path in paths}:
             _require_writable(folder)

@@ -7,7 +7,7 @@ from readers.test_weather_dialects import LOGS
 from support import tiny_station
 
 from station.config import read_site
-from station.processing.scan_inputs import load_scan_inputs
+from station.processing.scans.epoch_inputs import load_scan_inputs
 from station.processing.scans.open_scans import open_scan_for
 from station.processing.scans.scan_files import scan_file
 

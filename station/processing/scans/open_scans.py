@@ -10,7 +10,7 @@ from pathlib import Path
 
 from station.config import Site
 from station.errors import ScanError
-from station.inbox.file_hash import distinct_files
+from station.inbox.file_hash import distinct_files, sha256_files
 from station.inbox.listing import ScanFile
 from station.readers.formats.conversion import open_site_scan
 from station.readers.formats.several_files import as_one
@@ -29,6 +29,7 @@ class PositionScan:
     name: str  # of its first file
     reader: ScanReader
     logs: tuple[Path, ...]
+    matrix: Path | None  # its registration
     sop: SopSection | None  # None if the points are on the map
     start: datetime
     end: datetime
@@ -61,11 +62,11 @@ class OpenScan:
 def open_scan_for(site: Site, scan: ScanFile) -> Iterator[OpenScan]:
     """Yield a scan with the settings of the site; files with the same bytes are read once.
 
-    Files of an epoch with one SOP, and one start in their names, are tiles of one scan. Raises ScanError or
-    NotReadyError.
+    Files of an epoch with one SOP, one start in their names, and the same registration are tiles of one scan.
+    Raises ScanError or NotReadyError.
     """
     kept = set(distinct_files(scan.paths)) if scan.parts else {scan.path}
-    groups: dict[tuple[SopSection | None, datetime | None], list[tuple[ScanFile, ScanReader]]] = {}
+    groups: dict[tuple[SopSection | None, datetime | None, str], list[tuple[ScanFile, ScanReader]]] = {}
     with ExitStack() as stack:
         for file in scan.files:
             if file.path not in kept:
@@ -75,14 +76,15 @@ def open_scan_for(site: Site, scan: ScanFile) -> Iterator[OpenScan]:
                 start, _, _ = utc_interval(reader, site.scans.pattern, file.name)
                 is_on_map = site.scans.frame == "map"
                 sop = None if is_on_map else valid_sop(site.sop, start, file.name)
-                key = sop, None if is_on_map else start_in_name(file.name, site.scans.pattern)
+                name_start = None if is_on_map else start_in_name(file.name, site.scans.pattern)
+                key = sop, name_start, sha256_files(file.matrices)
             except ScanError as error:
                 if len(scan.files) == 1:
                     raise
                 raise type(error)(f"{file.name}: {error}") from error
             groups.setdefault(key, []).append((file, reader))
         name = scan_id(scan.name)
-        positions = tuple(_position(site, name, sop, files) for (sop, _), files in groups.items())
+        positions = tuple(_position(site, name, sop, files) for (sop, *_), files in groups.items())
         yield OpenScan(positions, len(kept))
 
 
@@ -92,7 +94,7 @@ def _position(
     reader = as_one([reader for _, reader in files])
     start, end, _ = utc_interval(reader, site.scans.pattern, files[0][0].name)
     logs = dict.fromkeys(file.log for file, _ in files if file.log is not None)
-    return PositionScan(scan, files[0][0].name, reader, tuple(logs), sop, start, end)
+    return PositionScan(scan, files[0][0].name, reader, tuple(logs), files[0][0].matrix, sop, start, end)
 
 
 @contextmanager

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import stat
 from collections.abc import Sequence
+from dataclasses import replace
 from datetime import UTC, datetime
 from functools import cache
 from pathlib import Path
@@ -26,9 +27,10 @@ def is_present(path: Path) -> bool:
 
 
 def scan_file(site: Site, path: Path) -> ScanFile:
-    """Return a file as a scan, with its inclination log, if that is in the same folder."""
+    """Return a file as a scan, with its inclination log and registration, if they are in the same folder."""
     status, name = path.lstat(), name_below(path.absolute(), site.scans.pattern)
-    return ScanFile(name, path.absolute(), _log_path(site, path), status.st_size, status.st_mtime_ns)
+    log, matrix = _log_path(site, path), _matrix_path(site, path)
+    return ScanFile(name, path.absolute(), log, status.st_size, status.st_mtime_ns, matrix=matrix)
 
 
 def scan_of_files(site: Site, paths: Sequence[Path]) -> list[ScanFile]:
@@ -75,8 +77,8 @@ class ScanFinder:
     def find(self, name: str, start_utc_s: float | None) -> ScanFile | None:
         """Return a scan from the inbox or the archive; None if it no longer exists.
 
-        If the log arrived after the scan was archived, it is taken from the inbox. The files of an epoch are
-        those of both folders.
+        If log or registration arrived after the scan was archived, they are taken from the inbox. The files
+        of an epoch are those of both folders.
         """
         site, archive = self._site, self._site.retention.archive
         month = None if archive is None or start_utc_s is None else archive_folder(archive, start_utc_s)
@@ -95,8 +97,12 @@ class ScanFinder:
         if month is None or not is_present(month / name):
             return None
         scan = scan_file(self._site, month / name)
-        log = scan.log or _log_path(self._site, self._site.scans.inbox / name)
-        return ScanFile(name, scan.path, log, scan.size, scan.mtime_ns)
+        return replace(
+            scan,
+            name=name,
+            log=scan.log or _log_path(self._site, path),
+            matrix=scan.matrix or _matrix_path(self._site, path),
+        )
 
 
 def find_scan(site: Site, name: str, start_utc_s: float | None) -> ScanFile | None:
@@ -110,7 +116,16 @@ def archive_folder(archive: Path, start_utc_s: float) -> Path:
 
 
 def _log_path(site: Site, scan: Path) -> Path | None:
-    if site.inclination is None:
+    return _beside(scan, site.inclination.suffix) if site.inclination else None
+
+
+def _matrix_path(site: Site, scan: Path) -> Path | None:
+    return _beside(scan, site.registration.suffix) if site.registration else None
+
+
+def _beside(scan: Path, suffix: str | None) -> Path | None:
+    """Return the file of a suffix beside a scan; None if it is none, or a link."""
+    if suffix is None:
         return None
-    log_path = scan.with_name(f"{scan_stem(scan)}{site.inclination.suffix}").absolute()
-    return log_path if is_present(log_path) and not log_path.is_symlink() else None
+    path = scan.with_name(f"{scan_stem(scan)}{suffix}").absolute()
+    return path if is_present(path) and not path.is_symlink() else None
