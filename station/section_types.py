@@ -49,6 +49,8 @@ def require_projected(crs: str) -> str:
 
 def require_time_pattern(pattern: str) -> str:
     """Return a pattern of scan names; raise ValueError unless times survive being written and read by it."""
+    if any(folder in {"", ".", ".."} for folder in pattern.split("/")):
+        raise ValueError("folders are those below the inbox, as in %Y-%m-%d/*")
     time = datetime(2025, 7, 15, 13, 14, 15, tzinfo=UTC)
     try:
         datetime.strptime(time.strftime(pattern), pattern)  # noqa: DTZ007 - the pattern may contain a zone
@@ -56,8 +58,6 @@ def require_time_pattern(pattern: str) -> str:
             raise ValueError("a name written by it does not match it")  # noqa: TRY301 - as those of strptime
     except (ValueError, re.error, OverflowError) as error:
         raise ValueError(f"not a pattern of times, such as %y%m%d_%H%M%S: {error}") from error
-    if any(folder in {"", ".", ".."} for folder in pattern.split("/")):
-        raise ValueError("folders are those below the inbox, as in %Y-%m-%d/*")
     return pattern
 
 

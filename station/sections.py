@@ -115,7 +115,7 @@ class EpochSection(Section):
 class RegistrationSection(Section):
     """The owner's registration of each scan: a matrix beside it, or already applied to points on the map."""
 
-    suffix: Annotated[str, Field(min_length=2)] | None = None
+    suffix: Annotated[str, Field(pattern=r"^[^/]{2,}$")] | None = None
     into: Literal["project", "scanner"] = "project"
     use: Literal["start", "given"] = "start"
     sigma_m: Positive

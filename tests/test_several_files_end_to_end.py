@@ -186,15 +186,26 @@ def sop(yaw_deg, x_m, y_m, z_m):
     return np.array([[c, -s, 0, x_m], [s, c, 0, y_m], [0, 0, 1, z_m], [0, 0, 0, 1.0]])
 
 
-def test_scan_positions_are_placed_by_their_sops(tmp_path):
-    """Counts are exact and means right to the storage quantum, by an own transformation with numpy."""
+SHIFT = sop(12.0, 1.0, -2.0, 0.5)
+
+
+@pytest.mark.parametrize("into", ["", "project", "scanner"])
+def test_scan_positions_are_placed_by_their_sops(tmp_path, into):
+    """Counts are exact and means right to the storage quantum, by an own transformation with numpy.
+
+    With `into` they are placed by matrices beside the scans, in the frame that it states.
+    """
     random = np.random.default_rng(3)
     sops = {"first": sop(30.0, -4.0, -3.0, 2.0), "second": sop(-75.0, 14.0, 12.0, 1.5)}
     day = tmp_path / "inbox" / "2025-07-15"
     day.mkdir(parents=True)
     on_map = []
     for number, (name, matrix) in enumerate(sops.items(), start=1):
-        np.savetxt(tmp_path / f"{name}.txt", matrix, fmt="%.12f")
+        of_file = sop(0.0, 0.0, 0.0, 0.0) if into else matrix
+        np.savetxt(tmp_path / f"{name}.txt", of_file if into != "scanner" else SHIFT, fmt="%.12f")
+        if into:
+            beside = matrix if into == "project" else np.linalg.inv(SHIFT) @ matrix
+            np.savetxt(day / f"ScanPos{number:03d}.dat", beside, fmt="%.12f")
         x_m, y_m = random.uniform(0.01, SIZE_M - 0.01, (2, COUNT))
         z_m = 0.3 * np.sin(x_m) + 0.1 * y_m + random.normal(0, 0.005, COUNT)
         points_m = np.stack([x_m, y_m, z_m])
@@ -206,8 +217,9 @@ def test_scan_positions_are_placed_by_their_sops(tmp_path):
         scan.write(day / f"ScanPos{number:03d}.laz")
         stored_m = np.stack([scan.x, scan.y, scan.z])
         on_map.append(matrix[:3, :3] @ stored_m + matrix[:3, 3:])
-    (tmp_path / "site.toml").write_text(SITE)
-    result = station("process", tmp_path / "site.toml", *day.iterdir())
+    section = f'[registration]\nsuffix = ".dat"\ninto = "{into}"\nsigma_m = 0.01\nsigma_deg = 0.001\n'
+    (tmp_path / "site.toml").write_text(SITE + (section if into else ""))
+    result = station("process", tmp_path / "site.toml", *day.glob("*.laz"))
     assert result.returncode == 0, result.stdout + result.stderr
     points_m = np.hstack(on_map)
     column, row = (points_m[:2] / CELL_M).astype(int)
