@@ -95,6 +95,7 @@ def _field_expression(field: str) -> str:
     return rf"\d{{{digits}}}" if digits else "%" if field == "%%" else "[^/]+"
 
 
+@lru_cache(maxsize=1 << 16)
 def epoch_name(start: datetime, pattern: str) -> str:
     """Return the name of the epoch to which a scan belongs: its start, in the zone of the pattern."""
     pattern, _, zone = pattern.partition(ZONE_MARK)

@@ -460,6 +460,8 @@ class SiteFile(Section):
                 'registration.suffix names the matrices beside scans: needed with scans.frame = "scanner",'
                 ' and none with "map"'
             )
+        if self.registration and self.scans.frame == "map" and self.map.origin is None:
+            raise ValueError("registration needs map.origin, from which its rotation and our own are counted")
         if self.map.crs is None and (self.map.pop or self.map.origin):
             raise ValueError("map.pop and map.origin need map.crs, the map they refer to")
         if self.map.pop and self.map.origin and self.scans.frame == "scanner":

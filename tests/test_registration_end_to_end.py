@@ -11,6 +11,9 @@ import xarray as xr
 from scipy.spatial.transform import Rotation
 
 from station import open as open_series
+from station.config import read_site
+from station.inbox.journal_reader import JournalReader
+from station.processing.staleness import late_inputs, plan_reprocessing
 from station.simulation.scenario import small
 from station.simulation.station import simulate
 
@@ -88,3 +91,33 @@ def test_a_wrong_registration_that_is_given_differs_from_the_own_estimate(statio
     reasons = [str(value) for value in series["verdict_reason"].values]
     assert "registration differs by 0.04" in reasons[2]
     assert not any("registration differs" in reason for reason in reasons[:2])
+
+
+def test_matrices_that_come_later_or_change_are_reasons_to_process_again(tmp_path):
+    folder = tmp_path / "late"
+    simulate(folder, replace(small(hours=1), reference_scans=1))
+    with (folder / "site.toml").open("a") as file:
+        file.write(REGISTRATION.format(use="start"))
+    site, (scan,) = read_site(folder / "site.toml"), (folder / "inbox").glob("*.laz")
+    command = [sys.executable, "-m", "station", "process", folder / "site.toml", scan]
+    matrix = scan.with_name(f"{scan.stem}-reg.txt")
+
+    def processed():
+        result = subprocess.run(command, capture_output=True, text=True, check=False, timeout=120)
+        assert result.returncode == 0, result.stdout + result.stderr
+        with JournalReader(site.station.data / "journal.sqlite") as journal:
+            return journal.rows()
+
+    rows = processed()
+    assert "registration missing: placed by the SOP" in rows[0].reason
+    assert late_inputs(site, rows, lambda: None) == []
+    matrix.write_text("1 0 0 0\n0 1 0 0\n0 0 -1 0\n0 0 0 1\n")
+    assert late_inputs(site, rows, lambda: None) == [scan.name]
+    rows = processed()
+    assert "registration unusable: placed by the SOP" in rows[0].reason
+    assert "is a reflection" in rows[0].reason
+    np.savetxt(matrix, np.eye(4))
+    assert late_inputs(site, rows, lambda: None) == []
+    (task,) = plan_reprocessing(site, rows, set(), (-np.inf, np.inf), lambda: None).tasks
+    assert "other registration" in task.reasons
+    assert processed()[0].verdict == "good"

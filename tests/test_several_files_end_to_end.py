@@ -233,3 +233,17 @@ def test_scan_positions_are_placed_by_their_sops(tmp_path, into):
         assert np.abs(stored["elevation"].to_numpy() - mean_m).max() <= 2**-11
         assert float(stored["point_total"]) == 2 * COUNT
         assert "2025-07-15" in str(stored["scan_id"].values)
+
+
+def test_a_corrupt_tile_sets_its_epoch_aside_and_no_other(tmp_path):
+    """Not even if the SOP was solved from it: the others lack its tilt then, and say so."""
+    folder = tiled(tmp_path / "cut", method="none")
+    tiles = deliver(folder)
+    tiles[1].write_bytes(tiles[1].read_bytes()[:3000])
+    tiles[3].unlink()
+    result = station("process", folder / "site.toml", *tiles[:3], *tiles[4:])
+    assert result.returncode == 3, result.stdout + result.stderr
+    assert f"250715_000000: set aside: 2025-07-15/{tiles[1].name}: cut off or corrupt" in result.stdout
+    assert "250715_010000: degraded (2 of 3 files of the epoch" in result.stdout
+    assert "250715_020000: degraded (log of 250715_000000, the scan of the SOP, not usable" in result.stdout
+    assert (folder / "data" / "set_aside" / "250715_000000.txt").is_file()

@@ -62,10 +62,12 @@ def export_points(site: Site, span: Span | None, folder: Path, track: Track = it
     usable = usable_site(site)
     stored = {epoch.ref.epoch_file: epoch for epoch in stored_epochs(series, chosen)}
     for epoch in track(chosen):
-        scan_id = stored[epoch.epoch_file].provenance.scan_id
-        scan = find_scan(site, names.get(scan_id, scan_id), epoch.start.timestamp())
+        stored_id = stored[epoch.epoch_file].provenance.scan_id
+        scan = find_scan(site, names.get(stored_id, stored_id), epoch.start.timestamp())
         if scan is None:
-            raise StationError(f"{epoch.epoch_file}: its scan {scan_id} is neither in the inbox nor archived")
+            raise StationError(
+                f"{epoch.epoch_file}: its scan {stored_id} is neither in the inbox nor archived"
+            )
         path = folder / f"{Path(epoch.epoch_file).stem}.laz"
         isolation.TaskRunner().run(
             write_points,

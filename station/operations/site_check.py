@@ -179,7 +179,9 @@ def _folders(site: Site) -> Iterator[Finding]:
     elif not os.access(inbox, os.R_OK | os.X_OK):
         yield _finding("fault", "inbox", f"{inbox}: no permission to read")
     else:
-        yield _finding("ok", "inbox", f"{inbox}: {len(_scans(site))} scans")
+        files = len(_scans(site))
+        count = f"{len(inbox_scans(site))} epochs of {files} files" if site.epoch else f"{files} scans"
+        yield _finding("ok", "inbox", f"{inbox}: {count}")
     if site.retention.raw != "leave" and not os.access(inbox, os.W_OK):
         message = f"{inbox}: no permission to write, but retention.raw is {site.retention.raw!r}"
         yield _finding("warning", "retention", message)

@@ -360,9 +360,13 @@ def _find_tilt_offset(
             f"waits for {waiting_before}: the first scan under an SOP defines its tilt offset"
         )
     if sop.scan is not None and sop.scan not in {position.scan, scan_stem(position.scan)}:
-        log, track = _load_earlier_log(site, sop)
-        if log is None:
-            warnings.append(f"log of {sop.scan}, the scan of the SOP, not found: tilt not corrected")
+        try:
+            log, track = _load_earlier_log(site, sop)
+            problem = "not found" if log is None else ""
+        except ScanError as error:
+            log, track, problem = None, None, f"not usable: {error}"
+        if problem:
+            warnings.append(f"log of {sop.scan}, the scan of the SOP, {problem}: tilt not corrected")
     if log is None:
         return None
     return _fit_tilt_offset(log, track, site.instrument.inclination_sigma_rad)

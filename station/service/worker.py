@@ -326,17 +326,17 @@ class Worker:
             )
 
     def run(self, task: Callable[..., T], *args: object) -> T:
-        """Run a task in a worker process, limited to `timeout_s` per scan; without scans, to hours."""
+        """Run a task in a worker process, limited to `timeout_s` per file of scans; without any, to hours."""
         items = [item for arg in args for item in (arg if isinstance(arg, list) else [arg])]
         self._before_task()
-        scan_count = sum(isinstance(item, ScanFile) for item in items)
+        file_count = sum(len(item.files) for item in items if isinstance(item, ScanFile))
         result: T = self._host.tasks.run(
             with_usable_inputs,
             task,
             self._site,
             *args,
             memory_gb=self._site.service.memory_gb,
-            timeout_s=self._site.scans.timeout_s * scan_count or MAX_STORE_TASK_S,
+            timeout_s=self._site.scans.timeout_s * file_count or MAX_STORE_TASK_S,
             on_progress=self._on_progress,
             should_stop=self._should_stop,
         )
