@@ -57,10 +57,10 @@ def require_time_pattern(pattern: str) -> str:
         if start_in_name(time.strftime(pattern), pattern) is None:
             raise ValueError("a name written by it does not match it")  # noqa: TRY301 - as those of strptime
     except (ValueError, re.error, OverflowError) as error:
-        if "redefinition" in str(error):
-            message = "states a field of the time twice: put * for one of them, as in */%y%m%d_%H%M%S"
-            raise ValueError(message) from error
-        raise ValueError(f"not a pattern of times, such as %y%m%d_%H%M%S: {error}") from error
+        reason = str(error)
+        if "redefinition" in reason:
+            reason = "a field of the time stands twice: put * for one of them, as in */%y%m%d_%H%M%S"
+        raise ValueError(f"not a pattern of times, such as %y%m%d_%H%M%S: {reason}") from error
     return pattern
 
 

@@ -2,10 +2,12 @@
 
 import os
 import re
+import shutil
 import signal
 import subprocess
 import sys
 import time
+from dataclasses import replace
 
 import laspy
 import numpy as np
@@ -14,6 +16,8 @@ import xarray as xr
 from support import tiny_station
 
 from station import open as open_series
+from station.simulation.scenario import small
+from station.simulation.station import simulate
 
 pytestmark = pytest.mark.integration
 
@@ -247,3 +251,40 @@ def test_a_corrupt_tile_sets_its_epoch_aside_and_no_other(tmp_path):
     assert "250715_010000: degraded (2 of 3 files of the epoch" in result.stdout
     assert "250715_020000: degraded (log of 250715_000000, the scan of the SOP, not usable" in result.stdout
     assert (folder / "data" / "set_aside" / "250715_000000.txt").is_file()
+
+
+def test_two_positions_are_adjusted_as_the_one_scan_that_they_are_halves_of(tmp_path):
+    """The second half of each scan, seen from a scanner that stands elsewhere and looks elsewhere."""
+    whole = tmp_path / "whole"
+    simulate(whole, replace(small(hours=3), reference_scans=2))
+    halves = shutil.copytree(without_log(whole), tmp_path / "halves")
+    between = sop(63.0, 3.0, -2.0, 1.0)
+    np.savetxt(halves / "sop2.dat", np.loadtxt(halves / "sop.dat") @ between, fmt="%.14f")
+    text = (halves / "site.toml").read_text().replace('name = "%y%m%d_%H%M%S"', 'name = "%y%m%d_%H%M%S_*"')
+    section = re.sub(r"scan = .*\n", "", re.search(r"\[\[sop\]\]\n(?:[^\[\n].*\n)*", text)[0])
+    both = f'{section}files = "*_A"\n' + section.replace("sop.dat", "sop2.dat") + 'files = "*_B"\n'
+    text = re.sub(r"\[\[sop\]\]\n(?:[^\[\n].*\n)*", lambda _: both.replace('"\n', '.laz"\n'), text)
+    text = text.replace('sop.dat.laz"', 'sop.dat"').replace('sop2.dat.laz"', 'sop2.dat"')
+    (halves / "site.toml").write_text(f'{text}\n[epoch]\nname = "%y%m%d_%H%M%S"\nfiles = 2\n')
+    back = np.linalg.inv(between)
+    for path in sorted((halves / "inbox").glob("*.laz")):
+        scan = laspy.read(path)
+        is_second = np.arange(len(scan.points)) >= len(scan.points) // 2
+        for letter, chosen in (("A", ~is_second), ("B", is_second)):
+            half = laspy.LasData(scan.header, scan.points[chosen])
+            if letter == "B":
+                half.x, half.y, half.z = back[:3, :3] @ np.stack([half.x, half.y, half.z]) + back[:3, 3:]
+            half.write(path.with_name(f"{path.stem}_{letter}.laz"))
+        path.unlink()
+    for site in (whole, halves):
+        result = station("process", site / "site.toml", *sorted((site / "inbox").glob("*.laz")))
+        assert result.returncode == 0, result.stdout + result.stderr
+    expected, actual = open_series(whole / "data"), open_series(halves / "data")
+    assert (actual["verdict"] == 0).all()
+    counts = actual["point_count"].to_numpy() == expected["point_count"].to_numpy()
+    assert counts.mean() > 0.9995  # a point on the edge of a cell, rounded to 0.25 mm in another frame
+    difference_m = (actual["elevation_change"].to_numpy() - expected["elevation_change"].to_numpy())[counts]
+    sigma_m = expected["elevation_change_uncertainty"].to_numpy()[counts]
+    assert np.isfinite(difference_m).sum() > 20_000
+    assert np.nanstd(difference_m) < 0.006
+    assert np.nanstd(difference_m / sigma_m) < 0.25

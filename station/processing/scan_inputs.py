@@ -52,6 +52,7 @@ from station.science.geometry.inclination import NO_CYCLIC_ERROR, CyclicError, T
 from station.science.uncertainty import parameters
 from station.sections import SopSection
 
+MEAN_TILT = "one mean tilt for the whole scan"
 MIN_LOG_COVERAGE = 0.97  # of the scan duration that a complete log covers
 MIN_LOG_ROWS = 20  # a shorter log is not filtered
 MIN_ABSOLUTE_LOG_S = 60.0  # of a scan whose static tilt is known from its log alone
@@ -110,7 +111,7 @@ def position_inputs(
     if track is None and site.scans.point_time == "auto":
         has_time = reader.time_range_s() is not None
         cause = "azimuth does not follow time" if has_time else "no time per point"
-        warnings.append(f"{cause}: one mean tilt for the whole scan")
+        warnings.append(f"{cause}: {MEAN_TILT}")
     rotation = transform.to_local[:3, :3]
     log_paths = position.logs or _converted_log(site, reader)
     log = _load_log(site, log_paths, track, rotation, warnings)

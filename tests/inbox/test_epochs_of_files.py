@@ -213,7 +213,7 @@ def test_copies_and_names_do_not_change_the_content(drop):
     [
         ("%Y-%m-%d/../*", "", "folders are those below the inbox"),
         ("/%Y-%m-%d", "", "folders are those below the inbox"),
-        ("%Y-%m-%d/%y%m%d_%H%M%S", "", r"a field of the time twice: put \* for one of them"),
+        ("%Y-%m-%d/%y%m%d_%H%M%S", "", r"field of the time stands twice: put \* for one"),
         ("%Y-%m-%d/*", '[epoch]\nname = "%Y.%m.%d"', "letters, digits, _ and - only"),
         ("%Y-%m-%d/*", '[epoch]\nname = "%H%M"', "must state the year"),
         ("%Y-%m-%d/*", '[registration]\nsuffix = ".dat"\nsigma_m = 1\nsigma_deg = 1', 'none with "map"'),

@@ -13,7 +13,7 @@ import numpy as np
 from station.config import Site
 from station.processing.pipeline import AdjustmentInputs, Pose
 from station.processing.scan_air import air_of_scan
-from station.processing.scan_inputs import ScanInputs, inputs_in_map_frame, position_inputs
+from station.processing.scan_inputs import MEAN_TILT, ScanInputs, inputs_in_map_frame, position_inputs
 from station.processing.scanner_pose import scan_geometry, scanner_to_map, sop_identity_at
 from station.processing.scans.open_scans import OpenScan
 from station.processing.scans.registration import registered_covariance
@@ -81,7 +81,8 @@ def _inputs_of_positions(site: Site, scan: OpenScan, each: list[ScanInputs]) -> 
         f"{position.name}: {warning}"
         for position, inputs in zip(scan.positions, each, strict=True)
         for warning in inputs.warnings
-        if not warning.startswith("weather")
+        if not warning.startswith("weather")  # that of all of them follows
+        if site.inclination is not None or not warning.endswith(MEAN_TILT)  # their tilt is not adjusted
     ]
     air, weather_known = air_of_scan(
         site, scan.start + (scan.end - scan.start) / 2, transform.position_m[2], warnings
