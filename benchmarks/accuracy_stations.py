@@ -14,7 +14,7 @@ from typing import Any
 
 from benchmarks.accuracy_rows import Row
 from station.config import Site, read_site
-from station.inbox.inbox import ScanFile
+from station.inbox.listing import ScanFile
 from station.processing import reference_tasks, scan_tasks, store_tasks
 from station.simulation.scenario import ROUGH, Scenario, full_resolution, named
 from station.simulation.station import simulate

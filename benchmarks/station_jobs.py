@@ -27,11 +27,11 @@ from station.archive import geometry_cache
 from station.config import Site, read_site
 from station.errors import StoreError
 from station.inbox.journal_reader import JournalReader, State
-from station.inbox.scan_files import scan_file
 from station.processing import scan_tasks
 from station.processing.pipeline import Pose
 from station.processing.reference_tasks import build_reference_version
-from station.processing.scan_inputs import load_scan_inputs
+from station.processing.scans.epoch_inputs import load_scan_inputs
+from station.processing.scans.scan_files import scan_file
 from station.processing.workers.fork_server import PRELOAD
 from station.quantities import Shots
 from station.readers.las import LasScan

@@ -49,6 +49,8 @@ LOG_KEYS = {
     "stable_z_std": "standard deviation of standardised residuals on hold-out stable ground; 1 is calibrated",
     "roll_deg": "mean roll of the scanner [°]",
     "pitch_deg": "mean pitch of the scanner [°]",
+    "registration_deg": "rotation between the registration of the owner and the adjustment [°]",
+    "registration_m": "distance between the positions by the registration and by the adjustment [m]",
     "seconds": "processing time [s]",
     "reference": "version of the reference surface, or what happened to it (waiting, failed)",
     "retry_s": "seconds until the next attempt",

@@ -89,6 +89,8 @@ class Site(SiteFile):
         )
         if self.scans.convert or self.scans.columns:  # without them, the hash is that of earlier versions
             settings["scans"] |= self.scans.model_dump(mode="json", include={"columns", "convert"})
+        if self.registration:
+            settings["registration"] = self.registration.model_dump(mode="json", exclude={"suffix", "wait_s"})
         if self.map.pop:
             settings["pop"] = _sha256(self.map.pop)
         if isinstance(self.adjustment.stable, Path):
@@ -106,6 +108,8 @@ class Site(SiteFile):
                 "scans": {"frame", "name", "zone", "columns", "convert", "point_time", "intensity"}
                 | {"timeout_s"},
                 "service": {"memory_gb"},
+                "epoch": {"name"},
+                "registration": True,
                 **dict.fromkeys(
                     ("scanner", "sop", "map", "grid", "inclination", "weather", "air", "adjustment",
                      "uncertainty", "reference"),

@@ -1,4 +1,7 @@
-"""Names of scan files: the stem that scan, log and epoch share, and the start that the name states."""
+"""Names of scan files: the stem that scan, log and epoch share, and the start that the name states.
+
+Scans may lie in folders below the inbox: their names then have as many `/` as the pattern of their names.
+"""
 
 from __future__ import annotations
 
@@ -14,6 +17,8 @@ INNER_SUFFIXES = (".copc",)  # `x.copc.laz` is the scan `x`
 FIELD_DIGITS = {"Y": 4, "m": 2, "d": 2, "H": 2, "I": 2, "M": 2, "S": 2, "y": 2, "j": 3}
 ANY = "*"
 ZONE_MARK = "@"  # separates the pattern from its time zone
+SEPARATOR = "/"  # of folders
+HOURS, MINUTES = ("%H", "%I", "%T", "%X", "%c", "%s", "%f"), ("%M", "%T", "%X", "%c", "%s", "%f")
 
 
 def scan_stem(name: str | PurePath) -> str:
@@ -26,15 +31,39 @@ def scan_stem(name: str | PurePath) -> str:
     return stem[: -len(inner)] if inner.lower() in INNER_SUFFIXES else stem
 
 
+def scan_id(name: str) -> str:
+    """Return the name of a scan with its folders below the inbox, without suffixes."""
+    folder, separator, _ = name.rpartition(SEPARATOR)
+    return f"{folder}{separator}{scan_stem(name)}"
+
+
+def folder_depth(pattern: str) -> int:
+    """Return how many folders below the inbox the scans lie, by the pattern of their names."""
+    return pattern.partition(ZONE_MARK)[0].count(SEPARATOR)
+
+
+def name_below(path: PurePath, pattern: str) -> str:
+    """Return the name of a scan with as many of its folders as the pattern has."""
+    return SEPARATOR.join(path.parts[-1 - folder_depth(pattern) :])
+
+
+def resolution_s(pattern: str) -> float:
+    """Return how exactly names by this pattern state the start of a scan [s]: 60, an hour, or a day."""
+    pattern = pattern.partition(ZONE_MARK)[0]
+    if any(field in pattern for field in MINUTES):
+        return 60.0
+    return 3600.0 if any(field in pattern for field in HOURS) else 86_400.0
+
+
 @lru_cache(maxsize=1 << 16)
 def start_in_name(name: str, pattern: str) -> datetime | None:
     """Return the start of a scan (UTC) that its name states; None if it does not match the pattern.
 
-    The pattern is one of strptime, in which `*` stands for any characters. `@` and the name of a time zone
-    may follow; of an hour that occurs twice, the first is meant.
+    The pattern is one of strptime, in which `*` stands for any characters of one name, also of the folders
+    before a `/`. `@` and the name of a time zone may follow; of an hour that occurs twice, the first counts.
     """
     pattern, _, zone = pattern.partition(ZONE_MARK)
-    stem = scan_stem(name)
+    stem = scan_id(name_below(PurePath(name), pattern))
     if ANY in pattern:
         match = _expression(pattern).fullmatch(stem)
         if match is None:
@@ -56,11 +85,18 @@ def _expression(pattern: str) -> re.Pattern[str]:
     for part in pattern.split(ANY):
         fields = re.findall(r"%.|[^%]+", part)
         parts.append("(" + "".join(_field_expression(field) for field in fields) + ")")
-    return re.compile(".*".join(parts))
+    return re.compile("[^/]*".join(parts))
 
 
 def _field_expression(field: str) -> str:
     if not field.startswith("%"):
         return re.escape(field)
     digits = FIELD_DIGITS.get(field[1])
-    return rf"\d{{{digits}}}" if digits else "%" if field == "%%" else ".+"
+    return rf"\d{{{digits}}}" if digits else "%" if field == "%%" else "[^/]+"
+
+
+@lru_cache(maxsize=1 << 16)
+def epoch_name(start: datetime, pattern: str) -> str:
+    """Return the name of the epoch to which a scan belongs: its start, in the zone of the pattern."""
+    pattern, _, zone = pattern.partition(ZONE_MARK)
+    return start.astimezone(ZoneInfo(zone) if zone else UTC).strftime(pattern)

@@ -49,13 +49,28 @@ def require_projected(crs: str) -> str:
 
 def require_time_pattern(pattern: str) -> str:
     """Return a pattern of scan names; raise ValueError unless times survive being written and read by it."""
+    if any(folder in {"", ".", ".."} for folder in pattern.split("/")):
+        raise ValueError("folders are those below the inbox, as in %Y-%m-%d/*")
     time = datetime(2025, 7, 15, 13, 14, 15, tzinfo=UTC)
     try:
         datetime.strptime(time.strftime(pattern), pattern)  # noqa: DTZ007 - the pattern may contain a zone
         if start_in_name(time.strftime(pattern), pattern) is None:
             raise ValueError("a name written by it does not match it")  # noqa: TRY301 - as those of strptime
     except (ValueError, re.error, OverflowError) as error:
-        raise ValueError(f"not a pattern of times, such as %y%m%d_%H%M%S: {error}") from error
+        reason = str(error)
+        if "redefinition" in reason:
+            reason = "a field of the time stands twice: put * for one of them, as in */%y%m%d_%H%M%S"
+        raise ValueError(f"not a pattern of times, such as %y%m%d_%H%M%S: {reason}") from error
+    return pattern
+
+
+def require_epoch_name(pattern: str) -> str:
+    """Return a pattern of epoch names; raise ValueError unless it writes plain names that state a date."""
+    if not re.fullmatch(r"[A-Za-z0-9%_-]+", pattern):
+        raise ValueError("an epoch's name has letters, digits, _ and - only, as %Y-%m-%d or %Y%m%d_%H")
+    start = start_in_name(datetime(2025, 7, 15, tzinfo=UTC).strftime(require_time_pattern(pattern)), pattern)
+    if start is None or start.year != 2025:
+        raise ValueError("an epoch's name must state the year, as %Y-%m-%d or %Y%m%d_%H")
     return pattern
 
 

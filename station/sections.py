@@ -23,6 +23,7 @@ from station.section_types import (
     Utc,
     Zone,
     on_loopback,
+    require_epoch_name,
     require_projected,
     require_suffix,
     require_time_pattern,
@@ -103,6 +104,25 @@ class ScansSection(Section):
         return self
 
 
+class EpochSection(Section):
+    """Several files that are one epoch: tiles of a scan, or scans from several positions."""
+
+    name: Annotated[str, AfterValidator(require_epoch_name)]
+    files: Annotated[int, Field(ge=1, le=1000)] | None = None
+    wait_s: NotNegative = 3600.0
+
+
+class RegistrationSection(Section):
+    """The owner's registration of each scan: a matrix beside it, or already applied to points on the map."""
+
+    suffix: Annotated[str, Field(pattern=r"^[^/]{2,}$")] | None = None
+    into: Literal["project", "scanner"] = "project"
+    use: Literal["start", "given"] = "start"
+    sigma_m: Positive
+    sigma_deg: Positive
+    wait_s: NotNegative = 900.0
+
+
 class ScannerSection(Section):
     """The instrument: a known model; each of its values can be overridden."""
 
@@ -158,6 +178,7 @@ class SopSection(Section):
     from_: Annotated[Utc, Field(alias="from")]
     file: Path
     scan: str | None = None
+    files: str | None = None
 
 
 class Origin(Section):
@@ -405,6 +426,8 @@ class SiteFile(Section):
     station: StationSection
     metadata: MetadataSection = MetadataSection()
     scans: ScansSection
+    epoch: EpochSection | None = None
+    registration: RegistrationSection | None = None
     scanner: ScannerSection = ScannerSection.model_validate({})
     sop: tuple[SopSection, ...] = ()
     map: MapSection = MapSection()
@@ -427,9 +450,18 @@ class SiteFile(Section):
     def _chain_is_complete(self) -> SiteFile:
         if self.scans.frame == "scanner" and not self.sop:
             raise ValueError('scans.frame = "scanner" needs an [[sop]] to transform the points to the map')
-        starts = [sop.from_ for sop in self.sop]
+        starts = [(sop.from_, sop.files) for sop in self.sop]
         if len(set(starts)) < len(starts):
             raise ValueError("two [[sop]] have the same from: which of them is valid then?")
+        if any(sop.files for sop in self.sop) and self.epoch is None:
+            raise ValueError("sop.files, for several scan positions, needs [epoch]")
+        if self.registration and (self.registration.suffix is None) != (self.scans.frame == "map"):
+            raise ValueError(
+                'registration.suffix names the matrices beside scans: needed with scans.frame = "scanner",'
+                ' and none with "map"'
+            )
+        if self.registration and self.scans.frame == "map" and self.map.origin is None:
+            raise ValueError("registration needs map.origin, from which its rotation and our own are counted")
         if self.map.crs is None and (self.map.pop or self.map.origin):
             raise ValueError("map.pop and map.origin need map.crs, the map they refer to")
         if self.map.pop and self.map.origin and self.scans.frame == "scanner":
@@ -437,3 +469,10 @@ class SiteFile(Section):
         if self.alarms and self.alarms.change and not self.areas:
             raise ValueError("alarms.change needs areas: give their file in [areas]")
         return self
+
+    @property
+    def row_pattern(self) -> str:
+        """The pattern of the names of scans in the journal: of epochs, if several files are one."""
+        if self.epoch is None:
+            return self.scans.pattern
+        return f"{self.epoch.name}{ZONE_MARK}{self.scans.zone}"

@@ -1,11 +1,20 @@
 """Stems of scan files, and starts in their names."""
 
 from datetime import UTC, datetime
+from pathlib import Path
 
 import pytest
 from pydantic import ValidationError
 
-from station.scan_names import scan_stem, start_in_name
+from station.scan_names import (
+    epoch_name,
+    folder_depth,
+    name_below,
+    resolution_s,
+    scan_id,
+    scan_stem,
+    start_in_name,
+)
 from station.sections import ScansSection
 
 START = datetime(2025, 7, 15, 9, 0, 5, tzinfo=UTC)
@@ -38,6 +47,9 @@ def test_stem_is_the_name_without_all_suffixes(name, stem):
         ("a+15Jul25_090005.laz", "*+%d%b%y_%H%M%S"),
         ("250715_110005.laz", "%y%m%d_%H%M%S@Europe/Vienna"),
         ("250715_110005+0200.laz", "%y%m%d_%H%M%S%z@America/New_York"),
+        ("/srv/hut/2025-07-15/250715_090005.laz", "*/%y%m%d_%H%M%S"),
+        ("2025/07/15/090005.laz", "%Y/%m/%d/%H%M%S"),
+        ("ScanPos001.SCNPOS/scans/250715_090005.rxp", "ScanPos*.SCNPOS/scans/%y%m%d_%H%M%S"),
     ],
 )
 def test_start_is_found_by_patterns_with_wildcards_and_zones(name, pattern):
@@ -69,3 +81,29 @@ def test_patterns_and_zones_of_the_site_file_are_checked(tmp_path):
         ScansSection(inbox=tmp_path, convert=("pdal", "{in}", "{out}"))
     with pytest.raises(ValidationError, match=r"lacks \{out\}"):
         ScansSection(inbox=tmp_path, suffix=".rxp", convert=("pdal", "{in}"))
+
+
+def test_a_wildcard_does_not_reach_beyond_a_folder():
+    assert start_in_name("a/b/250715_090005.laz", "*/%y%m%d_%H%M%S") == START  # the innermost folder
+    assert start_in_name("2025-07-15/b/a.laz", "%Y-%m-%d*/*") is None
+
+
+@pytest.mark.parametrize(
+    ("pattern", "seconds"),
+    [("%y%m%d_%H%M%S", 60), ("%y%m%d_%H*", 3600), ("%Y-%m-%d/*@Europe/Vienna", 86_400)],
+)
+def test_resolution_is_that_of_the_finest_field(pattern, seconds):
+    assert resolution_s(pattern) == seconds
+
+
+def test_names_with_folders_are_unique_without_suffixes():
+    assert scan_id("2025-07-15/ScanPos001.laz.gz") == "2025-07-15/ScanPos001"
+    assert scan_id("250715_090000.copc.laz") == "250715_090000"
+    assert folder_depth("%Y-%m-%d/*@Europe/Vienna") == 1
+    assert name_below(Path("/srv/hut/2025-07-15/a.laz"), "%Y-%m-%d/*") == "2025-07-15/a.laz"
+
+
+def test_epochs_are_those_of_the_zone():
+    late = datetime(2025, 7, 14, 22, 30, tzinfo=UTC)
+    assert epoch_name(late, "%Y-%m-%d@Europe/Vienna") == "2025-07-15"
+    assert epoch_name(late, "%Y-%m-%d@UTC") == "2025-07-14"

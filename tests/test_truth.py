@@ -10,7 +10,7 @@ import xarray as xr
 from support.series import open_with_processing
 
 from station.config import read_site
-from station.inbox.inbox import ScanFile
+from station.inbox.listing import ScanFile
 from station.monitoring.log_clock import log_clock_offset
 from station.processing import reference_tasks, scan_tasks, store_tasks
 from station.products.area_tables import Span

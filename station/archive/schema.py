@@ -244,6 +244,20 @@ VARIABLES: tuple[Variable, ...] = (
     Variable(
         "log_clock_offset_uncertainty", ("time",), "f8", "one standard deviation of log_clock_offset", "s"
     ),
+    Variable(
+        "registration_rotation",
+        ("time",),
+        "f8",
+        "angle of rotation between the registration of the scan by the owner and the adjustment",
+        "degree",
+    ),
+    Variable(
+        "registration_translation",
+        ("time",),
+        "f8",
+        "distance between the scanner's positions by the registration of the owner and the adjustment",
+        "m",
+    ),
     Variable("air_temperature", ("time",), "f8", "air temperature at the scanner", "degC", "air_temperature"),
     Variable("air_pressure", ("time",), "f8", "air pressure at the scanner", "hPa", "air_pressure"),
     Variable(
@@ -348,6 +362,7 @@ VARIABLES: tuple[Variable, ...] = (
     Variable("scanner_axis_north", ("time",), "f8", "north component of the axis of the scan head", "1"),
     Variable("scan_sha256", TEXT, "S1", "SHA-256 of the scan file"),
     Variable("log_sha256", TEXT, "S1", "SHA-256 of the inclination log"),
+    Variable("registration_sha256", TEXT, "S1", "SHA-256 of the registration of the scan by the owner"),
     Variable("adjustment", TEXT, "S1", "method of the pose estimate: joint, or none (filtered log only)"),
     Variable("sop_id", TEXT, "S1", "scanner orientation and position used"),
     Variable(

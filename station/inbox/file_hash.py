@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import os
 import stat
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -15,11 +15,11 @@ SAMPLE_BYTES = 4096
 
 
 @contextmanager
-def hash_if_unchanged(path: Path) -> Iterator[str]:
-    """Yield the SHA-256 of a regular file; raise NotReadyError on exit if the file changed meanwhile."""
-    identity = file_identity(path)
-    yield sha256_file(path)
-    if file_identity(path) != identity:
+def hash_if_unchanged(paths: Sequence[Path]) -> Iterator[str]:
+    """Yield the SHA-256 of regular files; raise NotReadyError on exit if one changed meanwhile."""
+    identities = [file_identity(path) for path in paths]
+    yield sha256_files(paths)
+    if [file_identity(path) for path in paths] != identities:
         raise NotReadyError("the file changed while it was read")
 
 
@@ -62,3 +62,27 @@ def sha256_file(path: Path) -> str:
             return hashlib.file_digest(file, "sha256").hexdigest()
     except OSError as error:
         raise NotReadyError(f"{path.name} cannot be read: {error.strerror}") from error
+
+
+def sha256_files(paths: Sequence[Path]) -> str:
+    """Return the SHA-256 of a file, or one of the contents of several, whatever their names.
+
+    Files with the same bytes count once. '' without any file; raises as `sha256_file`.
+    """
+    contents = sorted({sha256_file(path) for path in paths})
+    if len(contents) > 1:
+        return hashlib.sha256("\n".join(contents).encode()).hexdigest()
+    return "".join(contents)
+
+
+def distinct_files(paths: Sequence[Path]) -> list[Path]:
+    """Return the files without those that have the same bytes as one before; raises as `sha256_file`."""
+    sizes = [file_identity(path)[1] for path in paths]
+    contents: set[str] = set()
+    kept = []
+    for path, size in zip(paths, sizes, strict=True):
+        content = sha256_file(path) if sizes.count(size) > 1 else str(path)
+        if content not in contents:
+            kept.append(path)
+        contents.add(content)
+    return kept

@@ -352,7 +352,7 @@ class Journal(JournalReader):
 
     def _write_reason(self, name: str, reason: str) -> None:
         try:
-            self._reasons_folder.mkdir(exist_ok=True)
+            self._reason_file(name).parent.mkdir(parents=True, exist_ok=True)
             self._reason_file(name).write_text(f"{name}: {reason}\n", encoding="utf-8")
         except OSError as error:
             raise StoreError(

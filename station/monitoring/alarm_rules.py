@@ -15,8 +15,8 @@ import numpy as np
 
 from station.config import Site
 from station.errors import StationError, StoreError
-from station.inbox.inbox import is_scan, list_folder, safe_name
 from station.inbox.journal_reader import Entry, JournalReader, State
+from station.inbox.listing import ScanListing
 from station.inbox.lock import is_locked
 from station.logs import logfmt
 from station.monitoring.alarm_state import Alarm
@@ -106,9 +106,10 @@ def _stalled(site: Site, rules: AlarmsSection, now_s: float) -> Iterator[Alarm]:
         waiting = [entry for entry in journal.waiting() if entry.state is State.WAITING]
         journaled = journal.summaries()
     stuck = sum(entry.first_seen_utc_s < from_s and not entry.waiting_reason for entry in waiting)
-    suffixes = scan_suffixes(site.scans)
-    for name, file in list_folder(site.scans.inbox).items():  # ctime is the arrival: mtime may be older
-        stuck += is_scan(name, suffixes) and safe_name(name) not in journaled and file.st_ctime < from_s
+    listing = ScanListing(site, site.scans.inbox, scan_suffixes(site.scans))
+    for name, files in listing.scans.items():  # ctime is the arrival: mtime may be older
+        arrived_s = min(listing.files[file].st_ctime for file in files)
+        stuck += name not in journaled and arrived_s < from_s
     if stuck:
         text = f"{stuck} scans wait, but none was processed for {rules.stalled_h:g} h: the service stalls"
         yield Alarm("stalled", text)

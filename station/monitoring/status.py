@@ -8,8 +8,8 @@ import time
 from typing import TYPE_CHECKING, Any
 
 from station.errors import NotReadyError, StationError, StoreError
-from station.inbox.inbox import is_scan, list_folder, safe_name
 from station.inbox.journal_reader import Entry, JournalReader, State
+from station.inbox.listing import ScanListing, safe_name
 from station.inbox.lock import is_locked, pause_reason
 from station.monitoring.alarm_state import active
 from station.monitoring.preconditions import clock_problem, format_utc, require_disk_space
@@ -73,8 +73,8 @@ def _queue_status(site: Site, journal: JournalReader, entries: list[Entry]) -> S
     ]
     inbox_problem = ""
     try:
-        known = scan_suffixes(site.scans)
-        names = {safe_name(name) for name in list_folder(site.scans.inbox) if is_scan(name, known)}
+        listing = ScanListing(site, site.scans.inbox, scan_suffixes(site.scans))
+        names = {*listing.scans, *(safe_name(name) for name in listing.rejected)}
     except NotReadyError as error:
         names, inbox_problem = set(), str(error)
     running = is_locked(site.station.data)

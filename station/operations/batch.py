@@ -10,7 +10,7 @@ from station.errors import NotReadyError, ScanError
 from station.inbox.journal import Journal
 from station.inbox.journal_reader import Entry, State
 from station.inbox.lock import exclusive_lock
-from station.inbox.scan_files import scan_file
+from station.processing.scans.scan_files import scan_of_files
 from station.service.worker import Worker
 
 Report = Callable[[Entry], None]
@@ -24,7 +24,7 @@ def process_scans(site: Site, scans: Sequence[Path], report: Report) -> int:
     site.station.data.mkdir(parents=True, exist_ok=True)
     with exclusive_lock(site.station.data), Journal(site.station.data / "journal.sqlite") as journal:
         worker = Worker(site, journal)
-        files = {path.name: scan_file(site, path) for path in sorted(scans, key=lambda path: path.name)}
+        files = {scan.name: scan for scan in scan_of_files(site, scans)}
         journal.record_seen((scan.name, scan.size, scan.mtime_ns, "") for scan in files.values())
         todo = list(files)
         while todo:

@@ -14,13 +14,13 @@ import numpy as np
 from station.archive.atomic_files import atomic_write
 from station.config import Site
 from station.errors import ScanError, StoreError
-from station.inbox.inbox import is_scan
+from station.processing.scans.scan_files import inbox_scans
 from station.processing.site_files import series_for
 from station.processing.workers import isolation
 from station.quantities import Floats
 from station.queries.box_series import box_statistics
 from station.queries.stable_ground import validate_sigma
-from station.readers.formats.conversion import open_site_scan, scan_suffixes
+from station.readers.formats.conversion import open_site_scan
 from station.science.analysis.precision import (
     AnglePrecision,
     RangeModel,
@@ -80,10 +80,9 @@ def sigma_report(site: Site, max_epochs: int, progress: Progress) -> Calibration
 
 
 def _newest_scans(site: Site) -> list[Path]:
-    inbox = site.scans.inbox
-    known = scan_suffixes(site.scans)
-    scans = sorted(path for path in inbox.iterdir() if is_scan(path.name, known)) if inbox.is_dir() else []
-    return scans[-COMPARED_SCANS:]
+    """Return the first files of the newest scans in the inbox."""
+    scans = inbox_scans(site) if site.scans.inbox.is_dir() else []
+    return [scan.path for scan in scans[-COMPARED_SCANS:]]
 
 
 def precision_report(site: Site, scans: Sequence[Path], progress: Progress) -> CalibrationReport:

@@ -9,20 +9,22 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from station.config import Site
-from station.inbox.inbox import is_scan
+from station.inbox.listing import is_scan
 from station.operations.site_plausibility import LevelAndMessage
 from station.readers.formats.conversion import scan_suffixes
 from station.readers.scan import TEXT_SUFFIXES, suffixes
-from station.scan_names import scan_stem, start_in_name
+from station.scan_names import folder_depth, resolution_s, scan_stem, start_in_name
 
 MAX_FILES = 20_000  # that are looked at
 MAX_DEPTH = 4  # folders below the inbox
+HOUR_S = 3600.0
 MANUAL = "docs/how-to/your-own-files.md"
 # Usual patterns of names; those with a `*` match more and come last.
 PATTERNS = (
     "%y%m%d_%H%M%S", "%Y%m%d_%H%M%S", "%Y%m%dT%H%M%SZ", "%Y%m%d%H%M%S", "%Y-%m-%d_%H-%M-%S",
     "%Y-%m-%dT%H-%M-%S", "%Y_%m_%d_%H_%M_%S", "%Y%m%d_%H%M", "%Y-%m-%d_%H-%M",
 )  # fmt: skip
+FOLDER_PATTERNS = ("%Y-%m-%d", "%Y%m%d", "%Y_%m_%d", "%y%m%d")
 CONVERTED = {
     ".rxp": 'suffix = ".rxp" and convert = ["pdal", "translate", "{in}", "{out}", …]',
     ".zfs": 'suffix = ".zfs" and convert = [COMMAND, "{in}", "{out}"]',
@@ -36,16 +38,20 @@ def inbox_findings(site: Site) -> Iterator[LevelAndMessage]:
     """Yield what of the inbox is not read, and the lines that would let it in."""
     files = list(files_below(site.scans.inbox))
     known = scan_suffixes(site.scans)
-    scans = [path for path in files if is_scan(path.name, known) and path.parent == site.scans.inbox]
+    depth, scans, others = folder_depth(site.scans.pattern), list[str](), list[str]()
+    for path in files:
+        name = path.relative_to(site.scans.inbox).as_posix()
+        if is_scan(path.name, known):
+            (scans if name.count("/") == depth else others).append(name)
     yield from _other_formats(
         site, [path for path in files if not is_scan(path.name, known)], has_scans=bool(scans)
     )
-    deeper = [path for path in files if is_scan(path.name, known) and path.parent != site.scans.inbox]
-    if deeper:
-        example = deeper[0].relative_to(site.scans.inbox)
-        message = f"{len(deeper)} scans lie in folders below it, such as {example}: only the inbox itself is"
-        yield "warning", f"{message} watched; move or hard-link them, see {MANUAL}"
-    yield from _names(site, scans or deeper)
+    if others:
+        where = "in folders of scans.name only" if depth else "in the inbox itself, not below it"
+        message = f"{len(others)} scans, such as {others[0]}, are not read: they are looked for {where}"
+        pattern = _fitting_pattern(others)
+        yield "warning", f'{message}: name = "{pattern}" would, see {MANUAL}' if pattern else message
+    yield from _names(site, scans)
     if site.scans.convert is not None and shutil.which(site.scans.convert[0]) is None:
         yield "fault", f"scans.convert: {site.scans.convert[0]} is not found, or may not be run"
 
@@ -67,10 +73,9 @@ def files_below(folder: Path) -> Iterator[Path]:
 
 def _other_formats(site: Site, others: list[Path], *, has_scans: bool) -> Iterator[LevelAndMessage]:
     """Yield the files of formats that could be read, by their suffix."""
-    log_suffix = site.inclination.suffix if site.inclination else ""
-    counts = Counter(
-        path.suffix.lower() for path in others if not (log_suffix and path.name.endswith(log_suffix))
-    )
+    sections = (site.inclination, site.registration)
+    beside = tuple(section.suffix for section in sections if section and section.suffix)
+    counts = Counter(path.suffix.lower() for path in others if not path.name.endswith(beside))
     for suffix, count in counts.most_common():
         advice = CONVERTED.get(suffix, "")
         if suffix in suffixes() or (suffix in TEXT_SUFFIXES and not has_scans and count > 1):
@@ -79,16 +84,42 @@ def _other_formats(site: Site, others: list[Path], *, has_scans: bool) -> Iterat
             yield "warning", f"{count} {suffix} files are not read: [scans] {advice}, see {MANUAL}"
 
 
-def _names(site: Site, scans: list[Path]) -> Iterator[LevelAndMessage]:
-    """Yield a warning if names of scans do not match `scans.name`, with a pattern that they match."""
-    names = [path.name for path in scans if start_in_name(path.name, site.scans.pattern) is None]
+def _names(site: Site, scans: list[str]) -> Iterator[LevelAndMessage]:
+    """Yield a warning if names of scans do not match `scans.name`, with a pattern that they match.
+
+    Another one if several files have the same start, but are no epoch.
+    """
+    starts = {name: start_in_name(name, site.scans.pattern) for name in scans}
+    counts = Counter(start for start in starts.values() if start)
+    same = [name for name, start in starts.items() if start and counts[start] > 1][:2]
+    if same and site.epoch is None:
+        epoch = "%Y-%m-%d" if resolution_s(site.scans.pattern) > HOUR_S else "%Y%m%d_%H%M%S"
+        message = f"{' and '.join(same)} have the same start: such files are one epoch"
+        yield "warning", f'{message} with [epoch] name = "{epoch}", see {MANUAL}'
+    names = [name for name, start in starts.items() if start is None]
     if not names:
         return
     message = (
         f'{len(names)} of {len(scans)} names, such as {names[0]}, do not match name = "{site.scans.name}"'
     )
-    candidates = (*PATTERNS, *(f"*{pattern}" for pattern in PATTERNS), *(f"*{p}*" for p in PATTERNS))
-    fitting = (p for p in candidates if all(start_in_name(name, p) is not None for name in names))
-    pattern = next(fitting, None)
+    pattern = _fitting_pattern(names)
     advice = f'name = "{pattern}" would' if pattern else f"the start of {scan_stem(names[0])} must be in it"
     yield "warning", f"{message}: {advice}"
+
+
+def _fitting_pattern(names: list[str]) -> str | None:
+    """Return a pattern that all names match, at the depth of the first one; None if there is none."""
+    depth = names[0].count("/")
+    names = [name for name in names if name.count("/") == depth]
+    files = (*PATTERNS, *(f"*{pattern}" for pattern in PATTERNS), *(f"*{pattern}*" for pattern in PATTERNS))
+    candidates = [
+        *("*/" * depth + pattern for pattern in files),
+        *(
+            "*/" * level + f"{mark}{date}{mark}" + "/*" * (depth - level)
+            for mark in ("", "*")
+            for date in FOLDER_PATTERNS
+            for level in range(depth)
+        ),
+    ]
+    fitting = (p for p in candidates if all(start_in_name(name, p) is not None for name in names))
+    return next(fitting, None)

@@ -17,21 +17,22 @@ from station.archive.reference_files import open_reference
 from station.archive.series.index import list_epochs
 from station.config import Site
 from station.errors import StationError
-from station.inbox.inbox import ScanFile
 from station.inbox.journal_reader import JournalReader
-from station.inbox.scan_files import find_scan
+from station.inbox.listing import ScanFile
 from station.processing.pipeline import grid_scan, new_gridder, stacking_inputs, to_map
 from station.processing.provenance import stored_epochs
-from station.processing.scan_inputs import ScanInputs, load_scan_inputs
+from station.processing.scan_inputs import ScanInputs
 from station.processing.scan_tasks import adjust_scan, load_viewing_geometry
-from station.processing.site_files import open_scan_for, series_for
+from station.processing.scans.epoch_inputs import load_scan_inputs
+from station.processing.scans.open_scans import OpenScan, open_scan_for
+from station.processing.scans.scan_files import find_scan
+from station.processing.site_files import series_for
 from station.processing.usable_inputs import usable_site
 from station.processing.workers import isolation
 from station.processing.workers.worker_process import Progress
 from station.products.area_tables import Span
 from station.quantities import Floats, Floats32, Shots
-from station.readers.scan import ScanReader, utc_interval
-from station.scan_names import scan_stem
+from station.scan_names import scan_id
 
 POINT_FORMAT = 6  # LAS 1.4, with time
 SCALE_M = 0.0001
@@ -56,15 +57,17 @@ def export_points(site: Site, span: Span | None, folder: Path, track: Track = it
     if not chosen:
         raise StationError("no epoch in this span")
     with JournalReader(site.station.data / "journal.sqlite") as journal:
-        names = {scan_stem(entry.name): entry.name for entry in journal.rows()}
+        names = {scan_id(entry.name): entry.name for entry in journal.rows()}
     folder.mkdir(parents=True, exist_ok=True)
     usable = usable_site(site)
     stored = {epoch.ref.epoch_file: epoch for epoch in stored_epochs(series, chosen)}
     for epoch in track(chosen):
-        scan_id = stored[epoch.epoch_file].provenance.scan_id
-        scan = find_scan(site, names.get(scan_id, scan_id), epoch.start.timestamp())
+        stored_id = stored[epoch.epoch_file].provenance.scan_id
+        scan = find_scan(site, names.get(stored_id, stored_id), epoch.start.timestamp())
         if scan is None:
-            raise StationError(f"{epoch.epoch_file}: its scan {scan_id} is neither in the inbox nor archived")
+            raise StationError(
+                f"{epoch.epoch_file}: its scan {stored_id} is neither in the inbox nor archived"
+            )
         path = folder / f"{Path(epoch.epoch_file).stem}.laz"
         isolation.TaskRunner().run(
             write_points,
@@ -83,33 +86,30 @@ def write_points(
     site: Site, scan: ScanFile, epoch: EpochRef, version: str, path: Path, progress: Progress
 ) -> None:
     """Write the points of a scan on the grid; `version` is its reference, '' if it has none."""
-    with open_scan_for(site, scan.path) as reader:
-        start, end, _ = utc_interval(reader, site.scans.pattern)
-        inputs = load_scan_inputs(site, reader, scan.log, start, end, save_tilt_offset=False)
+    with open_scan_for(site, scan) as opened:
+        inputs = load_scan_inputs(site, opened, save_tilt_offset=False)
         cells, method = _cells(epoch)
-        correction_m = _correction(site, reader, inputs, version if method == "joint" else "", progress)
+        correction_m = _correction(site, opened, inputs, version if method == "joint" else "", progress)
         header = _header(site, cells["elevation"])
         with (
             atomic_write(path) as tmp_path,
             tmp_path.open("wb") as file,
             laspy.LasWriter(file, header, do_compress=True, closefd=False) as writer,
         ):
-            for shots in reader.blocks(intensity=site.scans.intensity):
+            for shots in inputs.shots(opened, site.scans.intensity):
                 points_m = to_map(shots, inputs.pose)
                 writer.write_points(_records(site, header, shots, points_m, correction_m, cells))
                 progress()
 
 
-def _correction(
-    site: Site, reader: ScanReader, inputs: ScanInputs, version: str, progress: Progress
-) -> Floats32:
+def _correction(site: Site, scan: OpenScan, inputs: ScanInputs, version: str, progress: Progress) -> Floats32:
     """Return what the adjustment subtracts from heights (ny, nx) [m]; zero without one."""
     reference = open_reference(series_for(site), version) if version else None
     if reference is None:
         return np.zeros(site.grid_cells.shape, np.float32)
     viewing = load_viewing_geometry(site, inputs.geometry, reference)
     gridder = new_gridder(inputs.geometry, viewing)
-    grid_scan(gridder, reader.blocks(intensity=site.scans.intensity), inputs.pose, progress)
+    grid_scan(gridder, inputs.shots(scan, site.scans.intensity), inputs.pose, progress)
     return stacking_inputs(gridder, viewing, adjust_scan(site, gridder, inputs, viewing))[1]
 
 

@@ -23,11 +23,10 @@ from station.archive.reference_files import valid_versions
 from station.archive.tilt_offsets import read_tilt_offset
 from station.config import Site
 from station.errors import NotReadyError, ScanError
-from station.inbox.inbox import ScanFile
 from station.inbox.journal import Journal
 from station.inbox.journal_reader import JournalReader
+from station.inbox.listing import ScanFile
 from station.inbox.lock import exclusive_lock
-from station.inbox.scan_files import find_scan
 from station.monitoring.preconditions import require_disk_space
 from station.processing.integrity import missing_epochs, verify_checksums
 from station.processing.reference_tasks import (
@@ -36,10 +35,12 @@ from station.processing.reference_tasks import (
     scans_for_version,
     update_reference_version,
 )
-from station.processing.scan_inputs import load_scan_inputs
 from station.processing.scan_tasks import Rejected, ScanHistory, StoredResult, load_reference
 from station.processing.scanner_pose import sop_identity
-from station.processing.site_files import open_scan_for, series_for
+from station.processing.scans.epoch_inputs import load_scan_inputs
+from station.processing.scans.open_scans import open_scan_for
+from station.processing.scans.scan_files import ScanFinder
+from station.processing.site_files import series_for
 from station.processing.staleness import Plan, Task, plan_reprocessing, usable_scans
 from station.processing.store_tasks import MAX_STORE_TASK_S
 from station.processing.usable_inputs import usable_site
@@ -47,7 +48,6 @@ from station.processing.workers.dask_executor import DaskExecutor
 from station.processing.workers.executors import Executor, LocalExecutor
 from station.processing.workers.isolation import TaskRunner
 from station.processing.workers.worker_process import Progress as Tick
-from station.readers.scan import utc_interval
 from station.readers.sop import valid_sop
 from station.service.worker import Worker, record_result
 
@@ -184,7 +184,8 @@ class Reprocessing(_Planning):
             self._site, self._worker.run(usable_scans, self._journal.rows()), version_count
         )
         entries = {entry.name: entry for entry in self._journal.rows()}
-        scan_by_name = {name: find_scan(self._site, name, entries[name].start_utc_s) for name in names}
+        finder = ScanFinder(self._site)
+        scan_by_name = {name: finder.find(name, entries[name].start_utc_s) for name in names}
         scans = [scan for scan in scan_by_name.values() if scan is not None]
         if len(scans) < at_least:
             missing = [name for name in names if scan_by_name[name] is None]
@@ -288,9 +289,8 @@ def _history(task: Task) -> ScanHistory:
 def _load_tilt_offset(site: Site, scan: ScanFile, progress: Tick) -> None:
     """Load the inputs of a scan, which saves the tilt offset of its SOP."""
     progress()
-    with open_scan_for(site, scan.path) as reader:
-        start, end, _ = utc_interval(reader, site.scans.pattern)
-        load_scan_inputs(site, reader, scan.log, start, end)
+    with open_scan_for(site, scan) as opened:
+        load_scan_inputs(site, opened)
 
 
 def _import_reference(site: Site, progress: Tick) -> None:

@@ -9,6 +9,7 @@ from station.errors import StationError
 from station.inbox.journal import Journal
 from station.inbox.journal_reader import Entry, State
 from station.inbox.lock import is_locked
+from station.processing.scans.scan_files import ScanFinder
 
 _FINAL = {State.SET_ASIDE, State.LATER}
 
@@ -27,7 +28,8 @@ def retry_scans(site: Site, names: Sequence[str]) -> list[str]:
             if faults:
                 raise StationError("\n".join(faults))
         chosen = names or [name for name, entry in entries.items() if entry.state in _FINAL]
-        queued = [name for name in chosen if (site.scans.inbox / name).is_file()]
+        finder = ScanFinder(site)
+        queued = [name for name in chosen if finder.in_inbox(name)]
         journal.requeue(queued, "station retry")
     if not queued:
         return ["nothing to retry: no scan in the inbox was set aside or failed"]
@@ -42,6 +44,6 @@ def _fault(site: Site, name: str, entry: Entry | None) -> str:
     if entry.state not in _FINAL:
         state = "stored: see station reprocess" if entry.state is State.STORED else "already waiting"
         return f"{name}: is {state}"
-    if not (site.scans.inbox / name).is_file():
+    if not ScanFinder(site).in_inbox(name):
         return f"{name}: is not in the inbox {site.scans.inbox}: copy it there, and it is tried by itself"
     return ""

@@ -15,10 +15,9 @@ import numpy as np
 from station.archive.reference_files import valid_versions
 from station.config import Site, read_site
 from station.errors import NotReadyError, ScanError, StationError
-from station.inbox.inbox import is_scan, start_from_name
 from station.inbox.journal_reader import JournalReader
+from station.inbox.listing import start_from_name
 from station.inbox.lock import is_locked
-from station.inbox.scan_files import scan_file
 from station.monitoring.preconditions import EARLIEST_S
 from station.operations.inbox_contents import inbox_findings
 from station.operations.site_plausibility import (
@@ -35,15 +34,15 @@ from station.processing.integrity import check_store
 from station.processing.scan_air import pressure_fault
 from station.processing.scan_tasks import dry_run
 from station.processing.scanner_pose import map_position, scanner_height_m, scanner_to_map
+from station.processing.scans.scan_files import inbox_scans
 from station.processing.site_files import load_areas, polygon_cells, series_for
 from station.processing.workers import isolation
 from station.readers.flags import read_flags
-from station.readers.formats.conversion import scan_suffixes
 from station.readers.inclination import read_inclination
 from station.readers.polygons import mended_outlines
 from station.readers.sop import valid_sop
 from station.readers.weather import interpolate_air, log_files, read_weather
-from station.scan_names import scan_stem
+from station.scan_names import name_below, scan_stem
 from station.science.analysis.verdict import NO_BRIGHTNESS
 from station.science.geometry import inclination
 
@@ -180,7 +179,9 @@ def _folders(site: Site) -> Iterator[Finding]:
     elif not os.access(inbox, os.R_OK | os.X_OK):
         yield _finding("fault", "inbox", f"{inbox}: no permission to read")
     else:
-        yield _finding("ok", "inbox", f"{inbox}: {len(_scans(site))} scans")
+        files = len(_scans(site))
+        count = f"{len(inbox_scans(site))} epochs of {files} files" if site.epoch else f"{files} scans"
+        yield _finding("ok", "inbox", f"{inbox}: {count}")
     if site.retention.raw != "leave" and not os.access(inbox, os.W_OK):
         message = f"{inbox}: no permission to write, but retention.raw is {site.retention.raw!r}"
         yield _finding("warning", "retention", message)
@@ -243,7 +244,8 @@ def _inclination(site: Site) -> Iterator[Finding]:
     if site.inclination is None or site.inclination.mode == "absolute" or not scans or not site.sop:
         return
     try:
-        sop = valid_sop(site.sop, start_from_name(scans[-1].name, site.scans.pattern))
+        name = name_below(scans[-1], site.scans.pattern)
+        sop = valid_sop(site.sop, start_from_name(name, site.scans.pattern), name)
         rotation = scanner_to_map(site, sop).to_local[:3, :3]
         log_path = scans[-1].with_name(scan_stem(scans[-1]) + site.inclination.suffix)
         log, _ = inclination.clean(read_inclination(log_path), site.instrument.inclination_range_rad)
@@ -267,21 +269,23 @@ def _newest_height_m(site: Site) -> float | None:
 
 
 def _scans(site: Site) -> list[Path]:
-    """Return the scans in the inbox, by name; none if it cannot be read."""
-    known = scan_suffixes(site.scans)
+    """Return the files of scans in the inbox, by name; none if it cannot be read."""
     try:
-        return sorted(path for path in site.scans.inbox.iterdir() if is_scan(path.name, known))
-    except OSError:  # a finding of its own
+        return [path for scan in inbox_scans(site) for path in scan.paths]
+    except NotReadyError:  # a finding of its own
         return []
 
 
 def _newest_scan(site: Site) -> Iterator[Finding]:
     """Measure the newest scan without storing it."""
-    scans = _scans(site)
+    try:
+        scans = inbox_scans(site)
+    except NotReadyError:  # a finding of its own
+        scans = []
     if not scans:
         yield _finding("warning", "scan", "no scan in the inbox to measure")
         return
-    scan = scan_file(site, scans[-1])
+    scan = scans[-1]
     try:
         verdict, reason, metrics = isolation.TaskRunner().run(
             dry_run,

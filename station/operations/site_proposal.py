@@ -12,7 +12,7 @@ from pyproj import CRS
 from pyproj.exceptions import CRSError
 
 from station.errors import ConfigError, StationError
-from station.inbox.inbox import is_scan
+from station.inbox.listing import is_scan
 from station.operations.inbox_contents import PATTERNS, files_below
 from station.operations.riscan_import import import_riscan, matrix_text, site_text, write_new
 from station.processing.workers import isolation

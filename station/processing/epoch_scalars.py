@@ -80,7 +80,12 @@ def log_metrics(epoch: epochs.Epoch, seconds: float) -> dict[str, float | str]:
     for variable in ("stable_nmad", "stable_z_std"):
         if np.isfinite(epoch.scalars.get(variable, np.nan)):
             metrics[variable] = round(epoch.scalars[variable], 3)
-    for variable, name in (("platform_roll", "roll_deg"), ("platform_pitch", "pitch_deg")):
+    for variable, name in (
+        ("platform_roll", "roll_deg"),
+        ("platform_pitch", "pitch_deg"),
+        ("registration_rotation", "registration_deg"),
+        ("registration_translation", "registration_m"),
+    ):
         if variable in epoch.scalars:
             metrics[name] = round(epoch.scalars[variable], 4)
     metrics["seconds"] = round(seconds, 2)

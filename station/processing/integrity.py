@@ -40,8 +40,8 @@ from station.config import Site
 from station.errors import StoreError
 from station.inbox.file_hash import sha256_file
 from station.inbox.journal_reader import Entry, State
-from station.inbox.scan_files import find_scan
 from station.processing.provenance import StoredEpoch, stored_epochs
+from station.processing.scans.scan_files import find_scan
 from station.processing.site_files import series_for
 from station.processing.workers.worker_process import Progress
 from station.readers.formats.conversion import scan_suffixes
@@ -341,7 +341,9 @@ def _journal_entry(site: Site, stored: StoredEpoch) -> Entry:
 
 
 def _scan_filename(site: Site, stored: StoredEpoch) -> str:
-    """Return the file name of the scan of an epoch, which stores only its stem."""
+    """Return the name of the scan of an epoch in the journal; the store has it without suffix."""
+    if site.epoch is not None:
+        return stored.provenance.scan_id
     for suffix in scan_suffixes(site.scans):
         name = stored.provenance.scan_id + suffix
         if find_scan(site, name, stored.provenance.start_s):

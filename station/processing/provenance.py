@@ -22,11 +22,11 @@ from station.archive.series.index import list_epochs
 from station.archive.tilt_offsets import read_tilt_offset
 from station.config import Site
 from station.errors import ConfigError, NotReadyError, ScanError
-from station.inbox.file_hash import sha256_file
-from station.inbox.inbox import ScanFile
+from station.inbox.file_hash import sha256_files
 from station.inbox.journal_reader import Entry
+from station.inbox.listing import ScanFile
 from station.processing.scan_air import air_from_log
-from station.processing.scanner_pose import scanner_height_m, sop_identity
+from station.processing.scanner_pose import scanner_height_m, sop_identity_at
 from station.quantities import Air
 from station.readers.flags import read_flags, reasons_for
 from station.readers.sop import valid_sop
@@ -48,6 +48,7 @@ class ScanProvenance:
     sop_tilt_offset: str
     flag: str
     air: tuple[float, ...]  # () if unknown
+    registration_sha256: str = ""
 
     def to_attrs(self) -> dict[str, str]:
         """Return the fields as text; `from_attrs` reads it."""
@@ -102,6 +103,7 @@ def _stored_epoch(
         sop_tilt_offset=text("sop_tilt_offset"),
         flag=text("flag"),
         air=tuple(air) if is_known else (),
+        registration_sha256=text("registration_sha256"),
     )
     verdict = int(scalars["verdict"][index]) if "verdict" in scalars else 0
     return StoredEpoch(
@@ -115,7 +117,6 @@ class CurrentConfig:
     def __init__(self, site: Site) -> None:
         self._site = site
         self._flags = read_flags(site.flags.file) if site.flags else []
-        self._sop_id = cache(sop_identity)
         self._height_m = cache(lambda sop: scanner_height_m(site, sop))
         self._tilt_offset = cache(lambda sop_id: read_tilt_offset(site, sop_id))
 
@@ -149,22 +150,25 @@ class CurrentConfig:
         changes = self._changed_weather(provenance)
         if scan is None:
             return changes
-        if scan.log is not None and sha256_file(scan.log) != provenance.log_sha256:
+        if scan.logs and sha256_files(scan.logs) != provenance.log_sha256:
             changes.append(
                 "other inclination log" if provenance.log_sha256 else "inclination log arrived later"
             )
+        if scan.matrices and sha256_files(scan.matrices) != provenance.registration_sha256:
+            is_late = not provenance.registration_sha256
+            changes.append("registration arrived later" if is_late else "other registration")
         is_unchanged = entry is not None and (entry.size, entry.mtime_ns) == (scan.size, scan.mtime_ns)
         known_sha256 = entry.sha256 if entry is not None and is_unchanged and entry.sha256 else None
-        if (known_sha256 or sha256_file(scan.path)) != provenance.scan_sha256:
+        if (known_sha256 or sha256_files(scan.paths)) != provenance.scan_sha256:
             changes.append("scan file changed")
         return changes
 
     def _sop_id_at(self, start_s: float) -> str:
         try:
-            sop = valid_sop(self._site.sop, datetime.fromtimestamp(start_s, UTC))
+            sop_id = sop_identity_at(self._site, datetime.fromtimestamp(start_s, UTC))
         except ScanError:
             return ""
-        return roundtrip_text(self._sop_id(sop), "text")
+        return roundtrip_text(sop_id, "text")
 
     def _tilt_offset_changed(self, provenance: ScanProvenance) -> bool:
         tilt_offset = self._tilt_offset(provenance.sop_id)

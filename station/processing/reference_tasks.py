@@ -19,8 +19,8 @@ from station.archive.reference_files import (
 )
 from station.config import Site
 from station.errors import StoreError
-from station.inbox.file_hash import sha256_file
-from station.inbox.inbox import ScanFile
+from station.inbox.file_hash import sha256_files
+from station.inbox.listing import ScanFile
 from station.processing.epoch_scalars import air_key, air_scalars
 from station.processing.pipeline import (
     AdjustmentInputs,
@@ -32,13 +32,14 @@ from station.processing.pipeline import (
     stacking_inputs,
 )
 from station.processing.provenance import ScanProvenance
-from station.processing.scan_inputs import ScanInputs, load_scan_inputs
+from station.processing.scan_inputs import ScanInputs
 from station.processing.scan_tasks import adjust_scan, load_viewing_geometry, stable_cells
-from station.processing.site_files import exclusion_reason, open_scan_for, series_for, sha256_log
+from station.processing.scans.epoch_inputs import load_scan_inputs
+from station.processing.scans.open_scans import open_scan_for
+from station.processing.site_files import exclusion_reason, series_for, sha256_log
 from station.processing.workers.worker_process import Progress
 from station.quantities import Reference, ScanGeometry, VarianceComponents
-from station.readers.scan import utc_interval
-from station.scan_names import scan_stem
+from station.scan_names import scan_id
 from station.science.adjustment.joint import Adjustment
 from station.science.adjustment.variance_components import estimate_variance_components
 from station.science.gridding.gridder import Gridder
@@ -247,12 +248,12 @@ def _add_scan(
 
     Without a surface, add it to the grid in `shared`, which its first scan creates.
     """
-    with open_scan_for(site, scan.path) as reader:
-        start, end, _ = utc_interval(reader, site.scans.pattern)
-        inputs = load_scan_inputs(site, reader, scan.log, start, end)
+    with open_scan_for(site, scan) as opened:
+        start, end = opened.start, opened.end
+        inputs = load_scan_inputs(site, opened)
         viewing = geometry_cache(inputs.geometry)
         gridder = shared[0] if shared else new_gridder(inputs.geometry, viewing)
-        blocks = reader.blocks(intensity=site.scans.intensity)
+        blocks = inputs.shots(opened, site.scans.intensity)
         (add_blocks if viewing is None else grid_scan)(gridder, blocks, inputs.pose, progress)
     adjustment = adjust_scan(site, gridder, inputs, viewing)
     if viewing is None:
@@ -261,14 +262,15 @@ def _add_scan(
         stack.add(gridder, stacking_inputs(gridder, viewing, adjustment), viewing.reference.roughness_m2)
     progress()
     provenance = ScanProvenance(
-        scan_id=scan_stem(scan.path),
+        scan_id=scan_id(scan.name),
         start_s=start.timestamp(),
         end_s=end.timestamp(),
-        scan_sha256=sha256_file(scan.path),
+        scan_sha256=sha256_files(scan.paths),
         log_sha256=sha256_log(scan),
         sop_id=roundtrip_text(inputs.provenance.get("sop_id", ""), "text"),
         sop_tilt_offset=inputs.provenance.get("sop_tilt_offset", ""),
         flag=exclusion_reason(site, start.timestamp(), end.timestamp()),
         air=air_key(air_scalars(inputs)),
+        registration_sha256=sha256_files(scan.matrices),
     )
     return _StackedScan(inputs, adjustment, provenance)

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Callable
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
-from datetime import datetime
+from fnmatch import fnmatchcase
 from functools import partial
 from pathlib import Path
 
@@ -15,23 +15,36 @@ import numpy as np
 from station.archive.tilt_offsets import read_tilt_offset, stored_tilt_offsets, write_tilt_offset
 from station.config import Site
 from station.errors import NotReadyError, ScanError
-from station.processing.pipeline import AdjustmentInputs, Pose
+from station.processing.pipeline import AdjustmentInputs, Pose, to_map
 from station.processing.scan_air import air_of_scan
-from station.processing.scanner_pose import map_position, scan_geometry, scanner_to_map, sop_identity
+from station.processing.scanner_pose import (
+    map_position,
+    scan_geometry,
+    scanner_to_map,
+    sop_identity,
+)
+from station.processing.scans.open_scans import OpenScan, PositionScan, open_files
+from station.processing.scans.registration import (
+    CovarianceOf,
+    is_given,
+    registered_covariance,
+    registration,
+)
+from station.processing.scans.scan_files import inbox_scans
 from station.quantities import (
     Air,
     AzimuthTrack,
     Floats,
     InclinationLog,
+    IntensityScale,
     ScanGeometry,
     SharedParameters,
+    Shots,
     VarianceComponents,
 )
-from station.readers.formats.conversion import open_site_scan
 from station.readers.inclination import align_gps_week, read_inclination
 from station.readers.scan import ScanReader
-from station.readers.sop import valid_sop
-from station.scan_names import scan_stem
+from station.scan_names import scan_id, scan_stem
 from station.science.adjustment import prior
 from station.science.geometry import inclination
 from station.science.geometry.air import air_correction
@@ -39,6 +52,7 @@ from station.science.geometry.inclination import NO_CYCLIC_ERROR, CyclicError, T
 from station.science.uncertainty import parameters
 from station.sections import SopSection
 
+MEAN_TILT = "one mean tilt for the whole scan"
 MIN_LOG_COVERAGE = 0.97  # of the scan duration that a complete log covers
 MIN_LOG_ROWS = 20  # a shorter log is not filtered
 MIN_ABSOLUTE_LOG_S = 60.0  # of a scan whose static tilt is known from its log alone
@@ -53,54 +67,63 @@ class ScanInputs:
 
     geometry: ScanGeometry
     pose: Pose
-    log_only_covariance: Callable[[VarianceComponents], SharedParameters] | None
+    log_only_covariance: CovarianceOf | None
     adjustment_inputs: AdjustmentInputs | None
     tilt_record: TiltRecord | None
     air: Air | None
     warnings: tuple[str, ...]
     provenance: dict[str, str]
     faults: tuple[str, ...] = ()  # that make the scan unusable
+    position_poses: tuple[Pose, ...] = ()  # of several positions, whose shots come on the map
+    is_given: bool = False  # by the owner's registration, which is not to be changed
+
+    def shots(self, scan: OpenScan, intensity: IntensityScale) -> Iterator[Shots]:
+        """Yield the shots of a scan, to be placed by `pose`; decoding starts with this call."""
+        if not self.position_poses:
+            return scan.positions[0].reader.blocks(intensity=intensity)
+        return self._shots_on_map(scan, intensity)
+
+    def _shots_on_map(self, scan: OpenScan, intensity: IntensityScale) -> Iterator[Shots]:
+        for position, pose in zip(scan.positions, self.position_poses, strict=True):
+            for shots in position.reader.blocks(intensity=intensity):
+                yield Shots(to_map(shots, pose), shots.time_s, shots.intensity)
 
     def log_only_shared(self, components: VarianceComponents) -> SharedParameters | None:
         """Return the systematic errors of all points without an adjustment, from SOP and log."""
         return self.log_only_covariance(components) if self.log_only_covariance else None
 
 
-def load_scan_inputs(
+def position_inputs(
     site: Site,
-    reader: ScanReader,
-    log_path: Path | None,
-    start: datetime,
-    end: datetime,
+    position: PositionScan,
     *,
-    save_tilt_offset: bool = True,
-    wait_for_weather: bool = False,
-    waiting_before: str = "",
+    save_tilt_offset: bool,
+    wait_for_weather: bool,
+    waiting_before: str,
 ) -> ScanInputs:
-    """Return the inputs of a scan; raise ScanError or ConfigError if it cannot be georeferenced.
-
-    With `save_tilt_offset`, a tilt offset estimated here is saved for later scans. NotReadyError is raised if
-    that offset is to be of an earlier scan, the one in `waiting_before`; and, with `wait_for_weather`, if
-    there is no weather yet.
-    """
-    if site.scans.frame == "map":
-        return _inputs_in_map_frame(site, start.timestamp())
-    sop = valid_sop(site.sop, start)
+    """Return the inputs of what was scanned from one position; raises as `load_scan_inputs`."""
+    reader, start, end, sop = position.reader, position.start, position.end, position.sop
+    assert sop is not None  # noqa: S101 - of a scan in the scanner's frame
     transform, sop_id = scanner_to_map(site, sop), sop_identity(sop)
     warnings: list[str] = []
+    registered = registration(site, position, warnings)
     track = reader.azimuth_track() if site.scans.point_time == "auto" else None
     if track is None and site.scans.point_time == "auto":
         has_time = reader.time_range_s() is not None
         cause = "azimuth does not follow time" if has_time else "no time per point"
-        warnings.append(f"{cause}: one mean tilt for the whole scan")
+        warnings.append(f"{cause}: {MEAN_TILT}")
     rotation = transform.to_local[:3, :3]
-    log = _load_log(site, log_path or _converted_log(site, reader), track, rotation, warnings)
-    faults = _static_tilt_faults(site, log)
-    tilt_offset = read_tilt_offset(site, sop_id)
-    if tilt_offset is None:
+    log_paths = position.logs or _converted_log(site, reader)
+    log = _load_log(site, log_paths, track, rotation, warnings)
+    faults = _static_tilt_faults(site, log) if registered is None else ()
+    if registered is not None:  # it contains the mean tilt of the scan
+        tilt_offset = _own_tilt_offset(site, log, track)
+    else:
+        tilt_offset = read_tilt_offset(site, sop_id)
+    if tilt_offset is None and registered is None:
         tilt_offset = stored_tilt_offsets(site).get(sop_id)
         if tilt_offset is None:
-            tilt_offset = _find_tilt_offset(site, sop, reader, log, track, warnings, waiting_before)
+            tilt_offset = _find_tilt_offset(site, position, log, track, warnings, waiting_before)
         # That of an absolute sensor is zero and need not be saved.
         if save_tilt_offset and tilt_offset is not None and tilt_offset != NO_CYCLIC_ERROR:
             write_tilt_offset(site, sop_id, tilt_offset)
@@ -115,30 +138,33 @@ def load_scan_inputs(
     assumed_rad, line_inclination = np.zeros((3, params.line_groups)), None
     if tilt_record is not None:
         assumed_rad = prior.tilt_rotation(tilt_record.tilt, rotation, lines.time_s)
-        if track is not None:
+        if track is not None and registered is None:
             line_inclination = prior.line_inclination(
                 params, lines, tilt_record, tilt_offset or NO_CYCLIC_ERROR, rotation
             )
+    placed = transform if registered is None else registered
     if site.air is not None:
         setting = site.air.scanner_setting
         assumed_air = air if setting == "weather" else setting.air
         correction = air_correction(
             air, assumed_air if site.air.scanner_corrects else None, site.instrument.wavelength_um
         )
-        transform = transform.with_correction(correction.apply, site.scanner.range_max_m)
-    provenance = {"sop_id": sop_id, "sop_tilt_offset": json.dumps(asdict(tilt_offset)) if tilt_offset else ""}
+        placed = placed.with_correction(correction.apply, site.scanner.range_max_m)
+    sop_offset = tilt_offset if registered is None else None
+    provenance = {"sop_id": sop_id, "sop_tilt_offset": json.dumps(asdict(sop_offset)) if sop_offset else ""}
     tilt = tilt_record.tilt if tilt_record is not None else None
+    covariance = partial(
+        prior.log_only_covariance,
+        params,
+        lines,
+        tilt_record,
+        tilt_offset or NO_CYCLIC_ERROR,
+        weather_known=weather_known,
+    )
     return ScanInputs(
         geometry,
-        Pose(transform, tilt),
-        partial(
-            prior.log_only_covariance,
-            params,
-            lines,
-            tilt_record,
-            tilt_offset or NO_CYCLIC_ERROR,
-            weather_known=weather_known,
-        ),
+        Pose(placed, tilt),
+        covariance if registered is None else registered_covariance(site, covariance),
         AdjustmentInputs(
             params, lines, assumed_rad, line_inclination, start.timestamp(), weather_known=weather_known
         ),
@@ -147,13 +173,22 @@ def load_scan_inputs(
         tuple(warnings),
         provenance,
         faults,
+        is_given=registered is not None and is_given(site),
     )
 
 
-def _inputs_in_map_frame(site: Site, start_s: float) -> ScanInputs:
+def _own_tilt_offset(
+    site: Site, log: InclinationLog | None, track: AzimuthTrack | None
+) -> CyclicError | None:
+    """Return the tilt of the scan itself, None without a log."""
+    return None if log is None else _fit_tilt_offset(log, track, site.instrument.inclination_sigma_rad)
+
+
+def inputs_in_map_frame(site: Site, start_s: float) -> ScanInputs:
     """Return the inputs of a scan that is already on the map."""
     position_m = map_position(site)
-    geometry, log_only_covariance, adjustment_inputs = scan_geometry(site, position_m), None, None
+    geometry, adjustment_inputs = scan_geometry(site, position_m), None
+    log_only_covariance: CovarianceOf | None = None
     if position_m is not None:  # registered elsewhere, with unknown accuracy
         params = parameters.parameter_layout(geometry.grid, position_m)
         lines = prior.line_times(params, np.eye(3), None)
@@ -168,32 +203,46 @@ def _inputs_in_map_frame(site: Site, start_s: float) -> ScanInputs:
             NO_CYCLIC_ERROR,
             weather_known=False,
         )
-    return ScanInputs(geometry, Pose(None, None), log_only_covariance, adjustment_inputs, None, None, (), {})
+        if site.registration is not None:
+            log_only_covariance = registered_covariance(site, log_only_covariance)
+    return ScanInputs(
+        geometry,
+        Pose(None, None),
+        log_only_covariance,
+        adjustment_inputs,
+        None,
+        None,
+        (),
+        {},
+        is_given=is_given(site),
+    )
 
 
-def _converted_log(site: Site, reader: ScanReader) -> Path | None:
-    """Return the inclination log that the command which converted a scan wrote next to it, None without."""
+def _converted_log(site: Site, reader: ScanReader) -> tuple[Path, ...]:
+    """Return the inclination log that the command which converted a scan wrote next to it; () without."""
     if site.scans.convert is None or site.inclination is None:
-        return None
+        return ()
     path = reader.path.with_name(scan_stem(reader.path) + site.inclination.suffix)
-    return path if path.is_file() else None
+    return (path,) if path.is_file() else ()
 
 
 def _load_log(
-    site: Site, path: Path | None, track: AzimuthTrack | None, rotation: Floats, warnings: list[str]
+    site: Site, paths: Sequence[Path], track: AzimuthTrack | None, rotation: Floats, warnings: list[str]
 ) -> InclinationLog | None:
     """Return the cleaned inclination log of a scan, or None; append what is wrong with it to `warnings`.
+
+    Logs of several files are one, in order of their times.
 
     `rotation` (3, 3) of the SOP contains the tilt of the mount, which shows whether the axes are right.
     """
     if site.inclination is None:
         return None
-    if path is None:
+    if not paths:
         if site.inclination.required:
             warnings.append("inclination log missing")
         return None
     try:
-        log = _clean_log(site, read_inclination(path), warnings)
+        log = _clean_log(site, inclination.joined([read_inclination(path) for path in paths]), warnings)
     except ScanError as error:
         warnings.append(f"inclination log unusable: {error}")
         return None
@@ -291,8 +340,7 @@ def _tilt_record(
 
 def _find_tilt_offset(
     site: Site,
-    sop: SopSection,
-    reader: ScanReader,
+    position: PositionScan,
     log: InclinationLog | None,
     track: AzimuthTrack | None,
     warnings: list[str],
@@ -303,7 +351,8 @@ def _find_tilt_offset(
     Without `sop.scan`, that is the scan at hand, the first one under the SOP. Raises NotReadyError if an
     earlier one, `waiting_before`, is still to be processed.
     """
-    if site.inclination is None:
+    sop = position.sop
+    if site.inclination is None or sop is None:
         return None
     if site.inclination.mode == "absolute":
         return NO_CYCLIC_ERROR
@@ -311,27 +360,38 @@ def _find_tilt_offset(
         raise NotReadyError(
             f"waits for {waiting_before}: the first scan under an SOP defines its tilt offset"
         )
-    if sop.scan is not None and sop.scan != scan_stem(reader.path):
-        log, track = _load_earlier_log(site, sop.scan)
-        if log is None:
-            warnings.append(f"log of {sop.scan}, the scan of the SOP, not found: tilt not corrected")
+    if sop.scan is not None and sop.scan not in {position.scan, scan_stem(position.scan)}:
+        try:
+            log, track = _load_earlier_log(site, sop)
+            problem = "not found" if log is None else ""
+        except ScanError as error:
+            log, track, problem = None, None, f"not usable: {error}"
+        if problem:
+            warnings.append(f"log of {sop.scan}, the scan of the SOP, {problem}: tilt not corrected")
     if log is None:
         return None
     return _fit_tilt_offset(log, track, site.instrument.inclination_sigma_rad)
 
 
-def _load_earlier_log(site: Site, stem: str) -> tuple[InclinationLog | None, AzimuthTrack | None]:
-    """Return log and azimuth track of an earlier scan in the inbox, (None, None) if they are missing."""
-    assert site.inclination is not None  # noqa: S101 - checked by the caller
-    log_path = site.scans.inbox / f"{stem}{site.inclination.suffix}"
-    scans = [path for path in site.scans.inbox.glob(f"{stem}.*") if path != log_path]
-    if not log_path.is_file() or not scans:
+def _load_earlier_log(site: Site, sop: SopSection) -> tuple[InclinationLog | None, AzimuthTrack | None]:
+    """Return log and azimuth track of the scan of an SOP in the inbox, (None, None) if they are missing.
+
+    `sop.scan` is its name without suffix, with or without its folders.
+    """
+    scans = [scan for scan in inbox_scans(site) if sop.scan in {scan_id(scan.name), scan_stem(scan.name)}]
+    files = [
+        file
+        for scan in scans[:1]
+        for file in scan.files
+        if sop.files is None or fnmatchcase(file.name, sop.files)
+    ]
+    logs = list(dict.fromkeys(file.log for file in files if file.log is not None))
+    if not logs:
         return None, None
-    with open_site_scan(
-        scans[0], site.scans, range_max_m=site.scanner.range_max_m, work_folder=site.station.data
-    ) as reader:
+    with open_files(site, files) as reader:
         track = reader.azimuth_track()
-    log, _ = inclination.clean(read_inclination(log_path), site.instrument.inclination_range_rad)
+    log = inclination.joined([read_inclination(path) for path in logs])
+    log, _ = inclination.clean(log, site.instrument.inclination_range_rad)
     if track is not None and len(log.time_s):
         log = align_gps_week(log, float(track.time_s[0]))
     return log, track

@@ -18,9 +18,9 @@ from station.archive.netcdf_layout import Series, roundtrip_text
 from station.archive.reference_files import open_reference, valid_versions, write_reference
 from station.config import Site
 from station.errors import ScanError
-from station.inbox.file_hash import hash_if_unchanged, sha256_file
-from station.inbox.inbox import ScanFile
+from station.inbox.file_hash import hash_if_unchanged, sha256_file, sha256_files
 from station.inbox.journal_reader import JournalReader
+from station.inbox.listing import ScanFile
 from station.processing.epoch_recorder import EpochRecorder
 from station.processing.epoch_scalars import air_key, log_metrics, scalar_variables
 from station.processing.pipeline import (
@@ -36,11 +36,13 @@ from station.processing.pipeline import (
     usual_motion,
     variance_factors,
 )
-from station.processing.scan_inputs import ScanInputs, load_scan_inputs
+from station.processing.scan_inputs import ScanInputs
+from station.processing.scans.epoch_inputs import load_scan_inputs
+from station.processing.scans.open_scans import open_scan_for
+from station.processing.scans.registration import registration_difference
 from station.processing.site_files import (
     exclusion_reason,
     file_version,
-    open_scan_for,
     polygon_cells,
     series_for,
     sha256_log,
@@ -51,8 +53,8 @@ from station.products.overview import Overview
 from station.quantities import Bools, Reference, ScanGeometry, VarianceComponents
 from station.queries.aggregates import LEVERAGE_VARIABLES
 from station.readers.raster import read_geotiff
-from station.readers.scan import reject_future, utc_interval
-from station.scan_names import scan_stem
+from station.readers.scan import reject_future
+from station.scan_names import scan_id
 from station.science.adjustment import ground_classes
 from station.science.adjustment.joint import Adjustment
 from station.science.analysis import inclination_check, verdict
@@ -115,7 +117,7 @@ def process_new(
     site: Site, scan: ScanFile, history: ScanHistory, progress: Progress
 ) -> StoredResult | Duplicate | Rejected:
     """Process a new scan unless its content was already assessed; raises as `process`."""
-    sha256 = sha256_file(scan.path) if history.last_content or history.stored_scans else ""
+    sha256 = sha256_files(scan.paths) if history.last_content or history.stored_scans else ""
     if history.last_content == (sha256, sha256_log(scan)):
         return Duplicate(scan.name, sha256)
     if sha256 in history.stored_scans:
@@ -131,9 +133,9 @@ def reprocess_scan(
     try:
         return process(site, scan, progress, history=history, with_preview=with_preview)
     except ScanError as error:
-        is_file = scan.path.is_file() and not scan.path.is_symlink()
+        are_files = all(path.is_file() and not path.is_symlink() for path in scan.paths)
         return Rejected(
-            str(error), sha256_file(scan.path) if is_file else "", sha256_log(scan) if is_file else ""
+            str(error), sha256_files(scan.paths) if are_files else "", sha256_log(scan) if are_files else ""
         )
 
 
@@ -152,7 +154,7 @@ def process(
     """
     began_s, history = time.monotonic(), history or ScanHistory()
     series = series_for(site)
-    with hash_if_unchanged(scan.path) as scan_sha256:
+    with hash_if_unchanged(scan.paths) as scan_sha256:
         progress()
         reference = load_reference(site, history.reference)
         epoch = _compute_epoch(site, scan, scan_sha256, reference, history, progress)
@@ -195,8 +197,8 @@ def _require_new_start(site: Site, start_utc_s: float) -> None:
 def check_header(site: Site, scan: ScanFile, progress: Progress) -> None:
     """Raise ScanError if the headers of a scan show that it cannot be used."""
     progress()
-    with open_scan_for(site, scan.path) as reader:
-        utc_interval(reader, site.scans.pattern)
+    with open_scan_for(site, scan):
+        return
 
 
 def dry_run(site: Site, scan: ScanFile, progress: Progress) -> tuple[str, str, dict[str, float | str]]:
@@ -217,15 +219,12 @@ def _compute_epoch(
     *,
     is_dry_run: bool = False,
 ) -> epochs.Epoch:
-    with open_scan_for(site, scan.path) as reader:
-        start, end, _ = utc_interval(reader, site.scans.pattern)
+    with open_scan_for(site, scan) as opened:
+        start, end = opened.start, opened.end
         reject_future(start, history.now_s)
         inputs = load_scan_inputs(
             site,
-            reader,
-            scan.log,
-            start,
-            end,
+            opened,
             save_tilt_offset=not is_dry_run,
             wait_for_weather=history.wait_for_weather,
             waiting_before=history.waiting_before,
@@ -233,17 +232,18 @@ def _compute_epoch(
         viewing = load_viewing_geometry(site, inputs.geometry, reference) if reference else None
         progress()
         # Decoding starts here.
-        blocks = reader.blocks(intensity=site.scans.intensity if site.adjusts else "none")
+        blocks = inputs.shots(opened, site.scans.intensity if site.adjusts else "none")
         gridder = new_gridder(inputs.geometry, viewing)
-        point_counts = reader.header.point_count, grid_scan(gridder, blocks, inputs.pose, progress)
+        point_counts = opened.point_count, grid_scan(gridder, blocks, inputs.pose, progress)
     if gridder.is_empty():
         raise ScanError("no point falls on the grid: wrong scans.frame, SOP, CRS or units?")
     progress()
     brightness_known = not site.adjusts or has_brightness(gridder, viewing)
-    adjustment = adjust_scan(site, gridder, inputs, viewing)
+    adjustment = adjust_scan(site, gridder, inputs, viewing, even_if_given=True)
     flag = exclusion_reason(site, start.timestamp(), end.timestamp())
     attempt = adjustment[1] if adjustment else None
-    if adjustment is not None and adjustment[1].rejected_share > UNUSABLE_REJECTED_SHARE:
+    registration, registration_warnings = registration_difference(site, scan, attempt)
+    if adjustment is not None and (inputs.is_given or adjustment[1].rejected_share > UNUSABLE_REJECTED_SHARE):
         adjustment = None
     components = usual_motion(reference, start.timestamp()) if reference else VarianceComponents()
     shared, factors = inputs.log_only_shared(components), UNIT_FACTORS
@@ -268,7 +268,7 @@ def _compute_epoch(
         scalars |= dict(zip(LEVERAGE_VARIABLES, adjustment[1].leverage_m2, strict=True))
     verdict_name, reason = verdict.assess(
         flag,
-        [*inputs.warnings, *log_warnings],
+        [*inputs.warnings, *log_warnings, *registration_warnings],
         measurement,
         viewing,
         attempt,
@@ -281,16 +281,17 @@ def _compute_epoch(
     return epochs.Epoch(
         start_s=start.timestamp(),
         end_s=end.timestamp(),
-        scan_id=scan_stem(scan.path),
+        scan_id=scan_id(scan.name),
         measurement=measurement,
         shared=shared,
         redundancy=adjustment[1].redundancy if adjustment else None,
         verdict=verdict_name,
         verdict_reason=reason,
-        scalars=scalars | clock_scalars,
+        scalars=scalars | clock_scalars | registration,
         provenance={
             "scan_sha256": scan_sha256,
             "log_sha256": sha256_log(scan),
+            "registration_sha256": sha256_files(scan.matrices),
             "flag": flag,
             "science_hash": site.science_hash,
             "reference_version": reference.version if reference else "",
@@ -315,9 +316,19 @@ def load_viewing_geometry(site: Site, geometry: ScanGeometry, reference: Referen
 
 
 def adjust_scan(
-    site: Site, gridder: Gridder, inputs: ScanInputs, viewing: ViewingGeometry | None
+    site: Site,
+    gridder: Gridder,
+    inputs: ScanInputs,
+    viewing: ViewingGeometry | None,
+    *,
+    even_if_given: bool = False,
 ) -> tuple[AdjustmentInputs, Adjustment] | None:
-    """Return the adjustment of a scan to the reference; None if it is disabled or there is no reference."""
+    """Return the adjustment of a scan to the reference; None if it is disabled or there is no reference.
+
+    Also None if its registration is given, unless `even_if_given`.
+    """
+    if inputs.is_given and not even_if_given:
+        return None
     if not site.adjusts or inputs.adjustment_inputs is None or viewing is None:
         return None
     adjustment = adjust_to_reference(gridder, inputs.geometry, inputs.adjustment_inputs, viewing)

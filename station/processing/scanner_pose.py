@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import hashlib
+from datetime import datetime
 from pathlib import Path
 
+import numpy as np
 from pyproj import CRS, Transformer
 
 from station.config import Site
 from station.errors import ConfigError
-from station.quantities import VERTICAL_AXIS, ScanGeometry
-from station.readers.sop import read_matrix
+from station.quantities import VERTICAL_AXIS, Floats, ScanGeometry
+from station.readers.sop import read_matrix, valid_sop
 from station.science.geometry import pose
 from station.sections import Origin, SopSection
 
@@ -39,9 +41,29 @@ def sop_identity(sop: SopSection) -> str:
     return f"{sop.file.stem}-{hashlib.sha256(content).hexdigest()[:8]}"
 
 
-def scanner_to_map(site: Site, sop: SopSection) -> pose.ScannerToMap:
-    """Return the transformation from scanner to map under an SOP; raise ConfigError if there is none."""
-    matrix = read_matrix(sop.file)
+def sop_identity_at(site: Site, time_utc: datetime) -> str:
+    """Return an identifier of the SOPs valid at a time: that of the only one, or of all positions together.
+
+    Raises ScanError if none has begun.
+    """
+    first = valid_sop(site.sop, time_utc)
+    started = [sop for sop in site.sop if sop.from_ <= time_utc]
+    patterns = sorted({sop.files or "" for sop in started})
+    if len(patterns) == 1:
+        return sop_identity(first)
+    valid = [
+        valid_sop([sop for sop in started if (sop.files or "") == files], time_utc) for files in patterns
+    ]
+    text = "\n".join(f"{sop.files} {sop_identity(sop)}" for sop in valid)
+    return f"positions-{hashlib.sha256(text.encode()).hexdigest()[:8]}"
+
+
+def scanner_to_map(site: Site, sop: SopSection, matrix: Floats | None = None) -> pose.ScannerToMap:
+    """Return the transformation from scanner to map under an SOP; raise ConfigError if there is none.
+
+    `matrix` (4, 4) replaces that of the file.
+    """
+    matrix = read_matrix(sop.file) if matrix is None else matrix
     radius_m = site.scanner.range_max_m
     if site.map.crs is None:
         return pose.scanner_to_local_map(matrix)
@@ -51,6 +73,16 @@ def scanner_to_map(site: Site, sop: SopSection) -> pose.ScannerToMap:
         return pose.scanner_to_map_by_origin(matrix, _degrees(site.map.origin), site.map.crs, radius_m)
     _require_on_map(site.map.crs, matrix[:3, 3].tolist(), sop.file)
     return pose.scanner_to_map_directly(matrix, site.map.crs, radius_m)
+
+
+def registered_matrix(site: Site, sop: SopSection, path: Path) -> Floats:
+    """Return the matrix (4, 4) from scanner to project that a registration file gives.
+
+    Raises ConfigError if it holds none.
+    """
+    matrix = read_matrix(path)
+    into_scanner = site.registration is not None and site.registration.into == "scanner"
+    return np.asarray(read_matrix(sop.file) @ matrix) if into_scanner else matrix
 
 
 def _degrees(origin: Origin) -> tuple[float, float, float]:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -11,15 +9,11 @@ import shapely
 
 from station.archive.netcdf_layout import Series, roundtrip_text
 from station.config import Site
-from station.errors import ScanError
-from station.inbox.file_hash import sha256_file
-from station.inbox.inbox import ScanFile
+from station.inbox.file_hash import sha256_file, sha256_files
+from station.inbox.listing import ScanFile
 from station.quantities import Bools
 from station.readers.flags import read_flags, reasons_for
-from station.readers.formats.conversion import open_site_scan
 from station.readers.polygons import cells_inside, read_polygons
-from station.readers.scan import ScanReader
-from station.science.geometry.pose import horizontal_crs, is_same_map
 
 
 def series_for(site: Site) -> Series:
@@ -71,24 +65,6 @@ def load_areas(site: Site) -> dict[str, Bools]:
     return {name: cells_inside(polygon, site.grid_cells) for name, polygon in polygons.items()}
 
 
-@contextmanager
-def open_scan_for(site: Site, path: Path) -> Iterator[ScanReader]:
-    """Yield a reader of a scan with the settings of the site; raises ScanError or NotReadyError."""
-    range_max_m = site.scanner.range_max_m if site.scans.frame == "scanner" else None
-    work_folder = site.station.data
-    with open_site_scan(path, site.scans, range_max_m=range_max_m, work_folder=work_folder) as reader:
-        if site.scans.frame == "map" and site.map.crs and reader.header.crs_wkt:
-            _require_same_map(reader.header.crs_wkt, site.map.crs)
-        yield reader
-
-
-def _require_same_map(declared_wkt: str, crs: str) -> None:
-    """Raise ScanError if a scan declares another projected or geographic CRS than the site."""
-    declared, expected = horizontal_crs(declared_wkt), horizontal_crs(crs)
-    if (declared.is_projected or declared.is_geographic) and not is_same_map(declared, expected):
-        raise ScanError(f"the file is in {declared.name}, map.crs is {expected.name}: export it to that map")
-
-
 def sha256_log(scan: ScanFile) -> str:
-    """Return the SHA-256 of a scan's inclination log, '' if there is none."""
-    return sha256_file(scan.log) if scan.log else ""
+    """Return the SHA-256 of a scan's inclination log, or of those of its files; '' if there is none."""
+    return sha256_files(scan.logs)

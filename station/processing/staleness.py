@@ -14,15 +14,19 @@ from station.archive.netcdf_layout import Series
 from station.archive.reference_files import valid_versions
 from station.archive.schema import VERDICTS
 from station.config import Site
-from station.inbox.inbox import ScanFile
 from station.inbox.journal_reader import Entry, State
-from station.inbox.scan_files import find_scan
+from station.inbox.listing import ScanFile
 from station.processing.provenance import CurrentConfig, ScanProvenance, StoredEpoch, stored_epochs
+from station.processing.scans.scan_files import ScanFinder
 from station.processing.site_files import file_version, series_for
 from station.processing.workers.worker_process import Progress
-from station.scan_names import scan_stem
+from station.scan_names import scan_id
 
-LATE_INPUTS = {"inclination log arrived later", "weather arrived later"}  # the service reprocesses these
+LATE_INPUTS = {
+    "inclination log arrived later",
+    "weather arrived later",
+    "registration arrived later",
+}  # the service reprocesses these
 EPOCH_MISSING = "epoch damaged or missing"
 REFERENCE_OUTDATED = "reference built with other settings or inputs"
 
@@ -72,13 +76,14 @@ def plan_reprocessing(
     if valid is not None:
         valid -= set(stale)
         stale = stale or (() if valid else tuple(sorted({epoch.reference for epoch in stored} - {""})))
-    tasks = [_task_for_missing(site, entry) for entry in entries if entry.name in missing]
+    finder = ScanFinder(site)
+    tasks = [_task_for_missing(finder, entry) for entry in entries if entry.name in missing]
     for epoch in stored:
         progress()
         entry = by_epoch.get(epoch.ref.epoch_file)
         if entry is None or entry.name in missing or entry.outcome is State.SET_ASIDE:
             continue  # set aside: the scan file of this epoch has been replaced
-        scan = find_scan(site, entry.name, epoch.provenance.start_s)
+        scan = finder.find(entry.name, epoch.provenance.start_s)
         reasons = [
             *(["queued for reprocessing"] if entry.outcome is None else []),
             *(["other settings"] if epoch.science_hash != site.science_hash else []),
@@ -95,9 +100,9 @@ def plan_reprocessing(
     return Plan(tuple(sorted(selected, key=lambda task: (task.start_utc_s, task.name))), stale)
 
 
-def _task_for_missing(site: Site, entry: Entry) -> Task:
+def _task_for_missing(finder: ScanFinder, entry: Entry) -> Task:
     start_s = entry.start_utc_s or 0.0
-    scan = find_scan(site, entry.name, start_s)
+    scan = finder.find(entry.name, start_s)
     return Task(entry.name, start_s, (EPOCH_MISSING,), scan, entry.reference, entry.revision or 0)
 
 
@@ -117,15 +122,16 @@ def usable_scans(site: Site, entries: list[Entry], progress: Progress) -> list[s
 
 def late_inputs(site: Site, entries: list[Entry], progress: Progress) -> list[str]:
     """Return the names of scans whose log or weather arrived after they were stored without it."""
-    config = CurrentConfig(site)
+    config, finder = CurrentConfig(site), ScanFinder(site)
     by_epoch = {Path(entry.epoch).name: entry for entry in entries if entry.epoch}
     names = []
     for epoch in stored_epochs(series_for(site)):
         progress()
         entry = by_epoch.get(epoch.ref.epoch_file)
-        if entry is None or (epoch.provenance.log_sha256 and epoch.provenance.air):
+        has_registration = site.registration is None or bool(epoch.provenance.registration_sha256)
+        if entry is None or (epoch.provenance.log_sha256 and epoch.provenance.air and has_registration):
             continue
-        scan = find_scan(site, entry.name, epoch.provenance.start_s)
+        scan = finder.find(entry.name, epoch.provenance.start_s)
         if scan is not None and LATE_INPUTS & set(config.changed_inputs(epoch.provenance, scan, entry)):
             names.append(entry.name)
     return names
@@ -164,13 +170,13 @@ def stale_versions(
     """Return the versions built with other settings or inputs, and those that build on them."""
     if isinstance(site.reference.scans, Path):
         return ()
-    by_stem = {scan_stem(entry.name): entry for entry in entries}
+    by_id, finder = {scan_id(entry.name): entry for entry in entries}, ScanFinder(site)
     versions = valid_versions(series)
     for index, reference_provenance in enumerate(versions.values()):
         is_stale = reference_provenance.science_hash not in {"", site.science_hash}
         for provenance in map(ScanProvenance.from_attrs, reference_provenance.scan_provenance):
-            entry = by_stem.get(provenance.scan_id)
-            scan = find_scan(site, entry.name, provenance.start_s) if entry else None
+            entry = by_id.get(provenance.scan_id)
+            scan = finder.find(entry.name, provenance.start_s) if entry else None
             is_stale = is_stale or bool(
                 config.changed_settings(provenance) or config.changed_inputs(provenance, scan, entry)
             )

@@ -22,7 +22,7 @@ import numpy as np
 
 from station.errors import InconclusiveError, NotReadyError, ScanError, StationError
 from station.quantities import AzimuthTrack, Floats, IntensityScale, Shots
-from station.scan_names import COMPRESSED, start_in_name
+from station.scan_names import COMPRESSED, resolution_s, start_in_name
 
 log = logging.getLogger(__name__)
 
@@ -261,7 +261,7 @@ def detect_time_base(
 
 
 def scan_start(
-    path: Path,
+    name: str,
     pattern: str,
     times_s: tuple[float, float] | None = None,
     *,
@@ -270,10 +270,11 @@ def scan_start(
 ) -> datetime:
     """Return the start of a scan (UTC): from its name by the pattern, else from standard GPS time.
 
+    A name that states only the hour or the day leaves the rest to the GPS times.
     `stated_utc` is the start that the file states, used if neither contains one. Raises ScanError if there is
     none, or if name and GPS time contradict each other.
     """
-    name_start = start_in_name(path.name, pattern)
+    name_start = start_in_name(name, pattern)
     if times_s is None or detect_time_base(*times_s, name_start, standard=standard) is not TimeBase.STANDARD:
         if name_start is None and stated_utc is not None:
             return stated_utc
@@ -287,6 +288,9 @@ def scan_start(
     if name_start is None:
         return gps_start
     difference_s = (name_start - gps_start).total_seconds()
+    exact_s = resolution_s(pattern)
+    if exact_s > MAX_CLOCK_DIFFERENCE_S and -exact_s < difference_s <= 0:
+        return gps_start
     if abs(difference_s) > MAX_CLOCK_DIFFERENCE_S:
         hours = round(difference_s / 3600)
         is_local = hours and abs(difference_s - hours * 3600) < MAX_CLOCK_DIFFERENCE_S and abs(hours) <= 14
@@ -307,15 +311,16 @@ def reject_future(start: datetime, now_s: float) -> None:
         )
 
 
-def utc_interval(reader: ScanReader, pattern: str) -> tuple[datetime, datetime, TimeBase]:
+def utc_interval(reader: ScanReader, pattern: str, name: str = "") -> tuple[datetime, datetime, TimeBase]:
     """Return start and end of a scan (UTC) and its time base; end = start if it has no time stamps.
 
-    The start is that in the name, if any; the duration is from the time stamps. Raises as `scan_start`.
+    The start is that in the name, by default that of the file, if any; the duration is from the time stamps.
+    Raises as `scan_start`.
     """
     times_s = reader.time_range_s()
     header = reader.header
     start = scan_start(
-        reader.path, pattern, times_s, standard=header.standard_time, stated_utc=header.start_utc
+        name or reader.path.name, pattern, times_s, standard=header.standard_time, stated_utc=header.start_utc
     )
     if times_s is None:
         return start, start, TimeBase.NONE

@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Iterable
 from datetime import datetime
+from fnmatch import fnmatchcase
 from pathlib import Path
 from xml.etree import ElementTree as ET
 
@@ -158,9 +159,19 @@ def _orthonormal_rotation(rotation: Floats, path: Path) -> Floats:
     return np.asarray(u @ vt)
 
 
-def valid_sop(sops: Iterable[SopSection], time_utc: datetime) -> SopSection:
-    """Return the SOP valid at a time: the latest that has begun; raise ScanError if none has."""
+def valid_sop(sops: Iterable[SopSection], time_utc: datetime, name: str = "") -> SopSection:
+    """Return the SOP valid at a time: the latest that has begun; raise ScanError if none has.
+
+    With scan positions it is that for the file `name`; without a name, that of the position listed first.
+    """
     started = [sop for sop in sops if sop.from_ <= time_utc]
     if not started:
         raise ScanError(f"no [[sop]] of the site file has begun by {time_utc:%Y-%m-%d %H:%M:%S} UTC")
+    if name:
+        own = [sop for sop in started if sop.files is not None and fnmatchcase(name, sop.files)]
+        started = own or [sop for sop in started if sop.files is None]
+        if not started:
+            raise ScanError(f"no [[sop]] of the site file is for {name}: see sop.files")
+    else:
+        started = [sop for sop in started if sop.files == started[0].files]
     return max(started, key=lambda sop: sop.from_)

@@ -19,15 +19,17 @@ from typing import TYPE_CHECKING, Protocol
 
 from station.config import Site, read_site
 from station.errors import ConfigError, NotReadyError, StationError
-from station.inbox.inbox import Inbox, ScanFile
+from station.inbox.inbox import Inbox
 from station.inbox.journal import Journal
 from station.inbox.journal_reader import State
+from station.inbox.listing import ScanFile
 from station.inbox.lock import LockedFolder, exclusive_lock, require_known
 from station.logs import log_to_stderr, logfmt
 from station.monitoring.metrics import Metrics
 from station.monitoring.preconditions import EARLIEST_S, clock_problem, require_disk_space
 from station.processing.workers import fork_server
 from station.readers.formats.conversion import scan_suffixes
+from station.scan_names import folder_depth
 from station.service.host import Host
 from station.service.inbox_watcher import InboxWatcher
 from station.service.scheduler import JobScheduler, LoopEvent
@@ -255,7 +257,10 @@ class Daemon:
         suffixes = scan_suffixes(site.scans)
         inbox = Inbox(site, journal, suffixes, monotonic_s=self._clock.monotonic_s, now_s=self._clock.now_s)
         watcher = self._host.make_watcher(
-            site.scans.inbox, lambda: self.post(LoopEvent.INBOX_CHANGED), polling=site.scans.polling
+            site.scans.inbox,
+            lambda: self.post(LoopEvent.INBOX_CHANGED),
+            polling=site.scans.polling,
+            recursive=folder_depth(site.scans.pattern) > 0,
         )
         scheduler = self._host.make_scheduler(
             self.post,

@@ -29,8 +29,11 @@ _POLL_INTERVAL_S = 5.0
 class InboxWatcher(FileSystemEventHandler):
     """Reports file events of a folder, also after the folder was removed and created again."""
 
-    def __init__(self, folder: Path, on_event: Callable[[], None], *, polling: bool) -> None:
+    def __init__(
+        self, folder: Path, on_event: Callable[[], None], *, polling: bool, recursive: bool = False
+    ) -> None:
         self._folder = folder
+        self._recursive = recursive
         self._on_event = on_event
         self._polling = polling
         self._observer: BaseObserver | None = None
@@ -51,7 +54,7 @@ class InboxWatcher(FileSystemEventHandler):
         self._identity = identity
         observer = PollingObserver(timeout=_POLL_INTERVAL_S) if self._polling else Observer()
         try:
-            observer.schedule(self, str(self._folder))
+            observer.schedule(self, str(self._folder), recursive=self._recursive)
             observer.start()
         except OSError as error:  # the inotify watches of the system are used up
             log.warning(logfmt(inbox=self._folder, events="none", reason=f"{error}: the inbox is polled"))

@@ -9,10 +9,9 @@ from pathlib import Path
 from station.archive.reference_files import valid_versions
 from station.config import Site
 from station.errors import NotReadyError, ScanError
-from station.inbox.inbox import ScanFile, start_from_name
 from station.inbox.journal import Journal
 from station.inbox.journal_reader import State
-from station.inbox.scan_files import find_scan, is_present
+from station.inbox.listing import ScanFile, start_from_name
 from station.logs import logfmt
 from station.processing.reference_tasks import (
     build_reference_version,
@@ -21,6 +20,7 @@ from station.processing.reference_tasks import (
     scans_needed,
     update_reference_version,
 )
+from station.processing.scans.scan_files import ScanFinder, is_present
 from station.processing.site_files import series_for
 from station.service.store_repair import RunTask, StoreRepair
 
@@ -63,7 +63,8 @@ class ReferenceBuilder:
         last_s = self._start_s(usable[needed - 1])
         if self._unsettled_before(last_s, however_often_failed=True):  # it may belong to the reference
             return
-        scans = [self._find_scan(name) for name in chosen]
+        finder = ScanFinder(self._site)
+        scans = [self._find_scan(finder, name) for name in chosen]
         available = [scan for scan in scans if scan is not None]
         if len(available) < (setting if versions else len(chosen)):
             missing = [name for name, scan in zip(chosen, scans, strict=True) if scan is None]
@@ -89,12 +90,12 @@ class ReferenceBuilder:
         These are all epochs of a first version; of an update, to the scans before `update_s`, those of later
         scans that were processed while the update waited for an earlier one, if they are still in the inbox.
         """
+        finder = ScanFinder(self._site)
         outdated = (
             row.name
             for row in self._journal.rows()
             if row.epoch and row.outcome is not State.SET_ASIDE and row.reference != version
-            if update_s is None
-            or ((row.start_utc_s or 0.0) > update_s and is_present(self._site.scans.inbox / row.name))
+            if update_s is None or ((row.start_utc_s or 0.0) > update_s and finder.in_inbox(row.name))
         )
         self._journal.requeue(outdated, keep_reference=False)
 
@@ -105,7 +106,7 @@ class ReferenceBuilder:
     def _unsettled_before(self, start_utc_s: float, *, however_often_failed: bool = False) -> str:
         unsettled = self._journal.unsettled(however_often_failed=however_often_failed)
         for name, known_s in unsettled.items():
-            if (known_s or start_from_name(name, self._site.scans.pattern).timestamp()) < start_utc_s:
+            if (known_s or start_from_name(name, self._site.row_pattern).timestamp()) < start_utc_s:
                 return name
         return ""
 
@@ -114,22 +115,22 @@ class ReferenceBuilder:
         entry = self._journal.entry(name)
         if entry is not None and entry.start_utc_s is not None:
             return entry.start_utc_s
-        return start_from_name(name, self._site.scans.pattern).timestamp()
+        return start_from_name(name, self._site.row_pattern).timestamp()
 
     def _requeue_without_reference(self) -> None:
         """Requeue epochs without change: power failed between building the reference and its first use."""
-        inbox = self._site.scans.inbox
+        finder = ScanFinder(self._site)
         names = [
             name
             for name in self._journal.without_reference()
-            if name in self._processed or is_present(inbox / name)
+            if name in self._processed or finder.in_inbox(name)
         ]
         self._journal.requeue(names)
 
-    def _find_scan(self, name: str) -> ScanFile | None:
+    def _find_scan(self, finder: ScanFinder, name: str) -> ScanFile | None:
         """Return a scan file from where it was processed, the inbox or the archive; None if it is gone."""
         scan = self._processed.get(name)
-        if scan is not None and is_present(scan.path):
+        if scan is not None and all(is_present(path) for path in scan.paths):
             return scan
         entry = self._journal.entry(name)
-        return find_scan(self._site, name, entry.start_utc_s if entry else None)
+        return finder.find(name, entry.start_utc_s if entry else None)

@@ -12,13 +12,13 @@ from station.archive.epochs import COMPACTED, compacted_files, epochs_in_file, p
 from station.archive.netcdf_layout import Series
 from station.config import Site
 from station.errors import NotReadyError, ScanError
-from station.inbox.file_hash import file_identity, sha256_file
-from station.inbox.inbox import ScanFile
+from station.inbox.file_hash import file_identity, sha256_file, sha256_files
 from station.inbox.journal_reader import Entry
-from station.inbox.scan_files import archive_path, is_present, scan_file
+from station.inbox.listing import ScanFile
+from station.processing.scans.scan_files import ScanFinder, archive_folder, find_scan
 from station.processing.site_files import series_for, sha256_log
 from station.processing.workers.worker_process import Progress
-from station.scan_names import scan_stem
+from station.scan_names import scan_id, scan_stem
 
 MAX_PER_RUN = 50  # scans per maintenance run; there are four runs a day
 
@@ -32,6 +32,7 @@ def expired_scans(site: Site, entries: Iterable[Entry], reserved: set[str], now_
     if settings.raw == "leave":
         return []
     sop_scans = {sop.scan for sop in site.sop}  # their logs are searched for in the inbox
+    finder = ScanFinder(site)
     all_entries = list(entries)
     newest_s = max((entry.start_utc_s or 0.0 for entry in all_entries), default=0.0)
     cutoff_s = min(now_s, newest_s) - settings.keep_days * 86_400  # a clock far ahead expires nothing
@@ -41,9 +42,9 @@ def expired_scans(site: Site, entries: Iterable[Entry], reserved: set[str], now_
         if entry.start_utc_s is not None
         and entry.start_utc_s < cutoff_s
         and entry.outcome is not None
-        and scan_stem(entry.name) not in sop_scans
+        and not sop_scans & {scan_id(entry.name), scan_stem(entry.name)}
         and (settings.raw == "move" or entry.name not in reserved)
-        and is_present(site.scans.inbox / entry.name)
+        and finder.in_inbox(entry.name)
     ]
     return [name for _, name in sorted(candidates)[:MAX_PER_RUN]]
 
@@ -76,28 +77,36 @@ def _move_or_delete(
     Store files in `verified` are not read again. Raises ScanError if the scan is not the stored one or its
     epoch cannot be verified, NotReadyError if the folders cannot be written. Nothing is lost then.
     """
-    scan = scan_file(site, site.scans.inbox / entry.name)
-    identity = file_identity(scan.path)
+    scan = find_scan(site, entry.name, entry.start_utc_s)
+    if scan is None:
+        raise ScanError("kept: the scan is no regular file, or no longer there")
+    identities = [file_identity(path) for path in scan.paths]
     _require_verified(site, scan, entry, files, verified, progress)
-    paths = [path for path in (scan.log, scan.path) if path is not None]  # the scan last
-    archive = site.retention.archive
+    inbox, archive = site.scans.inbox, site.retention.archive
+    # The scans last; what an interrupted run has moved stays where it is.
+    paths = [path for path in (*scan.logs, *scan.matrices, *scan.paths) if path.is_relative_to(inbox)]
     try:
-        if not os.access(site.scans.inbox, os.W_OK):
-            raise NotReadyError(
-                f"{site.scans.inbox} is read-only: with systemd, add ReadWritePaths={site.scans.inbox}"
-                " in a drop-in (systemctl edit) and give the group write permission"
-            )
+        for folder in {path.parent for path in paths}:
+            _require_writable(folder)
         if site.retention.raw == "move" and archive is not None:
-            folder = archive_path(archive, entry.name, entry.start_utc_s or 0.0).parent
+            month = archive_folder(archive, entry.start_utc_s or 0.0)
             for path in paths:
-                _copy(path, folder / path.name, sha256_file(path), progress)
-        if file_identity(scan.path) != identity:
+                _copy(path, month / path.relative_to(inbox), sha256_file(path), progress)
+        if [file_identity(path) for path in scan.paths] != identities:
             raise NotReadyError("the scan has changed since it was checked")
         for path in paths:
             path.unlink()
     except OSError as error:
         raise NotReadyError(f"cannot be moved or deleted: {error}") from error
     return "moved" if site.retention.raw == "move" else "deleted"
+
+
+def _require_writable(folder: Path) -> None:
+    if not os.access(folder, os.W_OK):
+        raise NotReadyError(
+            f"{folder} is read-only: with systemd, add ReadWritePaths={folder}"
+            " in a drop-in (systemctl edit) and give the group write permission"
+        )
 
 
 def _require_verified(
@@ -109,7 +118,7 @@ def _require_verified(
     progress: Progress,
 ) -> None:
     """Raise ScanError unless exactly these bytes are stored, in a file with the right checksum."""
-    if sha256_file(scan.path) != entry.sha256:
+    if sha256_files(scan.paths) != entry.sha256:
         raise ScanError("kept: the scan is not the one that was stored")
     if sha256_log(scan) not in {"", entry.log_sha256}:
         raise ScanError(

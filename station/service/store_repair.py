@@ -12,7 +12,6 @@ from station.clock import Clock
 from station.config import Site
 from station.errors import ConfigError, StoreError
 from station.inbox.journal import Journal
-from station.inbox.scan_files import is_present
 from station.logs import logfmt
 from station.processing.integrity import (
     add_checksums,
@@ -25,6 +24,7 @@ from station.processing.integrity import (
     unreadable_files,
     verify_checksums,
 )
+from station.processing.scans.scan_files import ScanFinder
 from station.processing.site_files import series_for
 from station.processing.store_tasks import update_series
 from station.science.geometry.pose import horizontal_crs, is_same_map
@@ -119,8 +119,9 @@ class StoreRepair:
         self.with_repair(restore_tilt_offsets)
 
     def _requeue_missing(self) -> None:
+        finder = ScanFinder(self._site)
         for name in self._run(missing_epochs, self._journal.current_epochs()):
-            if is_present(self._site.scans.inbox / name):
+            if finder.in_inbox(name):
                 log.warning("%s", logfmt(scan=name, reason="epoch missing from the store: reprocessing"))
                 self._journal.requeue([name])
             else:

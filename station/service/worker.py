@@ -8,10 +8,9 @@ from typing import TypeVar
 
 from station.config import Site
 from station.errors import InconclusiveError, NotReadyError, ScanError, StationError, StoreError
-from station.inbox.inbox import ScanFile
 from station.inbox.journal import Journal
 from station.inbox.journal_reader import Entry, State
-from station.inbox.scan_files import is_present
+from station.inbox.listing import ScanFile
 from station.logs import logfmt
 from station.monitoring.daily_digest import write_digest, yesterday
 from station.processing.integrity import holds_epochs
@@ -23,6 +22,7 @@ from station.processing.scan_tasks import (
     check_header,
     process_new,
 )
+from station.processing.scans.scan_files import ScanFinder
 from station.processing.site_files import series_for
 from station.processing.staleness import count_outdated, late_inputs
 from station.processing.store_tasks import (
@@ -232,7 +232,8 @@ class Worker:
             self._mirror_is_due = self._site.mirror is not None  # a fault may have gone
         self._journal.drop_checksums(self.store.with_repair(delete_expired, now_s))
         affected = self.store.with_repair(late_inputs, self._journal.rows(State.STORED))
-        names = [name for name in affected if is_present(self._site.scans.inbox / name)]
+        finder = ScanFinder(self._site)
+        names = [name for name in affected if finder.in_inbox(name)]
         for name in names:
             log.info("%s", logfmt(scan=name, reason="its log or weather arrived late: reprocessing"))
         self._journal.requeue(names)
@@ -284,15 +285,15 @@ class Worker:
 
     def _judge_again(self) -> None:
         """Queue scans that were set aside or failed under other settings, limits or another version."""
-        names = self._journal.judged_otherwise(self._site.judging_conditions)
-        names = [name for name in names if is_present(self._site.scans.inbox / name)]
+        names, finder = self._journal.judged_otherwise(self._site.judging_conditions), ScanFinder(self._site)
+        names = [name for name in names if finder.in_inbox(name)]
         reason = "settings, limits or version have changed since it was set aside or failed"
         for name in names:
             log.info("%s", logfmt(scan=name, verdict="waiting", reason=reason))
         self._journal.requeue(names, reason)
         reason = "rejected for now a week ago: one more attempt"
         for name in self._journal.rejected_for_now():
-            if is_present(self._site.scans.inbox / name):
+            if finder.in_inbox(name):
                 log.info("%s", logfmt(scan=name, verdict="waiting", reason=reason))
                 self._journal.try_once(name, reason, self._site.judging_conditions)
 
@@ -325,17 +326,17 @@ class Worker:
             )
 
     def run(self, task: Callable[..., T], *args: object) -> T:
-        """Run a task in a worker process, limited to `timeout_s` per scan; without scans, to hours."""
+        """Run a task in a worker process, limited to `timeout_s` per file of scans; without any, to hours."""
         items = [item for arg in args for item in (arg if isinstance(arg, list) else [arg])]
         self._before_task()
-        scan_count = sum(isinstance(item, ScanFile) for item in items)
+        file_count = sum(len(item.files) for item in items if isinstance(item, ScanFile))
         result: T = self._host.tasks.run(
             with_usable_inputs,
             task,
             self._site,
             *args,
             memory_gb=self._site.service.memory_gb,
-            timeout_s=self._site.scans.timeout_s * scan_count or MAX_STORE_TASK_S,
+            timeout_s=self._site.scans.timeout_s * file_count or MAX_STORE_TASK_S,
             on_progress=self._on_progress,
             should_stop=self._should_stop,
         )

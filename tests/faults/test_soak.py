@@ -16,7 +16,7 @@ import pytest
 from station.config import read_site
 from station.inbox.journal import Journal
 from station.inbox.journal_reader import State
-from station.inbox.scan_files import scan_file
+from station.processing.scans.scan_files import scan_file
 from station.processing.usable_inputs import with_usable_inputs
 from station.service.worker import Worker
 

@@ -15,9 +15,10 @@ import pytest
 
 from station.errors import NotReadyError
 from station.inbox import inbox as inbox_module
-from station.inbox.inbox import Inbox, safe_name
+from station.inbox.inbox import Inbox
 from station.inbox.journal import Journal
 from station.inbox.journal_reader import State
+from station.inbox.listing import safe_name
 
 FIRST, SECOND = "261121_010000.laz", "261121_020000.laz"
 LOG = """

@@ -77,7 +77,10 @@ def test_status_lists_the_offset_among_the_faults(problem_of, tmp_path, monkeypa
         pass
     site = SimpleNamespace(
         station=SimpleNamespace(id="hef", name="Hef", data=tmp_path),
-        scans=SimpleNamespace(inbox=tmp_path, expected_every_s=3600.0, suffix=None),
+        scans=SimpleNamespace(inbox=tmp_path, expected_every_s=3600.0, suffix=None, pattern="%y%m%d_%H%M%S"),
+        inclination=None,
+        epoch=None,
+        registration=None,
         grid=SimpleNamespace(shape=(2, 3)),
         adjusts=True,
         weather=None,

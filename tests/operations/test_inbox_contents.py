@@ -3,6 +3,7 @@
 import pytest
 
 from station.operations.inbox_contents import inbox_findings
+from station.sections import EpochSection
 
 
 @pytest.fixture
@@ -17,6 +18,10 @@ def findings(make_site):
         return [message for _, message in inbox_findings(site)]
 
     return find
+
+
+def with_pattern(site, pattern):
+    return site.model_copy(update={"scans": site.scans.model_copy(update={"name": pattern})})
 
 
 def test_an_inbox_with_scans_only_has_no_findings(findings):
@@ -34,9 +39,35 @@ def test_text_files_without_other_scans_may_be_scans(findings):
     assert findings("250715_090000.laz") == []
 
 
-def test_scans_in_folders_below_are_named(findings):
-    (message,) = findings("2025-07-15/250715_090000.laz", "ScanPos001.SCNPOS/scans/250715_100000.laz")
-    assert "2 scans lie in folders below it, such as 2025-07-15/250715_090000.laz" in message
+@pytest.mark.parametrize(
+    ("names", "pattern"),
+    [
+        (("2025-07-15/250715_090000.laz", "2025-07-16/250716_090000.laz"), "*/%y%m%d_%H%M%S"),
+        (("ScanPos001.SCNPOS/scans/250715_100000.laz",), "*/*/%y%m%d_%H%M%S"),
+        (("2025-07-15/ScanPos001.laz", "2025-07-16/ScanPos001.laz"), "%Y-%m-%d/*"),
+        (("20250715_hut.PROJ/ScanPos001.SCNPOS/scans/a.laz",), "*%Y%m%d*/*/*/*"),
+    ],
+)
+def test_a_pattern_with_folders_is_proposed(findings, make_site, names, pattern):
+    (message,) = findings(*names)
+    assert f"such as {names[0]}, are not read: they are looked for in the inbox itself" in message
+    assert f'name = "{pattern}" would' in message
+    assert list(inbox_findings(with_pattern(make_site(), pattern))) == []
+
+
+def test_scans_elsewhere_than_in_the_folders_of_the_pattern_are_named(make_site):
+    site = with_pattern(make_site(), "%Y-%m-%d/*")
+    (site.scans.inbox / "250715_090000.laz").touch()
+    ((_, message),) = inbox_findings(site)
+    assert "1 scans, such as 250715_090000.laz, are not read: they are looked for in folders of" in message
+
+
+def test_files_with_the_same_start_may_be_one_epoch(findings, make_site):
+    (message,) = findings("250715_090000.laz", "250715_090000.las", "250715_100000.laz")
+    assert 'have the same start: such files are one epoch with [epoch] name = "%Y%m%d_%H%M%S"' in message
+    site = make_site()
+    epoch = EpochSection(name="%Y%m%d_%H%M%S")
+    assert list(inbox_findings(site.model_copy(update={"epoch": epoch}))) == []
 
 
 @pytest.mark.parametrize(

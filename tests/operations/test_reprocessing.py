@@ -20,12 +20,12 @@ from station.errors import ConfigError, NotReadyError
 from station.inbox.journal import Journal
 from station.inbox.journal_reader import State
 from station.inbox.lock import exclusive_lock
-from station.inbox.scan_files import scan_file
 from station.monitoring.status import status as station_status
 from station.operations import reprocessing
 from station.operations.batch import process_scans
 from station.operations.reprocessing import Reprocessing, reprocess
 from station.operations.site_check import store_findings
+from station.processing.scans.scan_files import scan_file
 from station.processing.site_files import series_for
 from station.processing.staleness import count_outdated
 from station.processing.workers.dask_executor import require_secure

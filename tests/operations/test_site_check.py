@@ -10,6 +10,7 @@ import laspy
 import pytest
 
 from station.config import read_site
+from station.inbox import listing
 from station.operations import site_check
 from station.operations import site_plausibility as plausibility
 from station.sections import FlagsSection, RetentionSection
@@ -156,7 +157,7 @@ def test_rights_of_the_user_of_the_service_are_told_to_root(folder):
 def test_unreadable_inbox_is_a_fault(folder, monkeypatch):
     site = read_site(folder / "site.toml")
     monkeypatch.setattr(site_check.os, "access", lambda path, _: path != site.scans.inbox)
-    monkeypatch.setattr(type(site.scans.inbox), "iterdir", raise_permission_error)
+    monkeypatch.setattr(listing.os, "scandir", raise_permission_error)
     assert site_check._scans(site) == []
     assert [finding["what"] for finding in site_check._folders(site) if finding["level"] == "fault"] == [
         "inbox"

@@ -14,15 +14,15 @@ from pyproj import CRS
 from station.archive import tilt_offsets
 from station.config import read_site
 from station.errors import ConfigError, NotReadyError, ScanError
-from station.inbox.scan_files import scan_file
 from station.operations import site_check
-from station.processing import provenance, reference_tasks, scan_tasks, site_files
+from station.processing import provenance, reference_tasks, scan_tasks
 from station.processing.pipeline import to_map
 from station.processing.scan_air import pressure_fault
-from station.processing.scan_inputs import load_scan_inputs
 from station.processing.scan_tasks import ScanHistory
+from station.processing.scans import open_scans
+from station.processing.scans.epoch_inputs import load_scan_inputs
+from station.processing.scans.scan_files import scan_file
 from station.quantities import Air, Quality
-from station.readers.scan import utc_interval
 from station.science.uncertainty.parameters import LINE_GROUPS_PER_KNOT
 from station.simulation.instrument.motion import sensor_faults
 from station.simulation.station import simulate, small
@@ -86,9 +86,8 @@ def test_damaged_tilt_offset_is_restored_from_the_epochs(folder, content):
         assert tilt_offsets.damaged_tilt_offsets(folder / "data") == [path]
     site = edited_site(folder)
     scan = scan_file(site, max(site.scans.inbox.glob("*.laz")))
-    with scan_tasks.open_scan_for(site, scan.path) as reader:
-        start, end, _ = utc_interval(reader, site.scans.name)
-        load_scan_inputs(site, reader, scan.log, start, end)
+    with scan_tasks.open_scan_for(site, scan) as opened:
+        load_scan_inputs(site, opened)
     assert path.read_text() == intact
     assert tilt_offsets.damaged_tilt_offsets(folder / "data") == []
 
@@ -100,17 +99,16 @@ def test_damaged_tilt_offset_is_restored_from_the_epochs(folder, content):
 def test_map_that_a_scan_declares_must_be_that_of_the_site(declared, is_same):
     wkt = CRS.from_user_input(declared).to_wkt()
     with nullcontext() if is_same else pytest.raises(ScanError, match=r"map\.crs is WGS 84 / UTM zone 32N"):
-        site_files._require_same_map(wkt, "EPSG:32632")
+        open_scans._require_same_map(wkt, "EPSG:32632")
 
 
 def test_line_times_match_the_shots(folder):
     """True north deviates from grid north by 1.3°, which the head turns in 2.6 s."""
     site = edited_site(folder)
     scan = scan_file(site, min(site.scans.inbox.glob("*.laz")))
-    with scan_tasks.open_scan_for(site, scan.path) as reader:
-        start, end, _ = utc_interval(reader, site.scans.name)
-        inputs = load_scan_inputs(site, reader, scan.log, start, end)
-        shots = next(iter(reader.blocks()))
+    with scan_tasks.open_scan_for(site, scan) as opened:
+        inputs = load_scan_inputs(site, opened)
+        shots = next(iter(inputs.shots(opened, "auto")))
     points = to_map(shots, inputs.pose)
     offset_m = tuple(
         points_m - origin_m for points_m, origin_m in zip(points, inputs.geometry.position_m, strict=True)

@@ -7,10 +7,9 @@ from readers.test_weather_dialects import LOGS
 from support import tiny_station
 
 from station.config import read_site
-from station.inbox.scan_files import scan_file
-from station.processing.scan_inputs import load_scan_inputs
-from station.processing.scan_tasks import open_scan_for
-from station.readers.scan import utc_interval
+from station.processing.scans.epoch_inputs import load_scan_inputs
+from station.processing.scans.open_scans import open_scan_for
+from station.processing.scans.scan_files import scan_file
 
 
 @pytest.fixture(scope="module")
@@ -40,9 +39,8 @@ def test_the_air_of_a_scan_is_that_of_the_log(kind, folder):
     )
     site = read_site(folder / "other.toml")
     scan = scan_file(site, folder / "inbox" / f"{tiny_station.scan_name(0)}.laz")
-    with open_scan_for(site, scan.path) as reader:
-        begin, end, _ = utc_interval(reader, site.scans.pattern)
-        inputs = load_scan_inputs(site, reader, scan.log, begin, end, save_tilt_offset=False)
+    with open_scan_for(site, scan) as opened:
+        inputs = load_scan_inputs(site, opened, save_tilt_offset=False)
     assert not [warning for warning in inputs.warnings if "weather" in warning]
     assert inputs.air.temperature_c == pytest.approx(-1.5, abs=1e-9)
     assert inputs.air.humidity_pct == pytest.approx(51.0, abs=1e-9)

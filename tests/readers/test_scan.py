@@ -18,6 +18,7 @@ from station.readers.scan import (
     reject_future,
     utc_interval,
 )
+from station.scan_names import start_in_name
 
 NAMED = "%y%m%d_%H%M%S"
 START = datetime(2024, 10, 1, 12, 0, 0, tzinfo=UTC)
@@ -109,6 +110,17 @@ def test_start_is_from_the_name_and_duration_from_the_time_stamps(write_scan, fi
 def test_start_from_absolute_time_stamps(write_scan):
     with open_scan(write_timed_scan(write_scan, "flight.laz", START_STANDARD_S, standard=True)) as reader:
         assert utc_interval(reader, NAMED)[0] == START
+
+
+@pytest.mark.parametrize(("name", "pattern"), [("2024-10-01", "%Y-%m-%d"), ("241001_12", "%y%m%d_%H")])
+def test_names_of_a_day_or_an_hour_leave_the_rest_to_gps_times(write_scan, name, pattern):
+    path = write_timed_scan(write_scan, f"{name}.laz", START_STANDARD_S + 120, standard=True)
+    with open_scan(path) as reader:
+        assert utc_interval(reader, pattern)[0] == START + timedelta(seconds=120)
+        with pytest.raises(ScanError, match="check the scanner's clock"):
+            utc_interval(reader, "%Y-%m-%d", "2024-09-30.laz")
+    with open_scan(write_timed_scan(write_scan, f"{name}.laz", 40.0)) as reader:
+        assert utc_interval(reader, pattern, f"{name}.laz")[0] == start_in_name(name, pattern)
 
 
 @pytest.mark.parametrize("first_s", [None, 40.0, START_WEEK_S])

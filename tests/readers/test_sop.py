@@ -130,6 +130,24 @@ QUATERNION = Rotation.from_matrix(ROTATION).as_quat()  # x, y, z, w
 PLACE = "x = 12.5\ny = -3.25\nz = 1500\n"
 
 
+def test_each_position_has_its_sops():
+    later = OCTOBER + timedelta(days=1)
+    sops = [
+        SopSection.model_validate({"from": begin, "file": file, "files": files})
+        for begin, file, files in (
+            (OCTOBER, "1a", "*/ScanPos001*"), (later, "1b", "*/ScanPos001*"), (OCTOBER, "2", "*/ScanPos002*"),
+        )
+    ]  # fmt: skip
+    assert valid_sop(sops, OCTOBER, "day/ScanPos001.laz").file == Path("1a")
+    assert valid_sop(sops, later, "day/ScanPos001.laz").file == Path("1b")
+    assert valid_sop(sops, later, "day/ScanPos002.laz").file == Path("2")
+    assert valid_sop(sops, later).file == Path("1b")  # the position listed first
+    with pytest.raises(ScanError, match=r"no \[\[sop\]\] of the site file is for day/ScanPos003.laz"):
+        valid_sop(sops, later, "day/ScanPos003.laz")
+    others = SopSection.model_validate({"from": OCTOBER, "file": "rest"})
+    assert valid_sop([*sops, others], later, "day/ScanPos003.laz").file == Path("rest")
+
+
 @pytest.mark.parametrize(
     "text",
     [

@@ -112,7 +112,7 @@ def test_missing_folder_is_watched_once_it_exists(make, events, folder):
 
 def test_exhausted_inotify_watches_are_logged_once(make, folder, monkeypatch, caplog):
     class Exhausted:
-        def schedule(self, *_):
+        def schedule(self, *_, **__):
             raise OSError(28, "inotify watch limit reached")
 
     monkeypatch.setattr(inbox_watcher, "Observer", Exhausted)

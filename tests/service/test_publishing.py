@@ -13,12 +13,12 @@ from PIL import Image
 import station
 from station.config import read_site
 from station.inbox.journal import Journal
-from station.inbox.scan_files import scan_file
 from station.operations.batch import process_scans
 from station.processing import epoch_recorder
 from station.processing.epoch_recorder import page_folder
 from station.processing.reference_tasks import build_reference_version
 from station.processing.scan_tasks import ScanHistory, process_new
+from station.processing.scans.scan_files import scan_file
 from station.processing.store_tasks import update_series
 from station.products import gallery
 from station.products.overview import read_overview

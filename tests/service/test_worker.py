@@ -16,13 +16,13 @@ from support.tiny_station import PENDING, assert_same_values, build, scan_name
 from station.clock import Clock
 from station.config import read_site
 from station.errors import InconclusiveError, NotReadyError, ScanError, StationError
-from station.inbox.inbox import ScanFile
 from station.inbox.journal import MAX_FAILURES, Journal
 from station.inbox.journal_reader import State
+from station.inbox.listing import ScanFile
 from station.inbox.lock import exclusive_lock
-from station.inbox.scan_files import scan_file
 from station.operations.retry import retry_scans
 from station.processing.scan_tasks import StoredResult
+from station.processing.scans.scan_files import scan_file
 from station.processing.workers import fork_server
 from station.service.host import Host
 from station.service.worker import Worker

@@ -22,7 +22,7 @@ import station
 from station._version import __version__
 from station.config import Site
 from station.errors import ConfigError, NotReadyError, StoreError
-from station.inbox.inbox import ScanFile
+from station.inbox.listing import ScanFile
 from station.processing.scan_tasks import Rejected, ScanHistory, StoredResult, reprocess_scan
 
 CONNECT_TIMEOUT_S = 30.0

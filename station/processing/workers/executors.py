@@ -11,7 +11,7 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from typing import Protocol
 
 from station.config import Site
-from station.inbox.inbox import ScanFile
+from station.inbox.listing import ScanFile
 from station.processing.scan_tasks import Rejected, ScanHistory, StoredResult, reprocess_scan
 from station.processing.workers import isolation
 

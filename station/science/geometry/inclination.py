@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from bisect import bisect_left
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -42,6 +43,17 @@ OFFSET_ROUNDS = 4
 OFFSET_STEP_S = 10.0
 # Tilt drift of the mount during this scan and that of the cyclic error: equations.md, 6.3 and 6.4.
 MOTION_RAD, MOTION_S = math.radians(0.003), 300.0
+
+
+def joined(logs: Sequence[InclinationLog]) -> InclinationLog:
+    """Return the logs of the files of one scan as one, by their first times; each time is kept once."""
+    if len(logs) == 1:
+        return logs[0]
+    ordered = sorted(logs, key=lambda log: min(log.time_s, default=0.0))
+    columns = np.hstack([np.stack([log.time_s, log.roll_rad, log.pitch_rad]) for log in ordered])
+    _, first = np.unique(columns[0], return_index=True)
+    columns = columns[:, np.sort(first)]
+    return InclinationLog(columns[0], columns[1], columns[2])
 
 
 def clean(log: InclinationLog, range_rad: float) -> tuple[InclinationLog, int]:

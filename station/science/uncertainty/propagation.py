@@ -58,6 +58,19 @@ def difference_to_reference(shared: SharedParameters, reference: SharedParameter
     return shared + (reference if reference.names == shared.names else shared)
 
 
+def with_pose_uncertainty(shared: SharedParameters, sigma_rad: float, sigma_m: float) -> SharedParameters:
+    """Return the parameters with these uncertainties of rotation and translation, independent of all others.
+
+    `sigma_rad` is that about each axis, `sigma_m` that along each.
+    """
+    names = [name for name, _ in GLOBAL]
+    pose = slice(names.index("tilt_east"), names.index("translation_up") + 1)
+    covariance = shared.covariance.copy()
+    covariance[pose, :] = covariance[:, pose] = 0.0
+    covariance[pose, pose] = np.diag([sigma_rad**2] * 3 + [sigma_m**2] * 3)
+    return replace(shared, covariance=covariance)
+
+
 def align_to(params: ParameterLayout, shared: SharedParameters) -> SharedParameters:
     """Return shared parameters reordered to a parameter layout; parameters they lack get zero variance."""
     if shared.names == params.names:

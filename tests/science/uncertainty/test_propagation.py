@@ -206,3 +206,16 @@ def test_log_only_covariance_is_symmetric_and_smaller_with_a_log():
         assert np.linalg.eigvalsh(posterior.covariance).min() > -1e-18
         assert posterior.covariance == pytest.approx(posterior.covariance.T)
     assert with_log.covariance[0, 0] < without.covariance[0, 0]
+
+
+def test_stated_uncertainty_of_the_pose_replaces_its_covariance():
+    params = parameters.parameter_layout(GRID, (0.0, 0.0, 0.0))
+    shared = random_shared_parameters(params)
+    stated = propagation.with_pose_uncertainty(shared, 1e-5, 0.02)
+    names = list(shared.names)
+    for name, sigma in (("tilt_east", 1e-5), ("heading", 1e-5), ("translation_up", 0.02)):
+        row = names.index(name)
+        assert stated.covariance[row, row] == pytest.approx(sigma**2)
+        assert np.count_nonzero(stated.covariance[row]) == np.count_nonzero(stated.covariance[:, row]) == 1
+    rest = slice(names.index("range_bias"), None)
+    np.testing.assert_array_equal(stated.covariance[rest, rest], shared.covariance[rest, rest])

@@ -1,0 +1,1 @@
+"""Scans as files: where they lie, and reading them."""
