@@ -30,7 +30,7 @@ from station.processing.scans.registration import (
     registered_covariance,
     registration,
 )
-from station.processing.scans.scan_files import inbox_scans
+from station.processing.scans.scan_files import find_in_inbox
 from station.quantities import (
     Air,
     AzimuthTrack,
@@ -44,7 +44,7 @@ from station.quantities import (
 )
 from station.readers.inclination import align_gps_week, read_inclination
 from station.readers.scan import ScanReader
-from station.scan_names import scan_id, scan_stem
+from station.scan_names import scan_stem
 from station.science.adjustment import prior
 from station.science.geometry import inclination
 from station.science.geometry.air import air_correction
@@ -378,11 +378,10 @@ def _load_earlier_log(site: Site, sop: SopSection) -> tuple[InclinationLog | Non
 
     `sop.scan` is its name without suffix, with or without its folders.
     """
-    scans = [scan for scan in inbox_scans(site) if sop.scan in {scan_id(scan.name), scan_stem(scan.name)}]
+    scan = find_in_inbox(site, sop.scan or "")
     files = [
         file
-        for scan in scans[:1]
-        for file in scan.files
+        for file in (scan.files if scan else ())
         if sop.files is None or fnmatchcase(file.name, sop.files)
     ]
     logs = list(dict.fromkeys(file.log for file in files if file.log is not None))

@@ -18,6 +18,7 @@ from station.processing.site_files import series_for
 from station.processing.workers.worker_process import Progress
 from station.products.export import export
 from station.products.page import PageContext, write_page
+from station.scan_names import scan_id
 
 
 @dataclass(frozen=True)
@@ -71,6 +72,6 @@ def _page_context(site: Site, result: StoredResult | None, faults: list[str]) ->
         waiting=backlog["waiting"],
         set_aside=sorted(backlog["set_aside"], key=lambda scan: str(scan["since"])),
         faults=[*backlog["faults"], *faults],
-        durations_s={name.rpartition(".")[0] or name: duration_s for name, duration_s in durations_s.items()},
+        durations_s={scan_id(name): duration_s for name, duration_s in durations_s.items()},
         overviews={Path(result.epoch).name: result.overview} if result and result.overview else {},
     )

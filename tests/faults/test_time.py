@@ -14,8 +14,8 @@ import pytest
 
 from station.config import read_site
 from station.inbox.journal_reader import State
-from station.operations.batch import scan_file
 from station.processing import scan_tasks
+from station.processing.scans.scan_files import scan_file
 from station.readers.scan import gps_seconds
 
 pytestmark = pytest.mark.integration

@@ -13,7 +13,7 @@ from station.config import Site
 from station.errors import NotReadyError
 from station.inbox.listing import ScanFile, ScanListing, name_in_journal
 from station.readers.formats.conversion import scan_suffixes
-from station.scan_names import name_below, scan_stem
+from station.scan_names import name_below, scan_id, scan_stem
 
 
 def is_present(path: Path) -> bool:
@@ -49,6 +49,16 @@ def inbox_scans(site: Site) -> list[ScanFile]:
     """Return the scans in the inbox, by their names; raise NotReadyError if it cannot be listed."""
     listing = ScanListing(site, site.scans.inbox, scan_suffixes(site.scans))
     return [listing.scan(name) for name in sorted(listing.scans)]
+
+
+def find_in_inbox(site: Site, stem: str) -> ScanFile | None:
+    """Return the scan in the inbox of a name without suffix, with or without its folders; None without one.
+
+    Raises NotReadyError if it cannot be listed.
+    """
+    listing = ScanListing(site, site.scans.inbox, scan_suffixes(site.scans))
+    names = (name for name in sorted(listing.scans) if stem in {scan_id(name), scan_stem(name)})
+    return next((listing.scan(name) for name in names), None)
 
 
 def joined(name: str, parts: dict[str, ScanFile]) -> ScanFile:
