@@ -25,12 +25,16 @@ MIN_DEPTH_M = 0.05  # less is no event, however significant
 MIN_WIDESPREAD_M = 0.01
 WIDESPREAD_SHARE = 0.25  # of the observed tiles: what changes them alike is snowfall or melt
 PATCH_BLOCKS = 9  # that change alike where melt or snow is patchy
+NEIGHBOURS = np.ones((3, 3), np.bool_)  # of a block, itself included
 EXTENT_SIGMAS = 3.0  # of a block that belongs to an event
 MIN_BLOCKS = 2  # of an event: a single block may be an edge that was hit otherwise
 TAIL_QUANTILE, TAIL_SIGMAS = 0.99, 2.576  # two-sided, of a normal distribution
 OUTLIER_SIGMAS = 6.0  # beyond, a window tells nothing of the errors: it has changed
 MEDIAN_VARIANCE = np.pi / 2  # of a median, over that of the mean
-SMALL_SAMPLE = 1.2  # of the median absolute deviation of about six values
+SCATTER_QUANTILE, SCATTER_SIGMAS = 0.9, 1.645  # of absolute values, two-sided
+EDGE_RATIO = 3.0  # of the observed scatter over the random variance, beyond which a block is at an edge
+EDGE_VARIANCE = 1.3  # of a scan less the median of several, over that of a scan
+GAP_BLOCKS = 2  # parts of an event that are no farther apart
 
 
 @dataclass(frozen=True)
@@ -46,7 +50,7 @@ class BlockLevels:
 
 @dataclass(frozen=True)
 class Region:
-    """Blocks (by, bx) that changed together, upward or downward; everywhere, or against their surroundings."""
+    """Blocks (by, bx) that changed together, up or down; everywhere, or against their surroundings."""
 
     blocks: Bools
     sign: int
@@ -64,6 +68,7 @@ class _Contrast:
     random_m2: Floats
     systematic_m2: Floats
     patchy_m2: Floats  # by which the change differs from block to block, beyond the errors
+    edge_m2: Floats  # by which scans of the block scatter, where that is far more than its random errors
 
 
 @dataclass(frozen=True)
@@ -77,10 +82,10 @@ class Thresholds:
 def event_thresholds(blocks: int, scans_per_year: float, false_alarms_per_year: float = 1.0) -> Thresholds:
     """Return the thresholds at which a year of scans has that many false alarms at most.
 
-    Windows of w × w blocks are taken as 4 / w² times as many independent ones as there are blocks, because they
-    overlap. What is widespread must show in many tiles at once, so that it counts as a single test of an error
-    that all of them share. The thresholds hold for a single scan and normal errors; the second scan must
-    exceed them as well, which leaves a margin for heavier tails.
+    Windows of w × w blocks are taken as 4 / w² times as many independent ones as there are blocks, because
+    they overlap. What is widespread must show in many tiles at once: it counts as one test of an error that
+    all of them share. The thresholds hold for a single scan and normal errors; the second scan must exceed
+    them as well, which leaves a margin for heavier tails.
     """
     windows = max(blocks, 1) * sum(min(4 / size**2, 1.0) for size in WINDOWS)
     rate = false_alarms_per_year / 2  # half for each kind
@@ -90,28 +95,39 @@ def event_thresholds(blocks: int, scans_per_year: float, false_alarms_per_year: 
 
 
 def before_level(before: list[BlockLevels], least: int) -> BlockLevels:
-    """Return the median level of scans and its variance; NaN in blocks that fewer than `least` observed.
-
-    The variance is at least that of the observed scatter: a block at an edge, which beams hit or miss, scatters
-    more than its model.
-    """
+    """Return the median level of scans and its variance; NaN in blocks that fewer than `least` observed."""
     change_m = np.stack([levels.change_m for levels in before])
     observed = np.isfinite(change_m)
     count = np.maximum(observed.sum(axis=0), 1)
-    median_m = _nanmedian(change_m, 0)
     random_m2 = np.where(observed, [levels.random_m2 for levels in before], 0.0).sum(axis=0) / count
-    scatter_m = SMALL_SAMPLE / MEDIAN_ABSOLUTE_NORMAL * _nanmedian(np.abs(change_m - median_m), 0)
-    single_m2 = np.fmax(random_m2, scatter_m**2)
     known = observed.sum(axis=0) >= least
     return BlockLevels(
-        np.where(known, median_m, np.nan), np.where(known, MEDIAN_VARIANCE * single_m2 / count, 0.0)
+        np.where(known, _nanmedian(change_m, 0), np.nan),
+        np.where(known, MEDIAN_VARIANCE * random_m2 / count, 0.0),
     )
+
+
+def scan_scatter(history_m: Floats) -> Floats:
+    """Return the variance (by, bx) of the change of a block in one scan, as consecutive scans differ [m²].
+
+    `history_m` (n, by, bx) are scans in order of time. The tenth largest of a hundred differences tells it, so
+    that one event does not, but a block at an edge does, which beams hit in some scans and miss in others.
+    As its neighbours are on the same edge, a block has the largest variance of those around it.
+    """
+    differences_m = np.abs(np.diff(history_m, axis=0))
+    ordered = np.sort(differences_m, axis=0)  # NaN last
+    count = np.isfinite(differences_m).sum(axis=0)
+    rank = np.maximum(np.ceil(SCATTER_QUANTILE * count).astype(np.int64) - 1, 0)
+    typical_m = np.take_along_axis(ordered, rank[None], 0)[0]
+    scatter_m2 = np.where(count > 0, typical_m, 0.0) ** 2 / (2 * SCATTER_SIGMAS**2)
+    return np.asarray(ndimage.maximum_filter(np.nan_to_num(scatter_m2), 3))
 
 
 def detect_regions(
     before: list[BlockLevels],
     after: tuple[BlockLevels, BlockLevels],
     systematic_m2: tuple[Floats, Floats],
+    scatter_m2: Floats,
     rock: Bools,
     thresholds: Thresholds,
     least_before: int = 3,
@@ -119,13 +135,12 @@ def detect_regions(
     """Return the regions that two scans show to have changed since the scans before, the largest first.
 
     `systematic_m2` (by, bx) is the variance of the systematic errors in the difference of each of the two
-    scans and those before, `rock` marks blocks of bare ground. Both scans must show the change with the same
-    sign, beyond the thresholds.
+    scans and those before, `scatter_m2` (by, bx) that of `scan_scatter`, `rock` marks blocks of bare ground.
+    Both scans must show the change with the same sign, beyond the thresholds.
     """
     base = before_level(before, least_before)
-    single_m2 = base.random_m2 * len(before) / MEDIAN_VARIANCE
     first, second = (
-        _contrast(base, levels, np.fmax(levels.random_m2, single_m2), shared_m2, rock)
+        _contrast(base, levels, shared_m2, scatter_m2, rock)
         for levels, shared_m2 in zip(after, systematic_m2, strict=True)
     )
     regions = list(_widespread_regions(first, second, thresholds.widespread))
@@ -134,16 +149,17 @@ def detect_regions(
 
 
 def _contrast(
-    base: BlockLevels, levels: BlockLevels, random_m2: Floats, systematic_m2: Floats, rock: Bools
+    base: BlockLevels, levels: BlockLevels, systematic_m2: Floats, scatter_m2: Floats, rock: Bools
 ) -> _Contrast:
     change_m = levels.change_m - base.change_m
-    random_m2 = random_m2 + base.random_m2
+    random_m2 = levels.random_m2 + base.random_m2
     excess_m = change_m - surroundings(change_m, rock)
     spread_m = surroundings(np.abs(excess_m), rock) / MEDIAN_ABSOLUTE_NORMAL
     usual_m2 = surroundings(np.where(np.isfinite(change_m), random_m2, np.nan), rock)
-    # Melt and drifts of snow differ from block to block, and their neighbours alike.
+    # Melt and drifts of snow differ from block to block, edges from scan to scan, and their neighbours alike.
     patchy_m2 = np.nan_to_num(np.maximum(spread_m**2 - usual_m2, 0.0))
-    return _Contrast(change_m, excess_m, random_m2, np.nan_to_num(systematic_m2), patchy_m2)
+    edge_m2 = np.where(scatter_m2 > EDGE_RATIO * levels.random_m2, EDGE_VARIANCE * scatter_m2, 0.0)
+    return _Contrast(change_m, excess_m, random_m2, np.nan_to_num(systematic_m2), patchy_m2, edge_m2)
 
 
 def surroundings(values: Floats, rock: Bools, excluded: Bools | None = None) -> Floats:
@@ -162,7 +178,9 @@ def surroundings(values: Floats, rock: Bools, excluded: Bools | None = None) -> 
         smooth = _nanmedian(around, 2)
         if not np.isfinite(smooth).any():
             continue
-        nearest = ndimage.distance_transform_edt(np.isnan(smooth), return_distances=False, return_indices=True)
+        nearest = ndimage.distance_transform_edt(
+            np.isnan(smooth), return_distances=False, return_indices=True
+        )
         smooth = smooth[tuple(nearest)]
         row, column = ((np.arange(size) - (TILE - 1) / 2) / TILE for size in values.shape)
         coordinates = np.meshgrid(row, column, indexing="ij")
@@ -199,31 +217,34 @@ def _local_regions(first: _Contrast, second: _Contrast, sigmas: float) -> Iterat
         mean_m, window_z = _confirmed(*means), _confirmed(*z)
         hit = (np.abs(window_z) > sigmas) & (np.abs(mean_m) > MIN_DEPTH_M)
         for row, column in np.argwhere(hit).tolist():  # few
-            blocks = slice(row, row + size), slice(column, column + size)
-            higher = np.abs(score[blocks]) < abs(window_z[row, column])
-            score[blocks][higher] = window_z[row, column]
-            depth_m[blocks][higher] = mean_m[row, column]
+            window = slice(row, row + size), slice(column, column + size)
+            higher = np.abs(score[window]) < abs(window_z[row, column])
+            score[window][higher] = window_z[row, column]
+            depth_m[window][higher] = mean_m[row, column]
     block_z = _confirmed(*(_window_scores(contrast, 1)[1] for contrast in (first, second)))
     excess_m = _confirmed(first.excess_m, second.excess_m)
     for sign in (1, -1):
         inside = sign * score > 0
         member = inside & (sign * excess_m > sign * depth_m / 2)
         member |= (sign * block_z > EXTENT_SIGMAS) & (sign * excess_m > MIN_DEPTH_M / 2)
-        labels, _ = ndimage.label(member, np.ones((3, 3)))
+        labels, _ = ndimage.label(ndimage.binary_dilation(member, NEIGHBOURS, GAP_BLOCKS // 2))
         for label in np.unique(labels[member & inside]).tolist():
-            blocks = np.asarray(labels == label)
+            blocks = (labels == label) & member
             if np.count_nonzero(blocks) >= MIN_BLOCKS:
                 most = float(np.max(sign * score[blocks]))
-                yield Region(blocks, sign, widespread=False, mean_m=float(excess_m[blocks].mean()), sigmas=most)
+                yield Region(
+                    blocks, sign, widespread=False, mean_m=float(excess_m[blocks].mean()), sigmas=most
+                )
 
 
 def _window_scores(contrast: _Contrast, size: int) -> tuple[Floats, Floats]:
-    """Return mean excess [m] and its z of all windows (by - size + 1, bx - size + 1); 0 if hardly observed."""
+    """Return mean excess [m] and z of all windows (by - size + 1, bx - size + 1); 0 if hardly observed."""
     observed = np.isfinite(contrast.excess_m) & (contrast.random_m2 > 0)
+    correlated_m2 = contrast.systematic_m2 + np.maximum(contrast.patchy_m2, contrast.edge_m2)
     count = np.maximum(_window_sums(observed, size), 1)
     mean_m, random_m2, systematic_m2 = (
         _window_sums(np.where(observed, values, 0.0), size) / count
-        for values in (contrast.excess_m, contrast.random_m2, contrast.systematic_m2 + contrast.patchy_m2)
+        for values in (contrast.excess_m, contrast.random_m2, correlated_m2)
     )
     usable = _window_sums(observed, size) >= MIN_OBSERVED * size**2
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -247,7 +268,9 @@ def _window_sums(values: Floats | Bools, size: int) -> Floats:
     """Return the sums over all windows of size × size."""
     total = np.zeros((values.shape[0] + 1, values.shape[1] + 1))
     np.cumsum(np.cumsum(values, axis=0, dtype=np.float64), axis=1, out=total[1:, 1:])
-    return np.asarray(total[size:, size:] - total[:-size, size:] - total[size:, :-size] + total[:-size, :-size])
+    return np.asarray(
+        total[size:, size:] - total[:-size, size:] - total[size:, :-size] + total[:-size, :-size]
+    )
 
 
 def _confirmed(first: Floats, second: Floats) -> Floats:
@@ -280,7 +303,9 @@ def _tile_scores(contrast: _Contrast) -> tuple[Floats, Floats]:
     observed = np.isfinite(change_m)
     count = observed.sum(axis=2)
     mean_m = np.where(count >= MIN_BLOCKS, _nanmedian(change_m, 2), np.nan)
-    variances = [np.where(observed, v, 0.0).sum(axis=2) / np.maximum(count, 1) for v in (random_m2, systematic_m2)]
+    variances = [
+        np.where(observed, v, 0.0).sum(axis=2) / np.maximum(count, 1) for v in (random_m2, systematic_m2)
+    ]
     with np.errstate(divide="ignore", invalid="ignore"):
         z = mean_m / np.sqrt(MEDIAN_VARIANCE * variances[0] / np.maximum(count, 1) + variances[1])
     return mean_m, np.nan_to_num(z)
@@ -292,17 +317,19 @@ def surrounding_weights(blocks: Bools, usable: Bools, margin: int = TILE) -> Flo
     Around is the rectangle of the blocks, widened by `margin`. Without usable blocks it is the plain mean.
     """
     rows, columns = (np.flatnonzero(blocks.any(axis=axis)) for axis in (1, 0))
-    window = tuple(slice(max(int(index[0]) - margin, 0), int(index[-1]) + margin + 1) for index in (rows, columns))
+    window = tuple(
+        slice(max(int(index[0]) - margin, 0), int(index[-1]) + margin + 1) for index in (rows, columns)
+    )
     around = np.zeros_like(blocks)
-    near = ndimage.binary_dilation(blocks, np.ones((3, 3)))
+    near = ndimage.binary_dilation(blocks, NEIGHBOURS)
     around[window] = usable[window] & ~near[window]
-    weights = blocks / np.count_nonzero(blocks)
-    return weights - around / max(np.count_nonzero(around), 1)
+    weights = blocks / int(np.count_nonzero(blocks))
+    return weights - around / max(int(np.count_nonzero(around)), 1)
 
 
 def overlaps(first: Bools, second: Bools, margin: int = 1) -> bool:
     """Return True if regions (by, bx) overlap, or are less than `margin` blocks apart."""
-    return bool((ndimage.binary_dilation(first, np.ones((3, 3)), margin) & second).any())
+    return bool((ndimage.binary_dilation(first, NEIGHBOURS, margin) & second).any())
 
 
 def distance_blocks(first: Bools, second: Bools) -> float:
