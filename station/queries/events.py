@@ -43,6 +43,7 @@ from station.science.analysis.events import (
     scan_scatter,
     surrounding_weights,
 )
+from station.science.analysis.voids import area_weights, void_variance
 from station.science.geometry.robust_statistics import nmad
 
 HISTORY = 24  # scans before the two newest, which show how a block scatters
@@ -52,16 +53,17 @@ LEAST_BEFORE = 3  # of them must have seen a block
 YEAR_S = 365.25 * 86_400
 CACHED_EPOCHS = BEFORE + 4  # whose blocks are in memory
 NEIGHBOURS = np.ones((3, 3), np.bool_)  # of a block, itself included
+RETAINED_SIGMA = 0.02  # of the share of a change that cells with few points retain (accuracy.md)
+EDGE_BLOCKS = 2  # around what was detected: an event covers them in part
 EDGE_SIGMAS = 3.0  # of a block at the edge that has changed the other way: it belongs to another event
 
 
 @dataclass(frozen=True)
 class _Volume:
-    """Volume of an event, its σ, and the area that is known of it."""
+    """Volume of an event and its σ."""
 
     volume_m3: float
     sigma_m3: float
-    area_m2: float
 
 
 class EventQueries:
@@ -267,9 +269,10 @@ class EventQueries:
         return _Volume(*self._remember(key, lambda: self._measure(track, others, before, after)))
 
     def _measure(self, track: Track, others: Bools, before: list[int], after: list[int]) -> list[float]:
-        """Return volume [m³], its σ [m³] and area [m²] of an event, from the scans before and after it.
+        """Return the volume of an event and its σ [m³], from the scans before and after it.
 
-        A widespread event counts in full, another one less what its surroundings did.
+        A widespread event counts in full, another one less what its surroundings did. Blocks within it that
+        were not observed are interpolated.
         """
         newest = self._with_jacobian(after[-1])
         base = before_level([self._levels(scan) for scan in before], LEAST_BEFORE)
@@ -278,22 +281,32 @@ class EventQueries:
         known = np.isfinite(change_m) & newest.observed
         core = track.blocks & known
         if not core.any():
-            return [0.0, 0.0, 0.0]
+            return [0.0, 0.0]
         rock = newest.rock > 0.5
         ground = rock if rock[core].mean() > 0.5 else ~rock
-        weights = _volume_weights(track, core, known, known & ground & ~others, change_m, random_m2)
-        block_m2 = self.grid.cell_m**2
-        weights *= block_m2
+        members = _members(track, core, known, known & ground & ~others, change_m, random_m2)
+        surface = self._queries.reference_blocks(self._usable[after[-1]][1])["known"] > 0
+        if not track.widespread:
+            members |= ndimage.binary_closing(core, NEIGHBOURS, EDGE_BLOCKS) & ~known & surface
+        filled, distance = area_weights(members, known)
+        area_m2 = np.count_nonzero(members) * self.grid.cell_m**2
+        around = np.zeros_like(filled)
+        if not track.widespread:
+            around = np.maximum(-surrounding_weights(members, known & ground & ~others), 0.0)
+        weights = area_m2 * (filled - around)
         volume_m3 = float(np.sum(weights[known] * change_m[known]))
         variance = float(np.sum(weights[known] ** 2 * random_m2[known]))
         variance += self._shared_variance(newest, self._read(before[-1]), weights)
         variance += _sampling_variance(newest.count, self._queries.cells, weights, change_m)
-        around = known & (weights < 0)
+        variance += area_m2**2 * void_variance(
+            members, distance, np.where(known, change_m, np.nan), random_m2
+        )
+        variance += (RETAINED_SIGMA * volume_m3) ** 2
         if np.count_nonzero(around) > PATCH_BLOCKS:
-            patchy_m2 = max(nmad(change_m[around]) ** 2 - float(np.median(random_m2[around])), 0.0)
-            count = int(np.count_nonzero(weights > 0))
-            variance += patchy_m2 * block_m2**2 * count * min(count, PATCH_BLOCKS)
-        return [round(volume_m3, 4), round(float(np.sqrt(variance)), 4), np.count_nonzero(core) * block_m2]
+            patchy_m2 = max(nmad(change_m[around > 0]) ** 2 - float(np.median(random_m2[around > 0])), 0.0)
+            count = int(np.count_nonzero(members))
+            variance += area_m2**2 * patchy_m2 * min(1.0, PATCH_BLOCKS / count)
+        return [round(volume_m3, 4), round(float(np.sqrt(variance)), 4)]
 
     @staticmethod
     def _shared_variance(newest: Blocks, before: Blocks, weights: Floats) -> float:
@@ -316,21 +329,20 @@ def _mean_level(first: BlockLevels, second: BlockLevels) -> BlockLevels:
     return BlockLevels(mean_m, random_m2)
 
 
-def _volume_weights(
+def _members(
     track: Track, core: Bools, known: Bools, usable: Bools, change_m: Floats, random_m2: Floats
-) -> Floats:
-    """Return the weights (by, bx) that sum the change of an event's blocks, and of those at its edge.
+) -> Bools:
+    """Return the observed blocks (by, bx) of an event, with those at its edge, which it covers in part.
 
     Blocks at the edge that changed the other way belong to another event.
     """
     if track.widespread:
-        return core.astype(np.float64)
+        return core.copy()
     around = np.maximum(-surrounding_weights(core, usable), 0.0)
     level_m = float(np.sum(around[around > 0] * change_m[around > 0]))
     opposite_m = -track.sign * (change_m - level_m)
-    edge = ndimage.binary_dilation(core, NEIGHBOURS) & known
-    members = core | (edge & (opposite_m < EDGE_SIGMAS * np.sqrt(random_m2)))
-    return surrounding_weights(members, usable) * np.count_nonzero(members)
+    edge = ndimage.binary_dilation(core, NEIGHBOURS, EDGE_BLOCKS) & known
+    return np.asarray(core | (edge & (opposite_m < EDGE_SIGMAS * np.sqrt(random_m2))))
 
 
 def _sampling_variance(count: Floats, cells: int, weights: Floats, change_m: Floats) -> float:

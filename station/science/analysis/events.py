@@ -110,8 +110,8 @@ def before_level(before: list[BlockLevels], least: int) -> BlockLevels:
 def scan_scatter(history_m: Floats) -> Floats:
     """Return the variance (by, bx) of the change of a block in one scan, as consecutive scans differ [m²].
 
-    `history_m` (n, by, bx) are scans in order of time. The tenth largest of a hundred differences tells it, so
-    that one event does not, but a block at an edge does, which beams hit in some scans and miss in others.
+    `history_m` (n, by, bx) are scans in order of time. The tenth largest of a hundred differences tells it,
+    so that one event does not, but a block at an edge does, which beams hit in some scans only.
     As its neighbours are on the same edge, a block has the largest variance of those around it.
     """
     differences_m = np.abs(np.diff(history_m, axis=0))

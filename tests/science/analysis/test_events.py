@@ -116,7 +116,7 @@ def test_steady_melt_is_widespread_and_no_local_event():
     regions = valley.regions(scans)
     assert [(region.widespread, region.sign) for region in regions] == [(True, -1)]
     assert np.mean(ROCK[regions[0].blocks]) < 0.05
-    true_m = 3.5 * rate_m[regions[0].blocks].mean()  # from the middle of six scans to the first of the two
+    true_m = 3.5 * rate_m[regions[0].blocks].mean()  # from amid six scans to the next
     assert regions[0].mean_m == pytest.approx(true_m, rel=0.1)
 
 
@@ -149,7 +149,7 @@ def test_scatter_is_that_of_consecutive_scans_whatever_the_trend():
 
 
 def test_blocks_at_an_edge_raise_no_event():
-    """Beams that move a little hit the one or the other side of a rock step of 1.2 m, along a whole column."""
+    """Beams that move a little hit either side of a rock step of 1.2 m, along a whole column."""
     valley = Valley(8)
     scans = []
     for _ in range(26):
