@@ -26,7 +26,7 @@ from station.queries.events import EventQueries
 GRID = Grid(west_m=632_000.0, north_m=5_186_000.0, cell_m=5.0, nx=60, ny=50)
 RANDOM_M = 0.02
 SHARED = random_shared(1, GRID)
-HOURS, EVENT_HOUR = 16, 12
+HOURS, EVENT_HOUR = 14, 10
 Y_M, X_M = GRID.y_m[:, None] - GRID.north_m, GRID.x_m[None, :] - GRID.west_m
 DEPOSIT = (X_M - 180) ** 2 + (Y_M + 160) ** 2 < 20**2
 SCAR = (X_M - 80) ** 2 + (Y_M + 60) ** 2 < 15**2
@@ -52,6 +52,16 @@ def make_epoch(hour):
 def write(series, hours):
     for hour in hours:
         epochs.write_epoch(series, make_epoch(hour))
+    build_series(series)
+
+
+def copy_scans(base, series, hours):
+    """Let the scans of some hours arrive in another store."""
+    paths = sorted((base.folder / "epochs").rglob("*.nc"))
+    for hour in hours:
+        target = series.folder / paths[hour].relative_to(base.folder)
+        target.parent.mkdir(parents=True, exist_ok=True)
+        shutil.copyfile(paths[hour], target)
     build_series(series)
 
 
@@ -104,12 +114,12 @@ def test_scar_and_deposit_are_a_pair_with_the_true_volumes(base):
     assert deposit.confirmed[11:13] == f"{(int(deposit.begin[11:13]) + 1):02}"
 
 
-def test_the_second_scan_tells_an_event_and_no_scan_before(tmp_path):
+def test_the_second_scan_tells_an_event_and_no_scan_before(base, tmp_path):
     series = empty_store(tmp_path / "store")
-    write(series, range(EVENT_HOUR + 1))
+    copy_scans(base, series, range(EVENT_HOUR + 1))
     update(series)
     assert read_events(series.folder) == []
-    write(series, [EVENT_HOUR + 1])
+    copy_scans(base, series, [EVENT_HOUR + 1])
     update(series)
     assert {event.state for event in read_events(series.folder)} == {"active"}
     assert len(read_events(series.folder)) == 2
@@ -118,13 +128,14 @@ def test_the_second_scan_tells_an_event_and_no_scan_before(tmp_path):
 def test_live_equals_anew_and_a_late_scan(base, tmp_path):
     """Scan by scan, and with one scan that comes last; each searches only windows that changed."""
     live = empty_store(tmp_path / "live")
-    for hour in range(HOURS):
-        if hour != 11:
-            write(live, [hour])
-            assert update(live)[0] <= 1
+    copy_scans(base, live, range(EVENT_HOUR - 1))
+    update(live)
+    for hour in range(EVENT_HOUR, HOURS):
+        copy_scans(base, live, [hour])
+        assert update(live)[0] == 1
     assert table(live) != table(base)
-    write(live, [11])
-    assert 0 < update(live)[0] <= HOURS - 10
+    copy_scans(base, live, [EVENT_HOUR - 1])
+    assert update(live)[0] == HOURS - EVENT_HOUR + 1
     assert table(live) == table(base)
 
 
