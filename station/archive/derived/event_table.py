@@ -1,6 +1,6 @@
 """`events.geojson`: where and when the surface changed, one feature an event, and what it was found from.
 
-The table is written anew with each epoch, from the regions that each scan shows. These are kept beside it
+The table is written with each epoch, from the regions that each scan shows. These are kept beside it
 with the names of the scans that they were found in, so that only what a new or late scan touches is searched
 again.
 """
