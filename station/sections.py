@@ -387,6 +387,17 @@ class ChangeAlarm(Section):
     false_alarms_per_year: Positive = 1.0
 
 
+class EventAlarm(Section):
+    """The events anywhere on the grid that raise an alarm."""
+
+    kinds: tuple[Literal["loss", "gain", "paired", "melt_front", "snowfall"], ...] = (
+        "loss",
+        "gain",
+        "paired",
+    )
+    least_m3: NotNegative = 0.0
+
+
 class AlarmsSection(Section):
     """The alarm rules, and the targets (names of credentials) that are notified. 0 disables a rule."""
 
@@ -400,6 +411,7 @@ class AlarmsSection(Section):
     z_std: NotNegative = 1.5
     moved: bool = True
     change: ChangeAlarm | None = None
+    events: EventAlarm | None = None
 
 
 class ProductsSection(Section):

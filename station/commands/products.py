@@ -1,4 +1,4 @@
-"""`station areas`, `station trend`, `station plot` and `station serve`."""
+"""`station areas`, `station trend`, `station events`, `station plot` and `station serve`."""
 
 from __future__ import annotations
 
@@ -39,6 +39,16 @@ class MapVariable(StrEnum):
     change = "change"
     sigma = "sigma"
     points = "points"
+
+
+class EventKind(StrEnum):
+    """Kinds of events."""
+
+    loss = "loss"
+    gain = "gain"
+    paired = "paired"
+    melt_front = "melt_front"
+    snowfall = "snowfall"
 
 
 def areas(
@@ -86,6 +96,26 @@ def trend(
     period = every.value if every else None
     records = trend_records(settings, polygons, span, area, period, progress_bar("summing up"))
     print_or_write(as_text(records) if table is None else as_csv(records), table)
+
+
+def events(
+    site: SiteArgument,
+    kind: Annotated[EventKind | None, typer.Option(help="Only of this kind.", show_default=False)] = None,
+    first: FromOption = None,
+    last: ToOption = None,
+    table: CsvOption = None,
+) -> None:
+    """Print where and when the surface changed, anywhere on the grid.
+
+    Loss and gain against the surroundings, pairs of scar and deposit, snowfall and melt, each
+    with its volume and 95 % interval. The outlines are in events.geojson of the data folder.
+    """
+    from station.config import read_site
+    from station.products.area_tables import Span
+    from station.products.event_tables import as_csv, as_text, select_events
+
+    found = select_events(read_site(site), Span.parse(first, last), kind.value if kind else None)
+    print_or_write(as_text(found) if table is None else as_csv(found), table)
 
 
 def _print_epochs(settings: Site, *texts: str) -> None:

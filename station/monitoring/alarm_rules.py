@@ -24,8 +24,9 @@ from station.monitoring.area_curves import AreaCurve, read_curves
 from station.monitoring.preconditions import require_disk_space
 from station.readers.formats.conversion import scan_suffixes
 from station.science.analysis.change_detection import ChangeDetections, detect_changes, threshold_sigmas
+from station.science.geometry.robust_statistics import NORMAL_95
 from station.science.gridding.significance import SIGNIFICANT_SIGMAS
-from station.sections import AlarmsSection, ChangeAlarm
+from station.sections import AlarmsSection, ChangeAlarm, EventAlarm
 
 log = logging.getLogger("station")
 
@@ -66,6 +67,9 @@ def evaluate_rules(
     if rules.change:
         change = rules.change
         evaluate_rule("areas have changed", lambda: _area_changes(site, change, assessed_until_utc_s))
+    if rules.events:
+        events = rules.events
+        evaluate_rule("an event began", lambda: _events(site, events, assessed_until_utc_s))
     return alarms
 
 
@@ -187,6 +191,25 @@ def _area_changes(site: Site, rule: ChangeAlarm, assessed_until_utc_s: float | N
         is_new[-1:] |= detections.detected[-1:]
         if is_new.any():
             yield _change_alarm(curve, detections, rule, int(np.flatnonzero(is_new)[-1]))
+
+
+def _events(site: Site, rule: EventAlarm, assessed_until_utc_s: float | None) -> Iterator[Alarm]:
+    """Yield an alarm per event that is active, or was confirmed by an epoch not assessed yet."""
+    from station.archive.derived.event_table import read_events  # noqa: PLC0415 - imports netCDF4
+
+    for event in read_events(site.station.data):
+        confirmed_s = datetime.fromisoformat(event.confirmed).timestamp()
+        is_new = assessed_until_utc_s is not None and confirmed_s > assessed_until_utc_s
+        if event.kind not in rule.kinds or abs(event.volume_m3) < rule.least_m3:
+            continue
+        if is_new or event.state == "active":
+            half_m3 = NORMAL_95 * event.volume_sigma_m3
+            text = (
+                f"{event.kind} of {event.volume_m3:+.0f} m³ (± {half_m3:.0f} m³ at 95 %) on"
+                f" {event.area_m2:.0f} m² at {event.east_m:.0f} {event.north_m:.0f},"
+                f" {event.begin[:16].replace('T', ' ')} UTC"
+            )
+            yield Alarm(f"event {event.id}", text, size=abs(event.volume_m3))
 
 
 def change_alarms(

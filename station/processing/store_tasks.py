@@ -20,6 +20,7 @@ from station.processing.site_files import load_area_polygons, load_areas, series
 from station.processing.workers.worker_process import Progress
 from station.queries.aggregates import Aggregates
 from station.queries.blocks import BlockQueries, update_boxes
+from station.queries.events import EventQueries
 
 Checksums = dict[str, str]  # SHA-256 by file, relative to the data folder
 
@@ -43,7 +44,9 @@ def update_series(site: Site, progress: Progress) -> int:
     progress()
     try:
         update_areas(series, load_areas(site), Aggregates(series), progress, load_area_polygons(site))
-        update_boxes(series, BlockQueries(series), progress)
+        blocks = BlockQueries(series)
+        needed = EventQueries(series, blocks, site.scans.expected_every_s).update(progress)
+        update_boxes(series, blocks, progress, needed)
     except (OSError, RuntimeError) as error:
         raise StoreError(f"{series.folder}: an epoch is damaged: {error}") from error
     return compaction.count_compactable(series)

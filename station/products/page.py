@@ -14,6 +14,7 @@ import jinja2
 import numpy as np
 
 from station._version import __version__
+from station.archive.derived.event_table import read_events
 from station.archive.netcdf_layout import Series
 from station.archive.series.index import SeriesIndex
 from station.products.epoch_table import AreaSeries, EpochTable, read_area_series, read_epoch_table
@@ -28,6 +29,7 @@ from station.products.gallery import (
 from station.products.maps import ASSETS
 from station.products.overview import Overview
 from station.quantities import Floats
+from station.science.geometry.robust_statistics import NORMAL_95
 from station.science.gridding.significance import SIGNIFICANT_SIGMAS
 
 STATIC = {  # the parts of each file; a single style sheet is a single round trip
@@ -39,6 +41,7 @@ STATIC = {  # the parts of each file; a single style sheet is a single round tri
 MAX_CURVE_POINTS = 250  # of a curve; of a longer series every nth, the newest included
 MAX_AREAS = 8  # with a curve, so that the page stays small
 TABLE_ROWS = 24
+MAX_EVENTS = 20  # newest events in the table
 MAX_LISTED = 20  # scans that wait or were set aside
 CALIBRATED_Z_STD = (0.8, 1.25)  # limits of the standard deviation of change / sigma on stable ground
 RECENT_SCANS = 24  # scans used for it
@@ -179,6 +182,7 @@ def _render(
     gallery: Gallery,
     area_count: int,
 ) -> str:
+    events = read_events(series.folder)
     recent = range(max(0, len(table) - TABLE_ROWS), len(table))[::-1] if table is not None else []
     return PAGE.render(
         id=series.station_id,
@@ -192,6 +196,9 @@ def _render(
         set_aside=context.set_aside[-MAX_LISTED:][::-1],
         max_listed=MAX_LISTED,
         areas_left_out=area_count - len(areas),
+        events=events[: -MAX_EVENTS - 1 : -1],
+        events_left_out=max(0, len(events) - MAX_EVENTS),
+        half_95=NORMAL_95,
     )
 
 

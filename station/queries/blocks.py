@@ -7,7 +7,7 @@ changes little within 10 m. Larger blocks are weighted sums of such blocks. Sour
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
 from typing import Any
@@ -50,6 +50,7 @@ class Blocks:
     change_m: Floats
     random_m2: Floats  # variance of the mean
     reference_m2: Floats  # the part of it that comes from the reference, at the mean of its known cells
+    rock: Floats  # share of the cells that are bare ground
     jacobian: HeightJacobian | None  # of the observed blocks; None if the epoch has no shared parameters
     cells: EpochCells  # without cells: the shared parameters
 
@@ -57,6 +58,11 @@ class Blocks:
     def observed(self) -> Bools:
         """Blocks with a change."""
         return np.asarray(self.count > 0)
+
+    @property
+    def own_random_m2(self) -> Floats:
+        """Variance of the mean without the part that comes from the reference (by, bx)."""
+        return np.maximum(self.random_m2 - self.reference_m2, 0.0)
 
     @property
     def parameters(self) -> tuple[str, ...]:
@@ -81,7 +87,7 @@ class BlockQueries:
 
     def boxes(self, epoch: EpochRef) -> Rasters:
         """Return the rasters of `boxes.nc` of an epoch."""
-        blocks, size = self._read(epoch), self.blocks_per_box
+        blocks, size = self.read(epoch), self.blocks_per_box
         shape = -(-blocks.count.shape[0] // size), -(-blocks.count.shape[1] // size)
         row, column = np.nonzero(blocks.observed)
         box, count = row // size * shape[1] + column // size, blocks.count[blocks.observed]
@@ -110,7 +116,7 @@ class BlockQueries:
         change causes, are common to all epochs. Blocks that some epochs did not observe get the mean
         covariance of the day.
         """
-        day = [self._read(epoch) for epoch in epochs]
+        day = [self.read(epoch) for epoch in epochs]
         day = [blocks for blocks in day if blocks.parameters == day[-1].parameters]
         epoch_count = np.sum([blocks.observed for blocks in day], axis=0)
         seen, count = epoch_count > 0, np.maximum(epoch_count, 1)
@@ -138,14 +144,14 @@ class BlockQueries:
             "epoch_count": epoch_count
         }
 
-    def _read(self, epoch: EpochRef) -> Blocks:
-        """Return the blocks of an epoch."""
+    def read(self, epoch: EpochRef, *, with_jacobian: bool = True) -> Blocks:
+        """Return the blocks of an epoch; without the Jacobian of blocks only their means."""
         epoch_cells = self._reader.read_shared(epoch)
         sums, surface = epoch_sums(self._series, epoch), self._reference_sums(epoch_cells.reference)
         count, known = np.maximum(sums["count"], 1), np.maximum(surface["known"], 1)
         observed = (sums["count"] > 0) & (surface["known"] > 0)
         jacobian = None
-        if epoch_cells.shared is not None:
+        if with_jacobian and epoch_cells.shared is not None:
             jacobian = self._jacobian(epoch_cells, sums, surface, observed)
         random_m2 = sums["random_m2"] / count**2
         return Blocks(
@@ -153,9 +159,14 @@ class BlockQueries:
             np.where(observed, sums["change_m"] / count, 0.0),
             np.where(observed, random_m2, 0.0),
             np.where(observed, np.minimum(surface["random_m2"] / known / count, random_m2), 0.0),
+            sums["rock"] / count,
             jacobian,
             epoch_cells,
         )
+
+    def reference_blocks(self, version: str) -> Sums:
+        """Return the sums of a version of the reference over its blocks."""
+        return self._reference_sums(self._reader.reference(version))
 
     def _reference_sums(self, reference: Reference) -> Sums:
         if reference.version not in self._surfaces:
@@ -214,11 +225,13 @@ def _covariance_between(first: EpochCells, second: EpochCells) -> Floats | None:
     return reference.covariance if reference is not None and reference.names == first.shared.names else None
 
 
-def update_boxes(series: Series, queries: BlockQueries, progress: Callable[[], None]) -> None:
+def update_boxes(
+    series: Series, queries: BlockQueries, progress: Callable[[], None], keep: Collection[str] = ()
+) -> None:
     """Bring `boxes.nc` and `daily.nc` up to date with the epochs of `series.nc` that have a reference.
 
-    A day is in `daily.nc` when a later day has begun; unusable epochs do not count. Raises as
-    `update_blocks`.
+    A day is in `daily.nc` when a later day has begun; unusable epochs do not count. The sums of the epochs
+    named in `keep` are kept, as those of the last day are. Raises as `update_blocks`.
     """
     index = SeriesIndex(series)
     if not len(index):
@@ -246,7 +259,7 @@ def update_boxes(series: Series, queries: BlockQueries, progress: Callable[[], N
         progress,
     )
     last_day = np.flatnonzero(start_s // DAY_S == start_s[-1] // DAY_S).tolist()
-    drop_epoch_sums(series, {index[position].epoch_file for position in last_day})
+    drop_epoch_sums(series, {*keep, *(index[position].epoch_file for position in last_day)})
 
 
 def _closed_days(

@@ -1,0 +1,373 @@
+"""Events of a store: regions in each scan, volumes with σ, and the table. Source: equations.md, 6.11."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from datetime import UTC, datetime
+from functools import lru_cache, partial
+from typing import Any
+
+import h5py
+import numpy as np
+import shapely
+from scipy import ndimage, sparse
+
+from station.archive.chunk_codec import read_column
+from station.archive.derived.event_table import (
+    Event,
+    decode_blocks,
+    encode_blocks,
+    outline,
+    read_found,
+    write_events,
+    write_found,
+)
+from station.archive.netcdf_layout import Series
+from station.archive.schema import VERDICTS
+from station.archive.series.index import SeriesIndex
+from station.quantities import Bools, Floats, Grid, SharedParameters
+from station.queries.aggregates import common_error_covariance
+from station.queries.block_sums import epoch_sums
+from station.queries.blocks import BlockQueries, Blocks
+from station.science.analysis.calibration import SparseJacobian
+from station.science.analysis.event_tracks import Track, pair_tracks, track_events
+from station.science.analysis.events import (
+    PATCH_BLOCKS,
+    BlockLevels,
+    Region,
+    before_level,
+    detect_regions,
+    event_thresholds,
+    scan_scatter,
+    surrounding_weights,
+)
+from station.science.analysis.voids import area_weights, void_variance
+from station.science.geometry.robust_statistics import nmad
+
+HISTORY = 24  # scans before the two newest, which show how a block scatters
+LEAST_HISTORY = 8
+BEFORE = 6  # the last of them, with which the two newest are compared
+LEAST_BEFORE = 3  # of them must have seen a block
+YEAR_S = 365.25 * 86_400
+CACHED_EPOCHS = BEFORE + 4  # whose blocks are in memory
+NEIGHBOURS = np.ones((3, 3), np.bool_)  # of a block, itself included
+RETAINED_SIGMA = 0.02  # of the share of a change that cells with few points retain (accuracy.md)
+EDGE_BLOCKS = 2  # around what was detected: an event covers them in part
+EDGE_SIGMAS = 3.0  # of a block at the edge that has changed the other way: it belongs to another event
+
+
+@dataclass(frozen=True)
+class _Volume:
+    """Volume of an event and its σ."""
+
+    volume_m3: float
+    sigma_m3: float
+
+
+class EventQueries:
+    """Search for events in the epochs of a store, in windows of consecutive usable scans of one reference."""
+
+    def __init__(self, series: Series, queries: BlockQueries, expected_every_s: float) -> None:
+        self._series, self._queries, self._scans_per_year = series, queries, YEAR_S / expected_every_s
+        self._index = SeriesIndex(series)
+        self._usable = self._usable_epochs()
+        self._read = lru_cache(CACHED_EPOCHS)(self._read_blocks)
+        self._change = lru_cache(HISTORY + 2)(self._read_change)
+        self._found = read_found(series)
+        self._used: dict[str, Any] = {}  # of what was found, what is still of these epochs
+
+    def _usable_epochs(self) -> list[tuple[int, str]]:
+        """Return the position and the reference version of each usable epoch that has one."""
+        if not len(self._index):
+            return []
+        with h5py.File(self._series.path, "r") as file:
+            versions = read_column(file["reference_version"]).view(self._index.epoch_file.dtype)[:, 0]
+            usable = read_column(file["verdict"]) != VERDICTS.index("unusable")
+        positions = np.flatnonzero((versions != b"") & usable).tolist()
+        return [(position, versions[position].decode()) for position in positions]
+
+    @property
+    def grid(self) -> Grid:
+        """Grid of the blocks; those at the east and south edges may extend beyond the cells."""
+        grid, cells = self._series.grid, self._queries.cells
+        return Grid(
+            grid.west_m, grid.north_m, grid.cell_m * cells, -(-grid.nx // cells), -(-grid.ny // cells)
+        )
+
+    def update(self, progress: Callable[[], None]) -> set[str]:
+        """Bring the table up to date; return the epochs whose sums the next scan will need."""
+        if not self._usable:
+            return set()
+        tracks = track_events(self._detections(progress))
+        write_events(self._series, self._events(tracks))
+        if self._used != self._found:
+            write_found(self._series, self._used)
+        newest = len(self._usable) - 1
+        needed = set(range(newest - HISTORY, newest + 1))
+        for track in tracks:
+            if track.is_open(newest):
+                needed.update(self._window(track.first))
+        return {self._index[self._usable[number][0]].epoch_file for number in needed if number >= 0}
+
+    def _detections(self, progress: Callable[[], None]) -> Iterator[tuple[int, list[Region]]]:
+        for scan in range(len(self._usable)):
+            window = self._window(scan)
+            if len(window) < LEAST_HISTORY + 2:
+                continue
+            texts = self._remember(self._key("regions", window), partial(self._search, window, progress))
+            yield scan, [Region(decode_blocks(blocks, self.grid.shape), *values) for blocks, *values in texts]
+
+    def _window(self, scan: int) -> list[int]:
+        """Return the scans up to this one that are compared: as long as the reference is the same."""
+        version = self._usable[scan][1]
+        first = max(scan - HISTORY - 1, 0)
+        while self._usable[first][1] != version:
+            first += 1
+        return list(range(first, scan + 1))
+
+    def _remember(self, key: str, compute: Callable[[], Any]) -> Any:  # noqa: ANN401 - anything JSON can hold
+        if key not in self._used:
+            self._used[key] = self._found[key] if key in self._found else compute()
+        return self._used[key]
+
+    def _key(self, kind: str, scans: list[int], *texts: str) -> str:
+        names = [self._index.epoch_file[self._usable[scan][0]].decode() for scan in scans]
+        parts = [kind, f"{self._scans_per_year:.6g}", self._usable[scans[-1]][1], *names, *texts]
+        return hashlib.sha256("\n".join(parts).encode()).hexdigest()[:32]
+
+    def _read_blocks(self, scan: int) -> Blocks:
+        return self._queries.read(self._index[self._usable[scan][0]], with_jacobian=False)
+
+    def _read_change(self, scan: int) -> Floats:
+        sums = epoch_sums(self._series, self._index[self._usable[scan][0]])
+        count = sums["count"]
+        return np.where(count > 0, sums["change_m"] / np.maximum(count, 1), np.nan)
+
+    def _levels(self, scan: int) -> BlockLevels:
+        blocks = self._read(scan)
+        return BlockLevels(np.where(blocks.observed, blocks.change_m, np.nan), blocks.own_random_m2)
+
+    def _search(self, window: list[int], progress: Callable[[], None]) -> list[list[Any]]:
+        """Return the regions that the two newest scans of a window show: encoded blocks, and the rest."""
+        *history, first, second = window
+        before = history[-BEFORE:]
+        newest = self._with_jacobian(second)
+        systematic_m2 = [
+            self._systematic_variance(newest, self._read(scan), self._read(before[-1]))
+            for scan in (first, second)
+        ]
+        known = self._queries.reference_blocks(self._usable[second][1])["known"] > 0
+        regions = detect_regions(
+            [self._levels(scan) for scan in before],
+            (self._levels(first), self._levels(second)),
+            (systematic_m2[0], systematic_m2[1]),
+            scan_scatter(np.stack([self._change(scan) for scan in history])),
+            newest.rock > 0.5,
+            event_thresholds(int(np.count_nonzero(known)), self._scans_per_year),
+            LEAST_BEFORE,
+        )
+        progress()
+        return [
+            [
+                encode_blocks(region.blocks),
+                region.sign,
+                region.widespread,
+                round(region.mean_m, 6),
+                round(region.sigmas, 3),
+            ]
+            for region in regions
+        ]
+
+    def _with_jacobian(self, scan: int) -> Blocks:
+        return self._queries.read(self._index[self._usable[scan][0]])
+
+    @staticmethod
+    def _systematic_variance(geometry: Blocks, scan: Blocks, before: Blocks) -> Floats:
+        """Return the systematic variance of the difference of two scans (by, bx), with one Jacobian."""
+        variance_m2 = np.zeros(geometry.count.shape)
+        difference = _difference(scan, before)
+        if (
+            geometry.jacobian is not None
+            and difference is not None
+            and difference.names == geometry.parameters
+        ):
+            variance_m2[geometry.observed] = geometry.jacobian.variance(difference)
+        return variance_m2
+
+    def _events(self, tracks: list[Track]) -> Iterator[tuple[Event, shapely.Geometry]]:
+        volumes = []
+        for track in tracks:
+            others = [
+                other.blocks
+                for other in tracks
+                if other is not track and abs(other.first - track.first) <= BEFORE
+            ]
+            volumes.append(
+                self._volume_of(track, np.any(others, axis=0) if others else np.zeros_like(track.blocks))
+            )
+        version = self._usable[-1][1]
+        surface = self._queries.reference_blocks(version)
+        with np.errstate(invalid="ignore"):
+            elevation_m = surface["surface_m"] / surface["known"]
+        partners = pair_tracks(tracks, elevation_m)
+        ids = self._ids(tracks)
+        for number, (track, volume) in enumerate(zip(tracks, volumes, strict=True)):
+            event = self._event(ids[number], track, volume)
+            if number in partners:
+                other = volumes[partners[number]]
+                event = replace(
+                    event,
+                    kind="paired",
+                    partner=ids[partners[number]],
+                    balance_m3=round(volume.volume_m3 + other.volume_m3, 2),
+                    balance_sigma_m3=round(float(np.hypot(volume.sigma_m3, other.sigma_m3)), 2),
+                )
+            yield event, outline(track.blocks, self.grid)
+
+    def _ids(self, tracks: list[Track]) -> list[str]:
+        """Return the time of the first scan that shows each event, with a number if there are several."""
+        ids: list[str] = []
+        for track in tracks:
+            start = f"{self._index[self._usable[track.first - 1][0]].start:%Y%m%dT%H%M%SZ}"
+            ids.append(f"{start}-{1 + sum(name.startswith(start) for name in ids)}")
+        return ids
+
+    def _event(self, name: str, track: Track, volume: _Volume) -> Event:
+        grid, (row, column) = self.grid, np.nonzero(track.blocks)
+        size_m2 = np.count_nonzero(track.blocks) * grid.cell_m**2
+        kinds = ("snowfall", "melt_front") if track.widespread else ("gain", "loss")
+        newest = len(self._usable) - 1
+        window = self._window(track.first)
+        return Event(
+            id=name,
+            kind=kinds[0 if track.sign > 0 else 1],
+            state="active" if track.is_open(newest) else "closed",
+            after=self._time(window[-3]),
+            begin=self._time(track.first - 1),
+            confirmed=self._time(track.first),
+            end=self._time(track.grew - 1 if track.grew == track.first else track.grew),
+            east_m=round(float(grid.x_m[column].mean()), 2),
+            north_m=round(float(grid.y_m[row].mean()), 2),
+            area_m2=round(size_m2, 2),
+            volume_m3=round(volume.volume_m3, 2),
+            volume_sigma_m3=round(volume.sigma_m3, 2),
+            mean_depth_m=round(volume.volume_m3 / size_m2, 4),
+            sigmas=round(track.sigmas, 1),
+            reference_version=self._usable[track.first][1],
+        )
+
+    def _time(self, scan: int) -> str:
+        return f"{datetime.fromtimestamp(self._index.time_s[self._usable[scan][0]], UTC):%Y-%m-%dT%H:%M:%SZ}"
+
+    def _volume_of(self, track: Track, others: Bools) -> _Volume:
+        before = self._window(track.first)[:-2][-BEFORE:]
+        after = [track.last - 1, track.last]
+        texts = encode_blocks(track.blocks), encode_blocks(others)
+        key = self._key("volume", [*before, *after], *texts)
+        return _Volume(*self._remember(key, lambda: self._measure(track, others, before, after)))
+
+    def _measure(self, track: Track, others: Bools, before: list[int], after: list[int]) -> list[float]:
+        """Return the volume of an event and its σ [m³], from the scans before and after it.
+
+        A widespread event counts in full, another one less what its surroundings did. Blocks within it that
+        were not observed are interpolated.
+        """
+        newest = self._with_jacobian(after[-1])
+        base = before_level([self._levels(scan) for scan in before], LEAST_BEFORE)
+        level = _mean_level(self._levels(after[0]), self._levels(after[1]))
+        change_m, random_m2 = level.change_m - base.change_m, level.random_m2 + base.random_m2
+        known = np.isfinite(change_m) & newest.observed
+        core = track.blocks & known
+        if not core.any():
+            return [0.0, 0.0]
+        rock = newest.rock > 0.5
+        ground = rock if rock[core].mean() > 0.5 else ~rock
+        members = _members(track, core, known, known & ground & ~others, change_m, random_m2)
+        surface = self._queries.reference_blocks(self._usable[after[-1]][1])["known"] > 0
+        if not track.widespread:
+            members |= ndimage.binary_closing(core, NEIGHBOURS, EDGE_BLOCKS) & ~known & surface
+        filled, distance = area_weights(members, known)
+        area_m2 = np.count_nonzero(members) * self.grid.cell_m**2
+        around = np.zeros_like(filled)
+        if not track.widespread:
+            around = np.maximum(-surrounding_weights(members, known & ground & ~others), 0.0)
+        weights = area_m2 * (filled - around)
+        volume_m3 = float(np.sum(weights[known] * change_m[known]))
+        variance = float(np.sum(weights[known] ** 2 * random_m2[known]))
+        variance += self._shared_variance(newest, self._read(before[-1]), weights)
+        variance += _sampling_variance(newest.count, self._queries.cells, weights, change_m)
+        variance += area_m2**2 * void_variance(
+            members, distance, np.where(known, change_m, np.nan), random_m2
+        )
+        variance += (RETAINED_SIGMA * volume_m3) ** 2
+        if np.count_nonzero(around) > PATCH_BLOCKS:
+            patchy_m2 = max(nmad(change_m[around > 0]) ** 2 - float(np.median(random_m2[around > 0])), 0.0)
+            count = int(np.count_nonzero(members))
+            variance += area_m2**2 * patchy_m2 * min(1.0, PATCH_BLOCKS / count)
+        return [round(volume_m3, 4), round(float(np.sqrt(variance)), 4)]
+
+    @staticmethod
+    def _shared_variance(newest: Blocks, before: Blocks, weights: Floats) -> float:
+        difference = _difference(newest, before)
+        if newest.jacobian is None or difference is None:
+            return 0.0
+        row = sparse.csr_array(weights[newest.observed][None, :])
+        sums = SparseJacobian(newest.jacobian).sums(row)
+        return float(sums.variance(np.zeros(row.shape[1]), difference)[0])
+
+
+def _mean_level(first: BlockLevels, second: BlockLevels) -> BlockLevels:
+    """Return the mean level of two scans (by, bx), that of one where the other lacks it."""
+    levels_m = np.stack([first.change_m, second.change_m])
+    observed = np.isfinite(levels_m)
+    count = observed.sum(axis=0)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        mean_m = np.where(observed, levels_m, 0.0).sum(axis=0) / count
+        random_m2 = np.where(observed, [first.random_m2, second.random_m2], 0.0).sum(axis=0) / count**2
+    return BlockLevels(mean_m, random_m2)
+
+
+def _members(
+    track: Track, core: Bools, known: Bools, usable: Bools, change_m: Floats, random_m2: Floats
+) -> Bools:
+    """Return the observed blocks (by, bx) of an event, with those at its edge, which it covers in part.
+
+    Blocks at the edge that changed the other way belong to another event.
+    """
+    if track.widespread:
+        return core.copy()
+    around = np.maximum(-surrounding_weights(core, usable), 0.0)
+    level_m = float(np.sum(around[around > 0] * change_m[around > 0]))
+    opposite_m = -track.sign * (change_m - level_m)
+    edge = ndimage.binary_dilation(core, NEIGHBOURS, EDGE_BLOCKS) & known
+    return np.asarray(core | (edge & (opposite_m < EDGE_SIGMAS * np.sqrt(random_m2))))
+
+
+def _sampling_variance(count: Floats, cells: int, weights: Floats, change_m: Floats) -> float:
+    """Return the variance of the weighted sum because the observed cells are a sample of their block.
+
+    The scatter within a block is that of it and its neighbours, as on a steady slope of the change.
+    """
+    inside = weights > 0
+    filled = np.where(np.isfinite(change_m), change_m, 0.0)
+    number = np.maximum(ndimage.uniform_filter(np.isfinite(change_m).astype(np.float64), 3), 1 / 9)
+    mean_m = ndimage.uniform_filter(filled, 3) / number
+    scatter_m2 = np.maximum(ndimage.uniform_filter(filled**2, 3) / number - mean_m**2, 0.0)
+    unseen = 1 - count / cells**2 if cells > 1 else np.ones_like(count)
+    sample_m2 = scatter_m2 * np.clip(unseen, 0.0, 1.0) / np.maximum(count, 1)
+    return float(np.sum((weights**2 * sample_m2)[inside]))
+
+
+def _difference(scan: Blocks, before: Blocks) -> SharedParameters | None:
+    """Return the shared parameters of the difference of two scans: both errors, less what is common."""
+    first, second = scan.cells.shared, before.cells.shared
+    if first is None or second is None or first.names != second.names:
+        return first if first is None or second is None else first + first
+    common = common_error_covariance([scan.cells, before.cells])
+    covariance = first.covariance + second.covariance
+    if common is not None:
+        covariance = covariance - common - common.T
+    line_m2 = first.line_tilt_variance + second.line_tilt_variance
+    return replace(first, covariance=covariance, line_tilt_variance=line_m2)

@@ -1,0 +1,55 @@
+"""Events over time: growth, rest, joining, and a deposit below its scar."""
+
+import numpy as np
+
+from station.science.analysis.event_tracks import REST_SCANS, pair_tracks, track_events
+from station.science.analysis.events import Region
+
+SHAPE = 40, 50
+
+
+def region(rows, columns, *, sign=1, mean_m=0.5, widespread=False):
+    blocks = np.zeros(SHAPE, bool)
+    blocks[rows, columns] = True
+    return Region(blocks, sign, widespread, sign * mean_m, 10.0)
+
+
+def test_a_region_seen_again_is_one_event_which_grows_and_rests():
+    small, large = region(slice(5, 8), slice(5, 8)), region(slice(5, 10), slice(5, 10))
+    (track,) = track_events([(7, [small]), (8, [small]), (9, [large]), (10, [large]), (11, [large])])
+    assert (track.first, track.grew, track.last) == (7, 9, 11)
+    assert np.array_equal(track.blocks, large.blocks)
+    assert track.is_open(11 + REST_SCANS - 1)
+    assert not track.is_open(11 + REST_SCANS)
+
+
+def test_what_comes_after_rest_or_elsewhere_or_downward_is_another_event():
+    here, there = region(slice(5, 8), slice(5, 8)), region(slice(20, 22), slice(5, 8))
+    down = region(slice(5, 8), slice(5, 8), sign=-1)
+    assert len(track_events([(7, [here, there]), (8, [down]), (7 + REST_SCANS, [here])])) == 4
+
+
+def test_a_region_between_two_events_joins_them():
+    left, right = region(slice(5, 8), slice(5, 8)), region(slice(5, 8), slice(20, 24))
+    both = region(slice(5, 8), slice(5, 24))
+    (track,) = track_events([(3, [left, right]), (4, [both])])
+    assert track.first == 3
+    assert np.array_equal(track.blocks, both.blocks)
+
+
+def test_widespread_change_is_one_event_however_it_moves():
+    low, high = (
+        region(slice(30, 40), slice(0, 50), widespread=True),
+        region(slice(0, 8), slice(0, 50), widespread=True),
+    )
+    assert len(track_events([(3, [low]), (4, [high])])) == 1
+
+
+def test_a_deposit_is_paired_with_the_nearest_scar_above():
+    elevation_m = np.repeat(3000.0 - 5 * np.arange(SHAPE[0]), SHAPE[1]).reshape(SHAPE)
+    scar, deposit = region(slice(5, 8), slice(5, 8), sign=-1), region(slice(20, 23), slice(6, 9))
+    far, below = region(slice(2, 4), slice(40, 44), sign=-1), region(slice(36, 38), slice(5, 8), sign=-1)
+    tracks = track_events([(3, [scar, deposit, far, below])])
+    assert pair_tracks(tracks, elevation_m) == {0: 1, 1: 0}
+    late = track_events([(3, [scar]), (6, [deposit])])
+    assert pair_tracks(late, elevation_m) == {}

@@ -1,0 +1,183 @@
+"""Events anywhere on the grid: power, false alarms and extent on simulated blocks of 10 m."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy import ndimage
+
+from station.science.analysis.events import (
+    BlockLevels,
+    before_level,
+    detect_regions,
+    distance_blocks,
+    event_thresholds,
+    overlaps,
+    scan_scatter,
+    surrounding_weights,
+    surroundings,
+)
+
+SHAPE = 60, 80
+HOURS_PER_YEAR = 8766
+ROW, COLUMN = np.indices(SHAPE)
+RANGE_M = 10.0 * np.hypot(ROW - 30, COLUMN + 20)
+ROCK = COLUMN < 16
+SIGMA_M = 0.004 + 0.01 * RANGE_M / 1000  # of a block, in one scan
+THRESHOLDS = event_thresholds(ROCK.size, HOURS_PER_YEAR)
+
+
+class Valley:
+    """Scans of a valley: random errors with heavy tails, tilt, and stripes along the line of sight."""
+
+    def __init__(self, seed, *, heavy=True, systematic_rad=5e-6):
+        self.rng = np.random.default_rng(seed)
+        self.heavy, self.systematic_rad = heavy, systematic_rad
+        self.azimuth = np.arctan2(ROW - 30, COLUMN + 20)
+        self.unseen = ndimage.gaussian_filter(self.rng.normal(size=SHAPE), 4) > 0.12
+
+    def scan(self, surface_m=0.0):
+        noise = self.rng.standard_t(5, SHAPE) / np.sqrt(5 / 3) if self.heavy else self.rng.normal(size=SHAPE)
+        stripes = np.interp(
+            self.azimuth.ravel(), np.linspace(-1.6, 1.6, 90), self.rng.normal(size=90) * self.systematic_rad
+        ).reshape(SHAPE)
+        tilt = self.rng.normal(size=2) * self.systematic_rad
+        errors = RANGE_M * (stripes + tilt[0] * np.cos(self.azimuth) + tilt[1] * np.sin(self.azimuth))
+        change = surface_m + errors + SIGMA_M * noise
+        hidden = self.unseen | (self.rng.random(SHAPE) < 0.02)
+        return BlockLevels(np.where(hidden, np.nan, change), SIGMA_M**2)
+
+    @property
+    def systematic_m2(self):
+        return (2 * self.systematic_rad * RANGE_M) ** 2
+
+    def regions(self, scans):
+        shared_m2 = self.systematic_m2
+        scatter_m2 = scan_scatter(np.stack([scan.change_m for scan in scans[:-2]]))
+        return detect_regions(
+            scans[-8:-2], (scans[-2], scans[-1]), (shared_m2, shared_m2), scatter_m2, ROCK, THRESHOLDS
+        )
+
+
+def disc(row, column, area_m2, depth_m):
+    """Mean depth by block of a disc of an area."""
+    fine = 10
+    y, x = (np.indices((SHAPE[0] * fine, SHAPE[1] * fine)) + 0.5) / fine
+    inside = (y - row) ** 2 + (x - column) ** 2 < area_m2 / 100 / np.pi
+    return depth_m * inside.reshape(SHAPE[0], fine, SHAPE[1], fine).mean(axis=(1, 3))
+
+
+@pytest.mark.parametrize("heavy", [False, True])
+def test_quiet_hours_have_no_event(heavy):
+    for seed in range(4):
+        valley = Valley(seed, heavy=heavy)
+        scans = [valley.scan() for _ in range(20)]
+        for last in range(10, 21):
+            assert valley.regions(scans[:last]) == []
+
+
+def test_a_small_deposit_is_found_by_the_second_scan_anywhere():
+    """0.3 m over 500 m²; where at least 60 % of it is seen."""
+    found = seen = 0
+    for seed in range(12):
+        valley = Valley(seed)
+        row, column = valley.rng.uniform(4, SHAPE[0] - 4), valley.rng.uniform(4, SHAPE[1] - 4)
+        deposit = disc(row, column, 500, 0.3)
+        if deposit[~valley.unseen].sum() < 0.6 * deposit.sum():
+            continue
+        before = [valley.scan() for _ in range(10)]
+        assert valley.regions([*before, valley.scan(), valley.scan(deposit)]) == []
+        regions = valley.regions([*before, valley.scan(deposit), valley.scan(deposit)])
+        seen += 1
+        found += len(regions) == 1 and regions[0].sign == 1 and overlaps(regions[0].blocks, deposit > 0.1)
+        assert not any(region.widespread for region in regions)
+    assert seen >= 5
+    assert found == seen
+
+
+def test_a_large_avalanche_is_one_region():
+    valley = Valley(3)
+    deposit = disc(40, 50, 30_000, 2.0)
+    regions = valley.regions(
+        [*(valley.scan() for _ in range(10)), valley.scan(deposit), valley.scan(deposit)]
+    )
+    assert [region.sign for region in regions] == [1]
+    visible = ~valley.unseen & (deposit > 1.0)
+    assert np.count_nonzero(regions[0].blocks & visible) > 0.95 * np.count_nonzero(visible)
+    assert regions[0].mean_m == pytest.approx(1.85, abs=0.15)
+
+
+def test_steady_melt_is_widespread_and_no_local_event():
+    """Ice melts by 1 cm an hour, 50 % more or less from place to place; rock does not."""
+    valley = Valley(5)
+    patches = 1 + 0.5 * ndimage.gaussian_filter(valley.rng.normal(size=SHAPE), 3) / 0.094
+    rate_m = np.where(ROCK, 0.0, -0.01 * patches)
+    scans = [valley.scan(hour * rate_m) for hour in range(12)]
+    regions = valley.regions(scans)
+    assert [(region.widespread, region.sign) for region in regions] == [(True, -1)]
+    assert np.mean(ROCK[regions[0].blocks]) < 0.05
+    true_m = 3.5 * rate_m[regions[0].blocks].mean()  # from amid six scans to the next
+    assert regions[0].mean_m == pytest.approx(true_m, rel=0.1)
+
+
+def test_snowfall_is_widespread_and_hides_no_avalanche():
+    valley = Valley(6)
+    drifts = 0.1 * (1 + 0.3 * ndimage.gaussian_filter(valley.rng.normal(size=SHAPE), 3) / 0.094)
+    after = drifts + disc(30, 50, 6000, 1.5)
+    regions = valley.regions([*(valley.scan() for _ in range(10)), valley.scan(after), valley.scan(after)])
+    assert [(region.widespread, region.sign) for region in regions] == [(True, 1), (False, 1)]
+    assert np.count_nonzero(regions[1].blocks) == pytest.approx(60, abs=20)
+
+
+def test_a_level_has_the_variance_of_a_median():
+    rng = np.random.default_rng(0)
+    levels = [BlockLevels(0.02 * rng.normal(size=SHAPE), np.full(SHAPE, 4e-4)) for _ in range(7)]
+    level = before_level(levels, 3)
+    assert np.std(level.change_m / np.sqrt(level.random_m2)) == pytest.approx(0.95, abs=0.07)
+    assert np.isnan(before_level(levels[:2], 3).change_m).all()
+
+
+def test_scatter_is_that_of_consecutive_scans_whatever_the_trend():
+    rng = np.random.default_rng(0)
+    hour = np.arange(24)[:, None, None]
+    noise = 0.02 * rng.normal(size=(24, 40, 50))
+    step = np.where(hour >= 12, 1.0, 0.0) * (np.indices((40, 50))[0] < 10)
+    scatter_m = np.sqrt(scan_scatter(noise - 0.001 * hour + step))
+    assert np.median(scatter_m) == pytest.approx(0.027, abs=0.003)  # the largest of nine neighbours
+    edge = np.where(rng.random((24, 40, 50)) < 0.3, 0.6, 0.0)
+    assert np.sqrt(scan_scatter(noise + edge)).min() > 0.2
+
+
+def test_blocks_at_an_edge_raise_no_event():
+    """Beams that move a little hit either side of a rock step of 1.2 m, along a whole column."""
+    valley = Valley(8)
+    scans = []
+    for _ in range(26):
+        shifted = np.where(
+            (COLUMN > 40) & (COLUMN < 44) & (valley.rng.random(SHAPE[1]) < 0.3)[None, :], 1.2, 0.0
+        )
+        scans.append(valley.scan(shifted))
+    for last in range(12, 27):
+        assert valley.regions(scans[:last]) == []
+
+
+def test_surroundings_are_those_of_the_same_ground():
+    values = np.where(ROCK, 0.0, 0.3 - 0.002 * COLUMN)
+    around = surroundings(values + disc(30, 50, 20_000, 3.0), ROCK)
+    assert around[ROCK] == pytest.approx(0.0, abs=1e-9)
+    assert around[~ROCK][::7] == pytest.approx(values[~ROCK][::7], abs=0.04)
+
+
+def test_weights_take_off_what_surrounds_a_region():
+    blocks = disc(30, 40, 3000, 1.0) > 0.5
+    weights = surrounding_weights(blocks, ~ROCK)
+    assert np.sum(weights * (0.7 + 2.0 * blocks)) == pytest.approx(2.0)
+    assert surrounding_weights(blocks, np.zeros(SHAPE, bool)).sum() == pytest.approx(1.0)
+
+
+def test_distance_and_overlap_count_blocks():
+    first, second = np.zeros((2, *SHAPE), bool)
+    first[10, 10], second[10, 15] = True, True
+    assert distance_blocks(first, second) == 5
+    assert not overlaps(first, second, 4)
+    assert overlaps(first, second, 5)
