@@ -291,7 +291,7 @@ def _tilt_record(
 
 def _find_tilt_offset(
     site: Site,
-    sop: SopSection,
+    sop: SopSection | None,
     reader: ScanReader,
     log: InclinationLog | None,
     track: AzimuthTrack | None,
@@ -305,7 +305,7 @@ def _find_tilt_offset(
     """
     if site.inclination is None:
         return None
-    if site.inclination.mode == "absolute":
+    if site.inclination.mode == "absolute" or sop is None:
         return NO_CYCLIC_ERROR
     if sop.scan is None and waiting_before:
         raise NotReadyError(

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 from pathlib import Path
 
+import numpy as np
 from pyproj import CRS, Transformer
 
 from station.config import Site
@@ -13,6 +14,8 @@ from station.quantities import VERTICAL_AXIS, ScanGeometry
 from station.readers.sop import read_matrix
 from station.science.geometry import pose
 from station.sections import Origin, SopSection
+
+NO_SOP = "local"  # identity of the missing SOP of a local map
 
 
 def scan_geometry(
@@ -33,14 +36,21 @@ def scan_geometry(
     )
 
 
-def sop_identity(sop: SopSection) -> str:
+def sop_identity(sop: SopSection | None) -> str:
     """Return an identifier that changes with the content of the SOP file and with `sop.scan`."""
+    if sop is None:
+        return NO_SOP
     content = sop.file.read_bytes() + (f"\n{sop.scan}".encode() if sop.scan else b"")
     return f"{sop.file.stem}-{hashlib.sha256(content).hexdigest()[:8]}"
 
 
-def scanner_to_map(site: Site, sop: SopSection) -> pose.ScannerToMap:
-    """Return the transformation from scanner to map under an SOP; raise ConfigError if there is none."""
+def scanner_to_map(site: Site, sop: SopSection | None) -> pose.ScannerToMap:
+    """Return the transformation from scanner to map under an SOP; raise ConfigError if it has none.
+
+    Without an SOP the map is the levelled frame of the scanner.
+    """
+    if sop is None:
+        return pose.scanner_to_local_map(np.eye(4))
     matrix = read_matrix(sop.file)
     radius_m = site.scanner.range_max_m
     if site.map.crs is None:
@@ -84,6 +94,6 @@ def map_position(site: Site) -> tuple[float, float, float] | None:
     return float(east_m), float(north_m), float(up_m)
 
 
-def scanner_height_m(site: Site, sop: SopSection) -> float | None:
+def scanner_height_m(site: Site, sop: SopSection | None) -> float | None:
     """Return the height of the scanner above the ellipsoid [m]; None without a map, whose zero is unknown."""
     return None if site.map.crs is None else scanner_to_map(site, sop).position_m[2]
