@@ -30,7 +30,7 @@ from station.processing.usable_inputs import usable_site
 from station.processing.workers import isolation
 from station.processing.workers.worker_process import Progress
 from station.products.area_tables import Span
-from station.products.copc import write_copc
+from station.products.exports.copc import write_copc
 from station.quantities import Floats, Floats32, Shots
 from station.readers.scan import ScanReader, utc_interval
 from station.scan_names import scan_stem

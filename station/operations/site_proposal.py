@@ -153,8 +153,12 @@ def _project(name: str, sop: Floats, found: _Found, header: ScanHeader) -> Proje
 
 
 def _model_for(range_m: float) -> str:
-    """Return the scanner that reaches no farther than it must: a file does not tell which it is."""
-    reaching = [name for name, values in SCANNERS.items() if values["range_max_m"] >= range_m]
+    """Return the RIEGL that reaches no farther than it must: a file does not tell which scanner it is."""
+    reaching = [
+        name
+        for name, values in SCANNERS.items()
+        if name.startswith("riegl-") and values["range_max_m"] >= range_m
+    ]
     return min(reaching, key=lambda name: SCANNERS[name]["range_max_m"], default="riegl-vz-6000")
 
 

@@ -11,7 +11,7 @@ from pyproj import CRS, Transformer
 from scipy.spatial.transform import Rotation
 
 from station.errors import ConfigError, StoreError
-from station.products.transformations import covariance_text
+from station.products.exports.transformations import covariance_text
 from station.quantities import Floats, Scanner
 from station.readers.sop import read_matrix
 from station.readers.tie_features import read_tie_features

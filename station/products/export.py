@@ -18,10 +18,10 @@ from station.config import Site
 from station.errors import StationError
 from station.products.area_tables import REFERENCE, Span, area_records, as_csv
 from station.products.epoch_table import EpochTable, csv_times, read_epoch_table
+from station.products.exports.transformations import write_transformations
 from station.products.gallery import default_limit, replace_if_changed
 from station.products.geotiff import export_geotiff
 from station.products.stac import write_stac
-from station.products.transformations import write_transformations
 
 Track = Callable[[list[EpochRef]], Iterable[EpochRef]]
 

@@ -24,8 +24,8 @@ from station.archive.series.index import processing_file
 from station.config import Site
 from station.errors import StationError
 from station.products.epoch_table import EpochTable, read_epoch_table
+from station.products.exports.transformations import read_transformation
 from station.products.geotiff import KINDS, export_geotiff, write_cog
-from station.products.transformations import read_transformation
 from station.quantities import Floats
 from station.science.geometry.pose import horizontal_crs
 

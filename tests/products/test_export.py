@@ -20,8 +20,8 @@ from station.archive.reference_files import ReferenceProvenance, open_reference,
 from station.archive.series.index import series_in
 from station.products.area_tables import Span
 from station.products.export import export
+from station.products.exports.transformations import read_transformation
 from station.products.stac import PROJECTION, TOPO4D
-from station.products.transformations import read_transformation
 
 
 @pytest.mark.integration

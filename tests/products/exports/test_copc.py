@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from pyproj import CRS
 
-from station.products.copc import LEAF_POINTS, write_copc
+from station.products.exports.copc import LEAF_POINTS, write_copc
 
 COUNT = 3 * LEAF_POINTS
 
