@@ -24,6 +24,7 @@ from station.operations.inbox_contents import inbox_findings
 from station.operations.site_plausibility import (
     LevelAndMessage,
     alarm_findings,
+    double_tilt_findings,
     overlap_findings,
     position_findings,
     rights_findings,
@@ -261,7 +262,7 @@ def _inclination(site: Site) -> Iterator[Finding]:
     A log that cannot be read, or shows the limit of the sensor's range, is a finding on its scan.
     """
     scans = _scans(site)
-    if site.inclination is None or site.inclination.mode == "absolute" or not scans or not site.sop:
+    if site.inclination is None or not scans or not site.sop:
         return
     try:
         sop = valid_sop(site.sop, start_from_name(scans[-1].name, site.scans.pattern))
@@ -276,7 +277,9 @@ def _inclination(site: Site) -> Iterator[Finding]:
     expected_deg = np.degrees(inclination.mount_inclination(rotation))
     log_deg = math.degrees(log.roll_rad.mean()), math.degrees(log.pitch_rad.mean())
     expected = float(expected_deg[0]), float(expected_deg[1])
-    if math.degrees(site.instrument.inclination_range_rad) > max(map(abs, expected)):
+    if site.inclination.mode == "absolute":
+        yield from _named("inclination", double_tilt_findings(sop.file.name, expected, log_deg))
+    elif math.degrees(site.instrument.inclination_range_rad) > max(map(abs, expected)):
         yield from _named("inclination", [tilt_findings(sop.file.name, expected, log_deg)])
 
 
