@@ -13,6 +13,10 @@ import re
 # less. Aperture, encoders and inclination sensor of these RIEGL are those of the VZ-400i; ranges are the
 # makers'. The beam of the Livox is 0.52 by 4.89 mrad, as wide as a round one of 3.5 mrad in the mean square.
 # Its direction is known to 0.1° (one sigma), as with an encoder of 0.35° a step; it has no tilt sensor.
+# Livox HAP: its manual (2022), table 1.2.1; 150 m are at 10 % of reflectance. Z+F 5016: 1.5 µm and a
+# half-angle of 0.3 mrad from published code that cites the data sheet; noise of 0.25 mm and 0.004° as in
+# HDMapping (MapsHD); its aperture and its tilt sensor are not known.
+# Not checked against data sheets: ranges and 1.55 µm of the VZ-400, VZ-600i and VZ-1000.
 LIVOX_MID = {
     "wavelength_um": 0.905,
     "beam_divergence_mrad": 3.5,
@@ -96,6 +100,17 @@ SCANNERS: dict[str, dict[str, float]] = {
     },
     "livox-mid-40": LIVOX_MID,
     "livox-mid-70": LIVOX_MID,
+    "livox-hap": LIVOX_MID | {"range_max_m": 150.0},
+    "zf-imager-5016": {
+        "wavelength_um": 1.5,
+        "beam_divergence_mrad": 0.6,
+        "exit_diameter_m": 0.0,
+        "range_sigma_m": 0.00025,
+        "angle_resolution_deg": 0.0139,
+        "inclination_sigma_deg": 0.1,
+        "inclination_range_deg": 10.0,
+        "range_max_m": 360.0,
+    },
 }
 
 

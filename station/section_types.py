@@ -32,7 +32,7 @@ def require_projected(crs: str) -> str:
     from pyproj import CRS  # noqa: PLC0415 - a tenth of a second that not every command needs
     from pyproj.exceptions import CRSError  # noqa: PLC0415
 
-    advice = "name a projected CRS in metres, such as EPSG:32632"
+    advice = "name a projected CRS in metres, such as EPSG:32632, or omit it for a local map"
     try:
         parsed = CRS.from_user_input(crs)
     except CRSError as error:

@@ -190,7 +190,7 @@ class Origin(Section):
 
 
 class MapSection(Section):
-    """The map of the products, and how the project frame is placed on it."""
+    """The map of the products, and how the project frame is placed on it; without a CRS it is local."""
 
     crs: Annotated[str, AfterValidator(require_projected)] | None = None
     origin: Origin | None = None
@@ -461,7 +461,7 @@ class SiteFile(Section):
     @model_validator(mode="after")
     def _chain_is_complete(self) -> SiteFile:
         if self.scans.frame == "scanner" and not self.sop:
-            raise ValueError('scans.frame = "scanner" needs an [[sop]] to transform the points to the map')
+            self._require_local_map()
         starts = [(sop.from_, sop.files) for sop in self.sop]
         if len(set(starts)) < len(starts):
             raise ValueError("two [[sop]] have the same from: which of them is valid then?")
@@ -488,3 +488,17 @@ class SiteFile(Section):
         if self.epoch is None:
             return self.scans.pattern
         return f"{self.epoch.name}{ZONE_MARK}{self.scans.zone}"
+
+    def _require_local_map(self) -> None:
+        """Raise ValueError unless scans without an SOP can be on a local map that their logs make level."""
+        if self.map.crs is not None:
+            raise ValueError(
+                "map.crs needs an [[sop]], which transforms the points to that map; without both, the map is"
+                " local, with its origin at the scanner"
+            )
+        if self.registration is not None:
+            raise ValueError("registration needs an [[sop]], which says where the scanner stands in general")
+        if self.inclination is not None and self.inclination.mode == "relative":
+            raise ValueError(
+                'without an [[sop]] the log makes the map level: set inclination.mode = "absolute"'
+            )

@@ -42,6 +42,7 @@ def test_paths_are_relative_to_the_file(tmp_path):
     ("crs", "message"),
     [
         ("EPSG:99999", "unknown to PROJ: name a projected CRS in metres"),
+        ("local", "unknown to PROJ: name a projected CRS in metres, such as EPSG:32632, or omit it"),
         ("EPSG:4326", "is a Geographic 2D CRS, in degrees"),
         ("EPSG:4978", "is a Geocentric CRS"),
         ("EPSG:2263", "is in US survey foot"),
@@ -123,7 +124,14 @@ def test_all_faults_are_listed_with_the_closest_valid_key(tmp_path):
     ("change", "message"),
     [
         (("[station]", "[station"), "not valid TOML"),
-        (('frame = "map"', 'frame = "scanner"'), "needs an"),
+        (
+            ('frame = "map"', 'frame = "scanner"\n[map]\ncrs = "EPSG:32632"'),
+            "map.crs needs an .* without both, the map is local",
+        ),
+        (
+            ('frame = "map"', 'frame = "scanner"\n[inclination]\nmode = "relative"'),
+            'the log makes the map level: set inclination.mode = "absolute"',
+        ),
         (("[grid]", '[scanner]\nmodel = "vz"\n[grid]'), "choose from riegl-vz-6000"),
         (("[grid]", "[scanner]\nmodel = []\n[grid]"), "scanner.model: .* string"),
         (("[station]", "scanner = 5\n[station]"), "scanner: give a table of keys"),

@@ -82,11 +82,20 @@ def test_instrument_values_equal_those_of_helios():
         assert (SCANNERS[name]["range_sigma_m"], SCANNERS[name]["beam_divergence_mrad"]) == values
 
 
+def test_instrument_values_equal_those_of_manuals_and_published_code():
+    """Livox HAP, manual, table 1.2.1; Z+F IMAGER 5016, half-angle 0.3 mrad and 0.004° (one sigma)."""
+    hap, imager = SCANNERS["livox-hap"], SCANNERS["zf-imager-5016"]
+    assert (hap["wavelength_um"], hap["range_sigma_m"], hap["range_max_m"]) == (0.905, 0.02, 150.0)
+    assert (imager["wavelength_um"], imager["beam_divergence_mrad"]) == (1.5, 0.6)
+    assert imager["angle_resolution_deg"] / 12**0.5 == pytest.approx(0.004, rel=0.01)
+
+
 @pytest.mark.parametrize(
     ("name", "model"),
     [
         ("VZ-6000", "riegl-vz-6000"), ("Riegl VZ 6000", "riegl-vz-6000"), ("RIEGL_VZ-400i", "riegl-vz-400i"),
         ("vz400", "riegl-vz-400"), ("Livox Mid-70", "livox-mid-70"), ("VZ-9000", None), ("", None),
+        ("Z+F IMAGER 5016", "zf-imager-5016"), ("imager 5016", "zf-imager-5016"),
     ],
 )  # fmt: skip
 def test_scanners_are_known_by_the_names_that_people_write(name, model):

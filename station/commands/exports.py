@@ -19,6 +19,13 @@ if TYPE_CHECKING:
     from station.products.area_tables import Span
 
 
+class PointFormat(StrEnum):
+    """Of `station export points`."""
+
+    laz = "laz"
+    copc = "copc"
+
+
 class ExportFormat(StrEnum):
     """What `station export` writes."""
 
@@ -26,6 +33,7 @@ class ExportFormat(StrEnum):
     csv = "csv"
     stac = "stac"
     points = "points"
+    transformations = "transformations"
     netcdf = "netcdf"
     zarr = "zarr"
     references = "references"
@@ -38,6 +46,7 @@ OF_EPOCHS = {
     ExportFormat.csv,
     ExportFormat.stac,
     ExportFormat.points,
+    ExportFormat.transformations,
 }  # the others are of the series
 
 
@@ -57,7 +66,7 @@ def export(
     kind: Annotated[
         ExportFormat,
         typer.Argument(
-            metavar="geotiff|csv|stac|points|netcdf|zarr|references|ncml|erddap",
+            metavar="geotiff|csv|stac|points|transformations|netcdf|zarr|references|ncml|erddap",
             help="The format.",
             show_default=False,
         ),
@@ -95,6 +104,10 @@ def export(
             metavar="URL", help="References: address of the data folder; default here.", show_default=False
         ),
     ] = None,
+    point_format: Annotated[
+        PointFormat | None,
+        typer.Option("--format", help="Points: of the files; default laz.", show_default=False),
+    ] = None,
 ) -> None:
     """Write files to pass on, or for tools that cannot read the series.
 
@@ -103,14 +116,17 @@ def export(
     references, ncml and erddap describe it for the cloud and for data servers, without a copy.
     geotiff, stac and csv: the newest epoch, or those of a span; change and its uncertainty as GeoTIFF with
     QGIS styles, a STAC catalogue of these, or scans and areas as CSV.
-    points: the scans of these epochs as LAZ, corrected, on the map, each point with change, sigma and quality
-    of its cell.
+    points: the scans of these epochs as LAZ or COPC, corrected, on the map, each point with change, sigma and
+    quality of its cell. transformations: how the scanner had moved at these epochs, as 4 x 4 matrices, and
+    their covariance.
     """
     from station.config import read_site
     from station.products.area_tables import Span
     from station.products.export import export as write_files
 
     settings, span = read_site(site), Span.parse(first, last)
+    if point_format is not None and kind is not ExportFormat.points:
+        raise typer.BadParameter(f"--format is for points, not for {kind.value}")
     if kind not in OF_EPOCHS:
         options = SeriesOptions(every and every.value, area, variables, chunks, url)
         for path in _export_series(settings, kind.value, out, span, options):
@@ -123,7 +139,13 @@ def export(
     if kind is ExportFormat.points:
         from station.operations.point_export import export_points
 
-        for path in export_points(settings, span if first or last else None, out, progress_bar("writing")):
+        for path in export_points(
+            settings,
+            span if first or last else None,
+            out,
+            progress_bar("writing"),
+            (point_format or PointFormat.laz).value,
+        ):
             print(path)
         return
     for path in write_files(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import tempfile
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Any
@@ -31,6 +32,7 @@ from station.processing.usable_inputs import usable_site
 from station.processing.workers import isolation
 from station.processing.workers.worker_process import Progress
 from station.products.area_tables import Span
+from station.products.exports.copc import write_copc
 from station.quantities import Floats, Floats32, Shots
 from station.scan_names import scan_id
 
@@ -42,14 +44,18 @@ EXTRA_BYTES = {  # of each point, those of its cell
     "quality": ("u1", "flags of the cell"),
 }
 MAX_INTENSITY = 65535
+SUFFIXES = {"laz": ".laz", "copc": ".copc.laz"}
 
 Track = Callable[[list[EpochRef]], Iterable[EpochRef]]
 
 
-def export_points(site: Site, span: Span | None, folder: Path, track: Track = iter) -> Iterator[Path]:
-    """Yield a LAZ file for each epoch of a span, by default the newest, when it is written.
+def export_points(
+    site: Site, span: Span | None, folder: Path, track: Track = iter, file_format: str = "laz"
+) -> Iterator[Path]:
+    """Yield a file for each epoch of a span, by default the newest, when it is written.
 
-    Raises StationError if there is no such epoch, or its scan no longer exists; else as processing a scan.
+    `file_format` is laz or copc. Raises StationError if there is no such epoch, or its scan no longer exists;
+    else as processing a scan.
     """
     series = series_for(site)
     epochs = list_epochs(series)
@@ -68,7 +74,7 @@ def export_points(site: Site, span: Span | None, folder: Path, track: Track = it
             raise StationError(
                 f"{epoch.epoch_file}: its scan {stored_id} is neither in the inbox nor archived"
             )
-        path = folder / f"{Path(epoch.epoch_file).stem}.laz"
+        path = folder / f"{Path(epoch.epoch_file).stem}{SUFFIXES[file_format]}"
         isolation.TaskRunner().run(
             write_points,
             usable,
@@ -91,15 +97,33 @@ def write_points(
         cells, method = _cells(epoch)
         correction_m = _correction(site, opened, inputs, version if method == "joint" else "", progress)
         header = _header(site, cells["elevation"])
-        with (
-            atomic_write(path) as tmp_path,
-            tmp_path.open("wb") as file,
-            laspy.LasWriter(file, header, do_compress=True, closefd=False) as writer,
-        ):
+
+        def blocks() -> Iterator[laspy.ScaleAwarePointRecord]:
             for shots in inputs.shots(opened, site.scans.intensity):
-                points_m = to_map(shots, inputs.pose)
-                writer.write_points(_records(site, header, shots, points_m, correction_m, cells))
+                yield _records(site, header, shots, to_map(shots, inputs.pose), correction_m, cells)
                 progress()
+
+        write = _write_octree if path.name.endswith(SUFFIXES["copc"]) else _write_laz
+        with atomic_write(path) as tmp_path:
+            write(tmp_path, header, blocks())
+
+
+def _write_laz(path: Path, header: laspy.LasHeader, blocks: Iterable[laspy.ScaleAwarePointRecord]) -> None:
+    with path.open("wb") as file, laspy.LasWriter(file, header, do_compress=True, closefd=False) as writer:
+        for records in blocks:
+            writer.write_points(records)
+
+
+def _write_octree(path: Path, header: laspy.LasHeader, blocks: Iterable[laspy.ScaleAwarePointRecord]) -> None:
+    """Write COPC; its points are sorted through a temporary file. Raises StationError if there are none."""
+    with tempfile.TemporaryFile(dir=path.parent) as unsorted:
+        for records in blocks:
+            unsorted.write(records.array.tobytes())
+        if not unsorted.tell():
+            raise StationError(f"{path.name}: no point of the scan is on the grid")
+        unsorted.flush()
+        with path.open("w+b") as file:
+            write_copc(file, header, np.memmap(unsorted, header.point_format.dtype(), mode="r"))
 
 
 def _correction(site: Site, scan: OpenScan, inputs: ScanInputs, version: str, progress: Progress) -> Floats32:

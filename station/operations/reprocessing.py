@@ -215,7 +215,7 @@ class Reprocessing(_Planning):
             except ScanError:
                 continue  # reported when the scan is reprocessed
             sop_id = sop_identity(sop)
-            if sop_id in tried or (task.scan.log is None and sop.scan is None):
+            if sop is None or sop_id in tried or (task.scan.log is None and sop.scan is None):
                 continue
             if sop.scan is not None or read_tilt_offset(self._site, sop_id) is not None:
                 tried.add(sop_id)

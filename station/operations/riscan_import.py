@@ -67,9 +67,12 @@ def matrix_text(matrix: Floats) -> str:
     return "\n".join(" ".join(f"{value:.15g}" for value in row) for row in matrix) + "\n"
 
 
-def site_text(source: str, project: Project, scans: list[str], more: list[str] | None = None) -> str:
+def site_text(
+    source: str, project: Project, scans: list[str], more: list[str] | None = None, *, has_sop: bool = True
+) -> str:
     """Return a site file; `scans` are the lines of its table, `more` those of tables after the others.
 
+    Without SOPs, those of the project are not written, and the map is around its scanner.
     What the project cannot tell is marked with `check:`.
     """
     ident = file_stem(project.name)[:MAX_NAME].strip("_-") or "station"
@@ -86,8 +89,8 @@ def site_text(source: str, project: Project, scans: list[str], more: list[str] |
             *scans,
             "",
             *_scanner_lines(project),
-            *_sop_lines(project),
-            *_map_lines(project),
+            *(_sop_lines(project) if has_sop else []),
+            *_map_lines(project, has_sop=has_sop),
             *_air_lines(project),
             *(more or []),
         ]
@@ -121,13 +124,14 @@ def _sop_lines(project: Project) -> list[str]:
     return lines
 
 
-def _map_lines(project: Project) -> list[str]:
+def _map_lines(project: Project, *, has_sop: bool) -> list[str]:
     """Return map and grid: around the scanner of the last position, if any, as far as its scans reach."""
     if not project.positions:
         return []
     position = project.positions[-1]
     east_m, north_m = (float(value) for value in position.sop[:2, 3])
-    lines = ["# check: there is no POP: the map is the frame of the SOP, see docs/how-to/sop.md"]
+    frame = "POP: the map is the frame of the SOP" if has_sop else "SOP: the map is local, around the scanner"
+    lines = [f"# check: there is no {frame}, see docs/how-to/sop.md"]
     if project.pop is not None:
         crs, east_m, north_m = _utm_position(project.pop, position)
         crs_line = f'crs = "{crs}"                    # check: or the CRS of your maps'

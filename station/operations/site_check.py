@@ -23,6 +23,7 @@ from station.operations.inbox_contents import inbox_findings
 from station.operations.site_plausibility import (
     LevelAndMessage,
     alarm_findings,
+    double_tilt_findings,
     overlap_findings,
     position_findings,
     rights_findings,
@@ -45,6 +46,8 @@ from station.readers.weather import interpolate_air, log_files, read_weather
 from station.scan_names import name_below, scan_stem
 from station.science.analysis.verdict import NO_BRIGHTNESS
 from station.science.geometry import inclination
+from station.science.geometry.pose import ScannerToMap
+from station.sections import SopSection
 
 Finding = dict[str, str]  # level (ok, warning, fault), what, message
 EPOCH_BYTES_PER_CELL = 16  # typical, uncompressed
@@ -119,27 +122,46 @@ def _finding(level: str, what: str, message: str) -> Finding:
     return {"level": level, "what": what, "message": message}
 
 
+def _local_map(site: Site) -> Iterator[Finding]:
+    """Yield where a map without an SOP is, and a warning if nothing makes it level."""
+    message = "no [[sop]]: the map is local, with its origin at the scanner and east along its x axis"
+    if site.inclination is None:
+        level = "it is as level as the scanner, because there is no [inclination]"
+        yield _finding("warning", "map", f"{message}; {level}")
+    else:
+        yield _finding("ok", "map", f"{message}; the inclination log makes it level")
+
+
+def _sop_pose(site: Site, sop: SopSection, frame: ScannerToMap) -> Iterator[Finding]:
+    """Yield position and tilt of the scanner under an SOP."""
+    east_m, north_m, height_m = frame.position_m
+    tilt_deg = math.degrees(math.acos(min(1.0, frame.to_local[2, 2])))
+    yield _finding(
+        "ok",
+        "sop",
+        f"{sop.file.name} from {sop.from_:%Y-%m-%d}: scanner at"
+        f" {east_m:.2f} {north_m:.2f} {height_m:.2f}, tilt {tilt_deg:.2f}°",
+    )
+    yield from _named("sop", position_findings(site, sop.file.name, frame.position_m, map_position(site)))
+
+
 def _sop_poses(site: Site) -> Iterator[Finding]:
     """Yield position and tilt of the scanner under each SOP, and a fault if the grid is out of range."""
     grid = site.grid_cells
     if site.scans.frame == "map" and site.map.origin is None:
         message = "map.origin, the scanner's position, is missing: sigma contains only the scatter of points"
         yield _finding("warning", "map", message)
-    for sop in site.sop:
+    if site.scans.frame == "scanner" and not site.sop:
+        yield from _local_map(site)
+    for sop in site.sop or ((None,) if site.scans.frame == "scanner" else ()):
         try:
             frame = scanner_to_map(site, sop)
         except StationError as error:
             yield _finding("fault", "sop", str(error))
             continue
-        east_m, north_m, height_m = frame.position_m
-        tilt_deg = math.degrees(math.acos(min(1.0, frame.to_local[2, 2])))
-        yield _finding(
-            "ok",
-            "sop",
-            f"{sop.file.name} from {sop.from_:%Y-%m-%d}: scanner at"
-            f" {east_m:.2f} {north_m:.2f} {height_m:.2f}, tilt {tilt_deg:.2f}°",
-        )
-        yield from _named("sop", position_findings(site, sop.file.name, frame.position_m, map_position(site)))
+        east_m, north_m, _ = frame.position_m
+        if sop is not None:
+            yield from _sop_pose(site, sop, frame)
         distance_m = math.hypot(
             max(grid.west_m - east_m, 0.0, east_m - grid.west_m - grid.nx * grid.cell_m),
             max(north_m - grid.north_m, 0.0, grid.north_m - grid.ny * grid.cell_m - north_m),
@@ -241,11 +263,12 @@ def _inclination(site: Site) -> Iterator[Finding]:
     A log that cannot be read, or shows the limit of the sensor's range, is a finding on its scan.
     """
     scans = _scans(site)
-    if site.inclination is None or site.inclination.mode == "absolute" or not scans or not site.sop:
+    if site.inclination is None or not scans or not site.sop:
         return
     try:
         name = name_below(scans[-1], site.scans.pattern)
         sop = valid_sop(site.sop, start_from_name(name, site.scans.pattern), name)
+        assert sop is not None  # noqa: S101 - there are some
         rotation = scanner_to_map(site, sop).to_local[:3, :3]
         log_path = scans[-1].with_name(scan_stem(scans[-1]) + site.inclination.suffix)
         log, _ = inclination.clean(read_inclination(log_path), site.instrument.inclination_range_rad)
@@ -256,7 +279,9 @@ def _inclination(site: Site) -> Iterator[Finding]:
     expected_deg = np.degrees(inclination.mount_inclination(rotation))
     log_deg = math.degrees(log.roll_rad.mean()), math.degrees(log.pitch_rad.mean())
     expected = float(expected_deg[0]), float(expected_deg[1])
-    if math.degrees(site.instrument.inclination_range_rad) > max(map(abs, expected)):
+    if site.inclination.mode == "absolute":
+        yield from _named("inclination", double_tilt_findings(sop.file.name, expected, log_deg))
+    elif math.degrees(site.instrument.inclination_range_rad) > max(map(abs, expected)):
         yield from _named("inclination", [tilt_findings(sop.file.name, expected, log_deg)])
 
 

@@ -98,6 +98,17 @@ def tilt_findings(
     return "warning", f"{message}: another SOP, a moved mount, or a wrong log?"
 
 
+def double_tilt_findings(
+    sop: str, expected_deg: tuple[float, float], log_deg: tuple[float, float]
+) -> Iterator[LevelAndMessage]:
+    """Yield a warning if an SOP contains the tilt of the log, which an absolute mode applies once more."""
+    is_tilted = math.hypot(*expected_deg) > MAX_TILT_DEVIATION_DEG
+    if is_tilted and math.dist(expected_deg, log_deg) <= MAX_TILT_DEVIATION_DEG:
+        tilt = f"roll {expected_deg[0]:.2f}°, pitch {expected_deg[1]:.2f}°"
+        advice = 'inclination.mode = "absolute" applies it again: is it "relative"?'
+        yield "warning", f"{sop} contains the tilt of the mount, {tilt}, and {advice}"
+
+
 def weather_time_findings(last_utc_s: float) -> Iterator[LevelAndMessage]:
     """Yield a warning if the weather log ends in the future; one that ends too early degrades the scan."""
     ahead_s = last_utc_s - time.time()

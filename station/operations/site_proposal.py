@@ -21,6 +21,7 @@ from station.readers.formats.conversion import open_site_scan
 from station.readers.formats.riscan import Project, ScanPosition
 from station.readers.scan import ScanHeader, suffixes
 from station.readers.sop import read_matrix
+from station.readers.weather_dialects import recognise_dialect
 from station.scan_names import start_in_name
 from station.scanners import SCANNERS
 from station.sections import ScansSection
@@ -30,10 +31,7 @@ MATRIX_SUFFIXES = (".dat", ".txt", ".sop")
 MAX_MATRIX_BYTES = 1 << 14
 GEOCENTRIC_M = 6e6  # a POP leads to the centre of the Earth
 MAX_SCANNER_FRAME_M = 20_000.0  # farther from the origin, points are on a map
-FIRST_LINES = {  # of weather logs, and their dialect
-    "TOA5": "toa5", "SMET": "smet", "STATIONS_ID;MESS_DATUM": "dwd", "station_abbr;": "meteoswiss",
-    "Plot Title": "hobo",
-}  # fmt: skip
+NAMELESS = ("toa5", "csv")  # dialects whose columns have no usual names
 MEMORY_GB, TIMEOUT_S = 4.0, 300.0  # to look at one scan
 
 
@@ -77,11 +75,13 @@ def propose_site(source: Path, folder: Path) -> list[Path]:
     else:
         sop = read_matrix(found.sops[0]) if found.sops else np.eye(4)
         project = _project(source.resolve().name, sop, found, header)
-        texts[folder / "SOP-SOP.dat"] = matrix_text(sop)
+        if found.sops:
+            texts[folder / "SOP-SOP.dat"] = matrix_text(sop)
         if project.pop is not None:
             texts[folder / "POP.dat"] = matrix_text(project.pop)
         more = _more_lines(found, mode="relative" if found.sops else "absolute")
-    site = site_text(f"what lies in {source}", project, lines, more)
+    has_sop = on_map or bool(found.sops)
+    site = site_text(f"what lies in {source}", project, lines, more, has_sop=has_sop)
     return write_new(folder, {folder / "site.toml": site, **texts})
 
 
@@ -129,12 +129,13 @@ def _matrix(path: Path) -> Floats | None:
 
 
 def _dialect(path: Path) -> str:
-    """Return the dialect of a weather log by its first line, '' if it is none."""
+    """Return the dialect of a weather log by its header, '' if it is none."""
     if path.suffix.lower() not in {".dat", ".csv", ".txt", ".smet"} or not os.access(path, os.R_OK):
         return ""
+    if path.name.endswith(LOG_SUFFIX):
+        return ""
     with path.open("rb") as file:
-        line = file.readline(1000).decode("utf-8", "replace").lstrip('"\ufeff')
-    return next((kind for start, kind in FIRST_LINES.items() if line.startswith(start)), "")
+        return recognise_dialect(file)
 
 
 def _name_lines(found: _Found) -> list[str]:
@@ -152,8 +153,12 @@ def _project(name: str, sop: Floats, found: _Found, header: ScanHeader) -> Proje
 
 
 def _model_for(range_m: float) -> str:
-    """Return the scanner that reaches no farther than it must: a file does not tell which it is."""
-    reaching = [name for name, values in SCANNERS.items() if values["range_max_m"] >= range_m]
+    """Return the RIEGL that reaches no farther than it must: a file does not tell which scanner it is."""
+    reaching = [
+        name
+        for name, values in SCANNERS.items()
+        if name.startswith("riegl-") and values["range_max_m"] >= range_m
+    ]
     return min(reaching, key=lambda name: SCANNERS[name]["range_max_m"], default="riegl-vz-6000")
 
 
@@ -193,8 +198,13 @@ def _more_lines(found: _Found, *, mode: str) -> list[str]:
     if found.weather is not None:
         path, kind = found.weather
         weather = ["[weather]", f'file = "{path.resolve()}"', f'format = "{kind}"']
-        if kind == "toa5":  # its columns have no usual names
-            names = 'temperature_c = "…", humidity_pct = "…", pressure_hpa = "…"'
+        if kind == "davis":  # day or month first, as the computer was set
+            weather += ['time_format = "%d/%m/%y %H:%M"   # check: as in the file']
+        if kind in ("davis", "lufft"):
+            weather += ['zone = "UTC"   # check: of the logger']
+        if kind in NAMELESS:
+            names = "" if kind == "toa5" else 'time = "…", '
+            names += 'temperature_c = "…", humidity_pct = "…", pressure_hpa = "…"'
             weather = [f"# {line}" for line in (*weather, f"columns = {{ {names} }}   # check")]
         lines += [*weather, ""]
     if found.polygons is not None:

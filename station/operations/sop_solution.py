@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-import io
 import math
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -13,6 +11,7 @@ from pyproj import CRS, Transformer
 from scipy.spatial.transform import Rotation
 
 from station.errors import ConfigError, StoreError
+from station.products.exports.transformations import covariance_text
 from station.quantities import Floats, Scanner
 from station.readers.sop import read_matrix
 from station.readers.tie_features import read_tie_features
@@ -104,7 +103,7 @@ def solve_sop(
             raise ConfigError(f"{path}: already exists; nothing is overwritten")
     registration = solve(features, initial_sop) if crs is None else _solve_on_map(features, initial_sop, crs)
     _write_new(out, _format_matrix(registration, table, crs))
-    _write_new(covariance_file, _format_covariance(registration.covariance))
+    _write_new(covariance_file, covariance_text(POSE, registration.covariance, "at the scanner"))
     sigma = np.sqrt(np.diag(registration.covariance))
     residuals = [
         FeatureResidual(name, float(residual_m), float(standardised))
@@ -180,16 +179,6 @@ def _format_matrix(registration: Registration, table: Path, crs: str | None) -> 
         f" {registration.reference_variance:.3g}; into {crs or 'the frame of its references'}\n"
     )
     return header + "\n".join(" ".join(f"{value:.12f}" for value in row) for row in registration.sop) + "\n"
-
-
-def _format_covariance(covariance: Floats) -> str:
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(["", *POSE])
-    writer.writerows(
-        [name, *(f"{value:.9e}" for value in row)] for name, row in zip(POSE, covariance, strict=True)
-    )
-    return "# rotations in rad, counter-clockwise about axes at the scanner, shifts in m\n" + text.getvalue()
 
 
 def summarise_sops(files: list[Path], pop: Path | None, crs: str | None) -> list[PoseSummary]:

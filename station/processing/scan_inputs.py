@@ -352,9 +352,9 @@ def _find_tilt_offset(
     earlier one, `waiting_before`, is still to be processed.
     """
     sop = position.sop
-    if site.inclination is None or sop is None:
+    if site.inclination is None:
         return None
-    if site.inclination.mode == "absolute":
+    if site.inclination.mode == "absolute" or sop is None:
         return NO_CYCLIC_ERROR
     if sop.scan is None and waiting_before:
         raise NotReadyError(

@@ -16,6 +16,8 @@ from station.readers.sop import read_matrix, valid_sop
 from station.science.geometry import pose
 from station.sections import Origin, SopSection
 
+NO_SOP = "local"  # identity of the missing SOP of a local map
+
 
 def scan_geometry(
     site: Site,
@@ -35,8 +37,10 @@ def scan_geometry(
     )
 
 
-def sop_identity(sop: SopSection) -> str:
+def sop_identity(sop: SopSection | None) -> str:
     """Return an identifier that changes with the content of the SOP file and with `sop.scan`."""
+    if sop is None:
+        return NO_SOP
     content = sop.file.read_bytes() + (f"\n{sop.scan}".encode() if sop.scan else b"")
     return f"{sop.file.stem}-{hashlib.sha256(content).hexdigest()[:8]}"
 
@@ -49,20 +53,22 @@ def sop_identity_at(site: Site, time_utc: datetime) -> str:
     first = valid_sop(site.sop, time_utc)
     started = [sop for sop in site.sop if sop.from_ <= time_utc]
     patterns = sorted({sop.files or "" for sop in started})
-    if len(patterns) == 1:
+    if len(patterns) <= 1:
         return sop_identity(first)
     valid = [
         valid_sop([sop for sop in started if (sop.files or "") == files], time_utc) for files in patterns
     ]
-    text = "\n".join(f"{sop.files} {sop_identity(sop)}" for sop in valid)
+    text = "\n".join(f"{sop.files} {sop_identity(sop)}" for sop in valid if sop is not None)
     return f"positions-{hashlib.sha256(text.encode()).hexdigest()[:8]}"
 
 
-def scanner_to_map(site: Site, sop: SopSection, matrix: Floats | None = None) -> pose.ScannerToMap:
-    """Return the transformation from scanner to map under an SOP; raise ConfigError if there is none.
+def scanner_to_map(site: Site, sop: SopSection | None, matrix: Floats | None = None) -> pose.ScannerToMap:
+    """Return the transformation from scanner to map under an SOP; raise ConfigError if it has none.
 
-    `matrix` (4, 4) replaces that of the file.
+    `matrix` (4, 4) replaces that of the file. Without an SOP the map is the levelled frame of the scanner.
     """
+    if sop is None:
+        return pose.scanner_to_local_map(np.eye(4) if matrix is None else matrix)
     matrix = read_matrix(sop.file) if matrix is None else matrix
     radius_m = site.scanner.range_max_m
     if site.map.crs is None:
@@ -116,6 +122,6 @@ def map_position(site: Site) -> tuple[float, float, float] | None:
     return float(east_m), float(north_m), float(up_m)
 
 
-def scanner_height_m(site: Site, sop: SopSection) -> float | None:
+def scanner_height_m(site: Site, sop: SopSection | None) -> float | None:
     """Return the height of the scanner above the ellipsoid [m]; None without a map, whose zero is unknown."""
     return None if site.map.crs is None else scanner_to_map(site, sop).position_m[2]

@@ -1,4 +1,4 @@
-"""Files for tools that do not read NetCDF: GeoTIFF, CSV, a STAC catalogue."""
+"""Files for tools that do not read NetCDF: GeoTIFF, CSV, a STAC catalogue, transformations."""
 
 from __future__ import annotations
 
@@ -18,6 +18,7 @@ from station.config import Site
 from station.errors import StationError
 from station.products.area_tables import REFERENCE, Span, area_records, as_csv
 from station.products.epoch_table import EpochTable, csv_times, read_epoch_table
+from station.products.exports.transformations import write_transformations
 from station.products.gallery import default_limit, replace_if_changed
 from station.products.geotiff import export_geotiff
 from station.products.stac import write_stac
@@ -28,8 +29,8 @@ Track = Callable[[list[EpochRef]], Iterable[EpochRef]]
 def export(site: Site, kind: str, span: Span | None, folder: Path, track: Track = iter) -> list[Path]:
     """Write the epochs of a span, by default the newest, as `kind` into a folder; return the files written.
 
-    `kind` is geotiff, csv (scans and areas; by default of all epochs) or stac. Raises StationError if there
-    is nothing to write or a library is missing.
+    `kind` is geotiff, csv (scans and areas; by default of all epochs), stac or transformations. Raises
+    StationError if there is nothing to write or a library is missing.
     """
     series = series_in(site.station.data)
     table = read_epoch_table(series)
@@ -41,6 +42,8 @@ def export(site: Site, kind: str, span: Span | None, folder: Path, track: Track 
     chosen = measured[-1:] if span is None else [epoch for epoch in measured if epoch.start in span]
     if not chosen:
         raise StationError("no epoch with a change in this span")
+    if kind == "transformations":
+        return write_transformations(series, chosen, folder, track)
     limit_m = site.products.change_limit_m
     limit_m = limit_m or default_limit(series, measured[0], versions[measured[0].epoch_file])
     if kind == "stac":

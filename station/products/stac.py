@@ -15,17 +15,16 @@ from typing import TYPE_CHECKING, Any
 import h5py
 import numpy as np
 from pyproj import Transformer
-from scipy.spatial.transform import Rotation
 
 from station.archive.epochs import EpochRef
 from station.archive.netcdf_layout import Series
 from station.archive.read_errors import read_errors
 from station.archive.reference_files import read_reference
-from station.archive.schema import FILL
 from station.archive.series.index import processing_file
 from station.config import Site
 from station.errors import StationError
 from station.products.epoch_table import EpochTable, read_epoch_table
+from station.products.exports.transformations import read_transformation
 from station.products.geotiff import KINDS, export_geotiff, write_cog
 from station.quantities import Floats
 from station.science.geometry.pose import horizontal_crs
@@ -37,9 +36,6 @@ TOPO4D = "https://tum-rsa.github.io/topo4d/v0.2.0/schema.json"
 PROJECTION = "https://stac-extensions.github.io/projection/v2.0.0/schema.json"
 COG_MEDIA_TYPE = "image/tiff; application=geotiff; profile=cloud-optimized"
 SPDX = re.compile(r"[A-Za-z0-9][A-Za-z0-9.+-]*")  # a licence that is no identifier is a link or a text
-POSE = (
-    "tilt_east", "tilt_north", "heading", "translation_east", "translation_north", "translation_up"
-)  # fmt: skip
 
 
 def write_stac(
@@ -176,8 +172,13 @@ def _topo4d(site: Site, series: Series, table: EpochTable, row: int) -> dict[str
             "title": f"reference surface, version {version}",
         }
     }
-    if (matrix := _adjustment(series, row)) is not None:
-        transformation["transformation"] = matrix.tolist()
+    covariance = {}
+    if (found := read_transformation(series, row)) is not None:
+        transformation["transformation"] = found.matrix.tolist()
+        covariance = {
+            "station:transformation_covariance": found.covariance.tolist(),
+            "station:scanner_position": found.position_m.tolist(),
+        }
     if np.isfinite(error_m := table.scalars["stable_nmad"][row]):
         transformation["registration_error"] = round(float(error_m), 6)
     return {
@@ -194,33 +195,10 @@ def _topo4d(site: Site, series: Series, table: EpochTable, row: int) -> dict[str
             "param": {"reference_version": version},
             "product_level": "L3",
         },
+        **covariance,
         "station:verdict": table.verdict[row],
         "station:scan_id": table.texts["scan_id"][row],
     }
-
-
-def _adjustment(series: Series, row: int) -> Floats | None:
-    """Return the rigid motion (4, 4) from points by the SOP alone to those of an epoch, in map coordinates.
-
-    It is the mean of the scan: inclination within the scan, refraction and range errors are not in it. None
-    without an adjustment. Source: equations.md, 6.1.
-    """
-    path = processing_file(series)
-    with read_errors(path), h5py.File(path, "r") as file:
-        if not {"shared_parameter", "parameter_name", "scanner_east"} <= set(file):
-            return None
-        names = [name.tobytes().rstrip(b"\0").decode() for name in file["parameter_name"][:]]
-        estimate = dict(zip(names, file["shared_parameter"][row].tolist(), strict=True))
-        position_m = np.array([file[f"scanner_{axis}"][row] for axis in ("east", "north", "height")])
-    values = np.array([estimate.get(name, FILL) for name in POSE])
-    if np.any(np.abs([*values, *position_m]) > FILL / 2):
-        return None
-    east_rad, north_rad, heading_rad = values[:3]  # headings are clockwise, rotations about up are not
-    rotation = Rotation.from_rotvec([east_rad, north_rad, -heading_rad]).as_matrix()
-    matrix = np.eye(4)
-    matrix[:3, :3] = rotation
-    matrix[:3, 3] = position_m + values[3:] - rotation @ position_m
-    return matrix
 
 
 def _time_bounds(series: Series) -> Floats:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable
+from collections.abc import Sequence
 from datetime import datetime
 from fnmatch import fnmatchcase
 from pathlib import Path
@@ -159,11 +159,14 @@ def _orthonormal_rotation(rotation: Floats, path: Path) -> Floats:
     return np.asarray(u @ vt)
 
 
-def valid_sop(sops: Iterable[SopSection], time_utc: datetime, name: str = "") -> SopSection:
-    """Return the SOP valid at a time: the latest that has begun; raise ScanError if none has.
+def valid_sop(sops: Sequence[SopSection], time_utc: datetime, name: str = "") -> SopSection | None:
+    """Return the SOP valid at a time: the latest that has begun; None if there are none at all.
 
     With scan positions it is that for the file `name`; without a name, that of the position listed first.
+    Raises ScanError if none has begun.
     """
+    if not sops:
+        return None
     started = [sop for sop in sops if sop.from_ <= time_utc]
     if not started:
         raise ScanError(f"no [[sop]] of the site file has begun by {time_utc:%Y-%m-%d %H:%M:%S} UTC")

@@ -36,6 +36,10 @@ UNITS: tuple[dict[str, tuple[float, float]], ...] = (
     | dict.fromkeys(("0-1", "0..1", "frac", "fraction", "1"), (100.0, 0.0)),
 )
 SI = ("k", "pa", "1")
+FIRST_WORDS = {"TOA5": "toa5", "SMET": "smet", "Plot Title": "hobo"}
+OWN_NAMES = ("dwd", "meteoswiss")  # one column tells these dialects from all others
+TIME_NAME = re.compile(r"(?i)time|date|datum|zeit")
+QUANTITY_NAME = re.compile(r"(?i)temp|press|druck|humid|feuchte|\brh\b")
 UNIX = "unix"  # weather.time_format of seconds since 1970
 EXAMPLE = datetime(2025, 11, 15, 13, 14, 15, tzinfo=UTC)  # whose fields have all their digits
 # A name and the unit behind it: `T [C]`, `T (C)`, `Temp, °C (LGR S/N: 1)`, `Temp - C`, `Temp_C`.
@@ -167,6 +171,30 @@ def read_header(file: BinaryIO, section: WeatherSection, name: str, *, is_part: 
         first_row=file.tell(),
         to_utc_s=_time_parser(section, dialect.time_formats, _stated_offset_h(found, time_indices)),
     )
+
+
+def recognise_dialect(file: BinaryIO) -> str:
+    """Return the dialect of the log in a file by its header; '' if it is no weather log.
+
+    It is `csv` if a line names a time and a quantity in other words than a known dialect.
+    """
+    line = decode(file.readline(MAX_LINE_BYTES)).lstrip('"')
+    if mark := next((mark for mark in FIRST_WORDS if line.startswith(mark)), ""):
+        return FIRST_WORDS[mark]
+    for kind, dialect in DIALECTS.items():
+        if not any(getattr(dialect, key) for key in QUANTITIES):
+            continue
+        file.seek(0)
+        given = {"time_format": "%d"} if kind == "davis" else {}
+        section = WeatherSection.model_validate({"file": "log", "format": kind, **given})
+        wanted = _Wanted.of(section, dialect)
+        with suppress(ScanError, ValueError, csv.Error):
+            is_part = kind in OWN_NAMES
+            if not wanted.missing(_find_names(file, section, wanted, is_part=is_part).names, is_part=is_part):
+                return kind
+    file.seek(0)
+    lines = (decode(file.readline(MAX_LINE_BYTES)) for _ in range(MAX_HEADER_LINES))
+    return "csv" if any(TIME_NAME.search(line) and QUANTITY_NAME.search(line) for line in lines) else ""
 
 
 @dataclass(frozen=True)

@@ -5,9 +5,11 @@ from __future__ import annotations
 import logging
 import math
 from collections.abc import Callable, Iterable
+from contextlib import suppress
 from typing import Protocol, TypeVar
 
-from station.archive.series.index import stored_series
+from station.archive.netcdf_layout import Series
+from station.archive.series.index import list_epochs, stored_series
 from station.clock import Clock
 from station.config import Site
 from station.errors import ConfigError, StoreError
@@ -24,6 +26,8 @@ from station.processing.integrity import (
     unreadable_files,
     verify_checksums,
 )
+from station.processing.provenance import stored_epochs
+from station.processing.scanner_pose import NO_SOP
 from station.processing.scans.scan_files import ScanFinder
 from station.processing.site_files import series_for
 from station.processing.store_tasks import update_series
@@ -143,6 +147,7 @@ def require_same_map(site: Site) -> None:
             f"map.crs = {crs!r} differs from that of {site.station.data}, {stored_name}: restore it, or give"
             " station.data a new folder"
         )
+    _require_same_frame(site, series)
     stored = series.grid
     configured = site.grid_cells
     deviation_m = max(
@@ -159,3 +164,21 @@ def require_same_map(site: Site) -> None:
             f" {stored.cell_m:.6g} m from west {stored.west_m:.10g}, north {stored.north_m:.10g}: restore it,"
             " or give station.data a new folder"
         )
+
+
+def _require_same_frame(site: Site, series: Series) -> None:
+    """Raise ConfigError if the first stored epoch is on a local map without an SOP, and others would not be.
+
+    An SOP moves every cell: the reference of the local map means nothing under it.
+    """
+    if site.scans.frame == "map":
+        return
+    with suppress(StoreError):  # damaged files are repaired later
+        first = stored_epochs(series, list_epochs(series)[:1])
+        sop_id = first[0].provenance.sop_id if first else ""
+        if sop_id and (sop_id == NO_SOP) == bool(site.sop):
+            stored, now = ("without an [[sop]]", "has one") if site.sop else ("with an [[sop]]", "has none")
+            raise ConfigError(
+                f"{site.station.data} is of a map {stored}, the site file {now}: restore it, or give"
+                " station.data a new folder and process the scans again"
+            )

@@ -63,6 +63,22 @@ def test_clouds_give_the_stored_change(processed, tmp_path):
         assert np.ptp(cloud.gps_time) > 30
 
 
+def test_an_octree_has_the_points_of_the_cloud(processed, tmp_path):
+    site = read_site(processed / "site.toml")
+    (plain,) = export_points(site, None, tmp_path)
+    (path,) = export_points(site, None, tmp_path, file_format="copc")
+    assert path.name == plain.name.replace(".laz", ".copc.laz")
+    assert not list(tmp_path.glob(".*"))
+    expected = laspy.read(plain)
+    with laspy.CopcReader.open(str(path)) as reader:
+        assert reader.header.parse_crs().to_epsg() == 32632
+        points = reader.query()
+    fields = ("gps_time", "X", "Y", "Z", "intensity", "elevation_change", "quality")
+    rows = [np.stack([np.asarray(cloud[name], float) for name in fields]) for cloud in (expected, points)]
+    ordered = [row[:, np.lexsort(row[::-1])] for row in rows]
+    np.testing.assert_array_equal(*ordered)
+
+
 def test_a_span_without_epochs_and_a_missing_scan_are_told(processed, tmp_path):
     site = read_site(processed / "site.toml")
     with pytest.raises(StationError, match="no epoch in this span"):

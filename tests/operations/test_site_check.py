@@ -136,6 +136,16 @@ def test_tilt_of_sop_and_log_are_compared(folder):
     assert list(site_check._inclination(read_site(folder / "site.toml"))) == []
 
 
+def test_an_absolute_log_under_an_sop_that_contains_the_tilt_is_told(folder):
+    path = folder / "site.toml"
+    path.write_text(path.read_text().replace('mode = "relative"', 'mode = "absolute"'))
+    (finding,) = site_check._inclination(read_site(path))
+    assert (finding["level"], finding["what"]) == ("warning", "inclination")
+    assert 'inclination.mode = "absolute" applies it again' in finding["message"]
+    (folder / "sop.dat").write_text("0 1 0 0\n-1 0 0 0\n0 0 1 0\n0 0 0 1\n")  # of an upright scanner
+    assert list(site_check._inclination(read_site(path))) == []
+
+
 def test_weather_log_of_another_time_zone_is_told():
     (message,) = warnings(plausibility.weather_time_findings(time.time() + 7200))
     assert "2.0 h in the future" in message

@@ -12,6 +12,7 @@ from support import tiny_station
 from station.config import read_site
 from station.errors import ConfigError
 from station.operations.site_proposal import propose_site
+from station.readers.weather import read_weather
 
 
 @pytest.fixture(scope="module")
@@ -32,7 +33,8 @@ def test_scans_without_anything_else_level_themselves(source, tmp_path):
     assert (site.scans.frame, site.scans.name) == ("scanner", "%y%m%d_%H%M%S")
     assert site.inclination.mode == "absolute"
     assert site.map.crs is None
-    np.testing.assert_array_equal(np.loadtxt(tmp_path / "site" / "SOP-SOP.dat"), np.eye(4))
+    assert not site.sop
+    assert {path.name for path in (tmp_path / "site").iterdir()} == {"site.toml", "station-site.schema.json"}
     with pytest.raises(ConfigError, match="already exists"):
         propose_site(source, tmp_path / "site")
 
@@ -62,6 +64,22 @@ def test_matrices_weather_and_polygons_are_found(source, tmp_path, shared_data):
     assert site.inclination.mode == "relative"
     expected = np.loadtxt(shared_data / "mammoth/2020-2021-SOP.dat")
     np.testing.assert_allclose(np.loadtxt(site.sop[0].file), expected, atol=1e-6)
+
+
+def test_a_proposed_davis_log_can_be_read(source, tmp_path):
+    (source / "weather.txt").write_text(
+        "\t\tTemp\tOut\t\nDate\tTime\tOut\tHum\tBar  \n15/07/25\t 0:10\t-1.5\t51\t684.5\n"
+    )
+    site = read_site(propose_site(source, tmp_path / "site")[0])
+    assert site.weather.format == "davis"
+    assert len(read_weather(site.weather).time_utc_s) == 1
+
+
+def test_columns_of_an_unknown_log_are_left_to_the_user(source, tmp_path):
+    (source / "weather.csv").write_text("Zeit;Temperatur;Feuchte;Luftdruck\n2025-07-15 00:10;-1,5;51;684,5\n")
+    path = propose_site(source, tmp_path / "site")[0]
+    assert read_site(path).weather is None
+    assert '# columns = { time = "…", temperature_c' in path.read_text()
 
 
 def test_scans_on_the_map_and_other_names(tmp_path):

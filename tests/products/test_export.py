@@ -20,7 +20,8 @@ from station.archive.reference_files import ReferenceProvenance, open_reference,
 from station.archive.series.index import series_in
 from station.products.area_tables import Span
 from station.products.export import export
-from station.products.stac import PROJECTION, TOPO4D, _adjustment
+from station.products.exports.transformations import read_transformation
+from station.products.stac import PROJECTION, TOPO4D
 
 
 @pytest.mark.integration
@@ -206,15 +207,20 @@ def test_transformation_of_an_epoch_has_the_signs_of_the_adjustment(tmp_path):
         "translation_north": -0.01, "translation_up": 0.03,
     }  # fmt: skip
     scanner_m, gradient = np.array([632_000.0, 5_186_000.0, 2900.0]), np.array([0.2, -0.3])
+    scale = np.array([1e-6, 1e-6, 1e-6, 1e-3, 1e-3, 1e-3])
+    root = np.random.default_rng(2).normal(size=(6, 6)) * scale[:, None]
+    covariance = root @ root.T  # correlated: a sign that is wrong changes the variance of points
     series = Series(tmp_path, "hef", None, None)
     with h5py.File(series.path, "w") as file:
         names = np.array([name.encode() for name in estimate], "S64")
         file["parameter_name"] = names.view("S1").reshape(len(names), 64)
         file["shared_parameter"] = [list(estimate.values())]
+        file["shared_parameter_covariance"] = covariance[None]
         for axis, value_m in zip(("east", "north", "height"), scanner_m, strict=True):
             file[f"scanner_{axis}"] = [value_m]
     offset_m = np.random.default_rng(1).uniform(-2000, 2000, (50, 3))
-    moved = np.c_[scanner_m + offset_m, np.ones(50)] @ _adjustment(series, 0).T
+    found = read_transformation(series, 0)
+    moved = np.c_[scanner_m + offset_m, np.ones(50)] @ found.matrix.T
     motion_m = moved[:, :3] - scanner_m - offset_m
     rise_m = motion_m[:, 2] - motion_m[:, :2] @ gradient
     layout = ParameterLayout(0.0, 360, full_circle=True)
@@ -222,3 +228,10 @@ def test_transformation_of_an_epoch_has_the_signs_of_the_adjustment(tmp_path):
     expected_m = -np.array([*estimate.values()]) @ jacobian.pose[:6]
     np.testing.assert_allclose(rise_m, expected_m, atol=2e-6)
     assert np.ptp(expected_m) > 0.01
+    normal = np.array([*-gradient, 1.0])  # a small rotation w moves a point by w x P
+    by_pose = np.c_[np.cross(offset_m, normal), np.tile(normal, (50, 1))]
+    np.testing.assert_allclose(
+        np.einsum("ni,ij,nj->n", by_pose, found.covariance, by_pose),
+        np.einsum("in,ij,jn->n", jacobian.pose[:6], covariance, jacobian.pose[:6]),
+        rtol=1e-4,
+    )

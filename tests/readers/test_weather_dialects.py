@@ -1,5 +1,6 @@
 """Weather logs as loggers and services write them; the expected values are worked by hand."""
 
+import io
 from datetime import UTC, datetime
 
 import numpy as np
@@ -8,6 +9,7 @@ from pydantic import ValidationError
 
 from station.errors import NotReadyError, ScanError
 from station.readers.weather import read_weather
+from station.readers.weather_dialects import recognise_dialect
 from station.sections import WeatherSection
 
 # Each: lines of the site file, and the file. All say: 15 July 2025, 00:10 and 00:20 UTC; at first -1.5 °C,
@@ -104,6 +106,28 @@ def test_dialects_give_time_temperature_pressure_and_humidity(kind, encoding, tm
         np.testing.assert_allclose(log.temperature_c, [-1.5, np.nan], atol=1e-9)
         np.testing.assert_allclose(log.pressure_hpa, [684.5, 684.6], atol=0.05)
         np.testing.assert_allclose(log.humidity_pct, [51, 50], atol=1e-9)
+
+
+@pytest.mark.parametrize("kind", [kind for kind in LOGS if "header" not in kind and "preamble" not in kind])
+def test_dialects_are_recognised_by_their_header(kind):
+    settings, text = LOGS[kind]
+    assert recognise_dialect(io.BytesIO(text.encode())) == settings["format"]
+
+
+@pytest.mark.parametrize(
+    ("text", "dialect"),
+    [
+        ('"TOA5","hut","CR1000"\n"TIMESTAMP","RECORD","T"\n', "toa5"),
+        ("STATIONS_ID;MESS_DATUM;QN_9;TT_TU;RF_TU;eor\n", "dwd"),  # hourly files lack the pressure
+        ('"Plot Title: hut"\n"#","Date Time, GMT+02:00","Temp, °C"\n', "hobo"),
+        ("Time,Roll,Pitch\n0.5,1.25,-0.5\n", ""),
+        ("1 0 0 5\n0 1 0 6\n0 0 1 7\n0 0 0 1\n", ""),
+        ("\0\1time\0" * 3000, ""),
+        ("", ""),
+    ],
+)
+def test_other_headers(text, dialect):
+    assert recognise_dialect(io.BytesIO(text.encode())) == dialect
 
 
 def test_hours_of_the_dwd_are_not_taken_for_minutes(tmp_path):

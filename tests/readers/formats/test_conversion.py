@@ -1,14 +1,18 @@
 """Scans that a command converts: its limits, its messages, and what is left of it."""
 
+import re
 import sys
 import time
+import tomllib
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from station.errors import InconclusiveError, NotReadyError, ScanError
 from station.processing.workers.isolation import TaskRunner
 from station.readers.formats.conversion import convert, open_site_scan
+from station.readers.inclination import read_inclination
 from station.sections import ScansSection
 
 COPY = "import shutil, sys; shutil.copy(sys.argv[1], sys.argv[2])"
@@ -49,6 +53,44 @@ def test_the_converted_scan_is_read_under_its_own_name_and_removed(tmp_path, wri
 def test_commands_that_fail_are_told(tmp_path, script, error, message):
     with pytest.raises(error, match=message):
         convert(command(script), tmp_path / "a.rxp", tmp_path / "a.laz", **LIMITS)
+
+
+PDAL = """#!/bin/sh
+# Stand-in: takes the options of pdal translate and of two of its stages, and copies.
+[ "$1" = translate ] && [ -f "$2" ] && source="$2" && out="$3" && shift 3 || exit 64
+for option; do
+    case "$option" in
+    --readers.rxp.sync_to_pps=false|--writers.las.*=*) ;;
+    *) echo "unknown option $option" >&2; exit 1 ;;
+    esac
+done
+cp "$source" "$out"
+"""
+RI_INCLINATION = """#!/bin/sh
+case "$1" in file:*) [ -f "${1#file:}" ] || exit 2 ;; *) exit 64 ;; esac
+printf 'Time,Roll,Pitch\\n1.0,0.5,-0.25\\n2.0,0.5,-0.25\\n'
+"""
+
+
+def test_recipes_for_rxp_run_with_programs_of_their_interface(tmp_path, monkeypatch, write_sweep):
+    """The real PDAL with RiVLib, and rivlib-utils, never ran here."""
+    manual = (Path(__file__).parents[3] / "docs" / "how-to" / "your-own-files.md").read_text()
+    script = re.search(r'```sh title="rxp_to_laz.sh"\n(.*?)```', manual, re.DOTALL)[1]
+    plain = re.search(r'convert = (\["pdal".*?\])\n', manual, re.DOTALL)[1]
+    for name, text in (("pdal", PDAL), ("ri-inclination", RI_INCLINATION), ("rxp_to_laz.sh", script)):
+        (tmp_path / name).write_text(text)
+        (tmp_path / name).chmod(0o755)
+    monkeypatch.setenv("PATH", f"{tmp_path}:/usr/bin:/bin")
+    source = write_sweep("250715_090000.laz", 5000).rename(tmp_path / "250715_090000.rxp")
+    for recipe in (
+        (str(tmp_path / "rxp_to_laz.sh"), "{in}", "{out}"),
+        tuple(tomllib.loads(f"convert = {plain}")["convert"]),
+    ):
+        convert(recipe, source, tmp_path / "out.laz", **LIMITS)
+        assert (tmp_path / "out.laz").read_bytes() == source.read_bytes()
+        (tmp_path / "out.laz").unlink()
+    log = read_inclination(tmp_path / "out-incl.txt")
+    np.testing.assert_allclose(np.degrees([log.roll_rad, log.pitch_rad]), [[0.5, 0.5], [-0.25, -0.25]])
 
 
 def test_a_command_that_is_not_there_makes_the_scan_wait(tmp_path):
