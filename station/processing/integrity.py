@@ -16,6 +16,7 @@ import numpy as np
 from station.archive.areas import FILE_NAME as AREAS
 from station.archive.atomic_files import DAMAGED
 from station.archive.derived.boxes import BOXES, DAILY
+from station.archive.derived.event_table import FILE_NAME as EVENTS
 from station.archive.derived.fingerprints import is_intact as is_derived_intact
 from station.archive.epochs import (
     EpochRef,
@@ -273,7 +274,7 @@ def _check_references(series: Series) -> list[tuple[str, str, str]]:
 def _check_derived(series: Series) -> list[tuple[str, str, str]]:
     """Return findings on the derived files and the tilt offsets, which the service restores while it runs."""
     paths = damaged_tilt_offsets(series.folder)
-    derived = [series.folder / name for name in (AREAS, BOXES, DAILY)]
+    derived = [series.folder / name for name in (AREAS, BOXES, DAILY, EVENTS)]
     paths += [path for path in derived if path.exists() and not is_derived_intact(path)]
     message = "damaged: the service restores it with the next scan"
     return [("fault", "file", f"{path.relative_to(series.folder)}: {message}") for path in paths]

@@ -60,11 +60,6 @@ class Blocks:
         return np.asarray(self.count > 0)
 
     @property
-    def own_random_m2(self) -> Floats:
-        """Variance of the mean without the part that comes from the reference (by, bx)."""
-        return np.maximum(self.random_m2 - self.reference_m2, 0.0)
-
-    @property
     def parameters(self) -> tuple[str, ...]:
         """Names of the shared parameters; they depend on the position of the scanner."""
         return () if self.cells.shared is None else self.cells.shared.names
@@ -144,14 +139,14 @@ class BlockQueries:
             "epoch_count": epoch_count
         }
 
-    def read(self, epoch: EpochRef, *, with_jacobian: bool = True) -> Blocks:
-        """Return the blocks of an epoch; without the Jacobian of blocks only their means."""
+    def read(self, epoch: EpochRef) -> Blocks:
+        """Return the blocks of an epoch."""
         epoch_cells = self._reader.read_shared(epoch)
         sums, surface = epoch_sums(self._series, epoch), self._reference_sums(epoch_cells.reference)
         count, known = np.maximum(sums["count"], 1), np.maximum(surface["known"], 1)
         observed = (sums["count"] > 0) & (surface["known"] > 0)
         jacobian = None
-        if with_jacobian and epoch_cells.shared is not None:
+        if epoch_cells.shared is not None:
             jacobian = self._jacobian(epoch_cells, sums, surface, observed)
         random_m2 = sums["random_m2"] / count**2
         return Blocks(

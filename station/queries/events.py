@@ -31,6 +31,7 @@ from station.quantities import Bools, Floats, Grid, SharedParameters
 from station.queries.aggregates import common_error_covariance
 from station.queries.block_sums import epoch_sums
 from station.queries.blocks import BlockQueries, Blocks
+from station.queries.epoch_cells import EpochCells, EpochReader
 from station.science.analysis.calibration import SparseJacobian
 from station.science.analysis.event_tracks import Track, pair_tracks, track_events
 from station.science.analysis.events import (
@@ -51,7 +52,7 @@ LEAST_HISTORY = 8
 BEFORE = 6  # the last of them, with which the two newest are compared
 LEAST_BEFORE = 3  # of them must have seen a block
 YEAR_S = 365.25 * 86_400
-CACHED_EPOCHS = BEFORE + 4  # whose blocks are in memory
+CACHED_EPOCHS = 4  # whose shared parameters are in memory
 NEIGHBOURS = np.ones((3, 3), np.bool_)  # of a block, itself included
 RETAINED_SIGMA = 0.02  # of the share of a change that cells with few points retain (accuracy.md)
 EDGE_BLOCKS = 2  # around what was detected: an event covers them in part
@@ -73,8 +74,9 @@ class EventQueries:
         self._series, self._queries, self._scans_per_year = series, queries, YEAR_S / expected_every_s
         self._index = SeriesIndex(series)
         self._usable = self._usable_epochs()
-        self._read = lru_cache(CACHED_EPOCHS)(self._read_blocks)
-        self._change = lru_cache(HISTORY + 2)(self._read_change)
+        self._reader = EpochReader(series)
+        self._shared = lru_cache(CACHED_EPOCHS)(self._read_shared)
+        self._levels = lru_cache(HISTORY + 2)(self._read_levels)
         self._found = read_found(series)
         self._used: dict[str, Any] = {}  # of what was found, what is still of these epochs
 
@@ -137,17 +139,21 @@ class EventQueries:
         parts = [kind, f"{self._scans_per_year:.6g}", self._usable[scans[-1]][1], *names, *texts]
         return hashlib.sha256("\n".join(parts).encode()).hexdigest()[:32]
 
-    def _read_blocks(self, scan: int) -> Blocks:
-        return self._queries.read(self._index[self._usable[scan][0]], with_jacobian=False)
+    def _read_levels(self, scan: int) -> BlockLevels:
+        """Return the levels of a scan: of its sums alone, which is all that most scans of a window need."""
+        position, version = self._usable[scan]
+        sums = epoch_sums(self._series, self._index[position])
+        surface = self._queries.reference_blocks(version)
+        count, known = np.maximum(sums["count"], 1), np.maximum(surface["known"], 1)
+        observed = (sums["count"] > 0) & (surface["known"] > 0)
+        random_m2 = sums["random_m2"] / count**2 - surface["random_m2"] / known / count
+        return BlockLevels(
+            np.where(observed, sums["change_m"] / count, np.nan),
+            np.where(observed, np.maximum(random_m2, 0.0), 0.0),
+        )
 
-    def _read_change(self, scan: int) -> Floats:
-        sums = epoch_sums(self._series, self._index[self._usable[scan][0]])
-        count = sums["count"]
-        return np.where(count > 0, sums["change_m"] / np.maximum(count, 1), np.nan)
-
-    def _levels(self, scan: int) -> BlockLevels:
-        blocks = self._read(scan)
-        return BlockLevels(np.where(blocks.observed, blocks.change_m, np.nan), blocks.own_random_m2)
+    def _read_shared(self, scan: int) -> EpochCells:
+        return self._reader.read_shared(self._index[self._usable[scan][0]])
 
     def _search(self, window: list[int], progress: Callable[[], None]) -> list[list[Any]]:
         """Return the regions that the two newest scans of a window show: encoded blocks, and the rest."""
@@ -155,7 +161,7 @@ class EventQueries:
         before = history[-BEFORE:]
         newest = self._with_jacobian(second)
         systematic_m2 = [
-            self._systematic_variance(newest, self._read(scan), self._read(before[-1]))
+            self._systematic_variance(newest, self._shared(scan), self._shared(before[-1]))
             for scan in (first, second)
         ]
         known = self._queries.reference_blocks(self._usable[second][1])["known"] > 0
@@ -163,7 +169,7 @@ class EventQueries:
             [self._levels(scan) for scan in before],
             (self._levels(first), self._levels(second)),
             (systematic_m2[0], systematic_m2[1]),
-            scan_scatter(np.stack([self._change(scan) for scan in history])),
+            scan_scatter(np.stack([self._levels(scan).change_m for scan in history])),
             newest.rock > 0.5,
             event_thresholds(int(np.count_nonzero(known)), self._scans_per_year),
             LEAST_BEFORE,
@@ -184,7 +190,7 @@ class EventQueries:
         return self._queries.read(self._index[self._usable[scan][0]])
 
     @staticmethod
-    def _systematic_variance(geometry: Blocks, scan: Blocks, before: Blocks) -> Floats:
+    def _systematic_variance(geometry: Blocks, scan: EpochCells, before: EpochCells) -> Floats:
         """Return the systematic variance of the difference of two scans (by, bx), with one Jacobian."""
         variance_m2 = np.zeros(geometry.count.shape)
         difference = _difference(scan, before)
@@ -296,7 +302,7 @@ class EventQueries:
         weights = area_m2 * (filled - around)
         volume_m3 = float(np.sum(weights[known] * change_m[known]))
         variance = float(np.sum(weights[known] ** 2 * random_m2[known]))
-        variance += self._shared_variance(newest, self._read(before[-1]), weights)
+        variance += self._shared_variance(newest, self._shared(before[-1]), weights)
         variance += _sampling_variance(newest.count, self._queries.cells, weights, change_m)
         variance += area_m2**2 * void_variance(
             members, distance, np.where(known, change_m, np.nan), random_m2
@@ -309,8 +315,8 @@ class EventQueries:
         return [round(volume_m3, 4), round(float(np.sqrt(variance)), 4)]
 
     @staticmethod
-    def _shared_variance(newest: Blocks, before: Blocks, weights: Floats) -> float:
-        difference = _difference(newest, before)
+    def _shared_variance(newest: Blocks, before: EpochCells, weights: Floats) -> float:
+        difference = _difference(newest.cells, before)
         if newest.jacobian is None or difference is None:
             return 0.0
         row = sparse.csr_array(weights[newest.observed][None, :])
@@ -360,12 +366,12 @@ def _sampling_variance(count: Floats, cells: int, weights: Floats, change_m: Flo
     return float(np.sum((weights**2 * sample_m2)[inside]))
 
 
-def _difference(scan: Blocks, before: Blocks) -> SharedParameters | None:
+def _difference(scan: EpochCells, before: EpochCells) -> SharedParameters | None:
     """Return the shared parameters of the difference of two scans: both errors, less what is common."""
-    first, second = scan.cells.shared, before.cells.shared
+    first, second = scan.shared, before.shared
     if first is None or second is None or first.names != second.names:
         return first if first is None or second is None else first + first
-    common = common_error_covariance([scan.cells, before.cells])
+    common = common_error_covariance([scan, before])
     covariance = first.covariance + second.covariance
     if common is not None:
         covariance = covariance - common - common.T

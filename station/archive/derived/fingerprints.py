@@ -1,4 +1,4 @@
-"""Fingerprints of files that are derived from the epochs: `areas.nc`, `boxes.nc`, `daily.nc`.
+"""Fingerprints of files derived from the epochs: `areas.nc`, `boxes.nc`, `daily.nc`, `events.geojson`.
 
 A derived file that differs from what was written, by a single bit, is not opened but built again.
 """
