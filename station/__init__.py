@@ -96,6 +96,24 @@ def volume(
     return volumes.volume_change(to_mask(area, volumes.series), volumes.find_epoch(epoch), other)
 
 
+def levels(site_or_folder: str | Path, area: str | npt.ArrayLike | shapely.Geometry) -> xr.Dataset:
+    """Return level [m] and rate [m/d] of the cells of an area at the end of each day, with their uncertainty.
+
+    The level is the elevation change filtered over time, cell by cell, from all usable epochs of the newest
+    reference; the rate is its slope without steps. Both have a random uncertainty, independent between
+    cells, and a systematic one, which cells have in common. `filled` is 1 where the last epoch of the day did
+    not see the cell: its level is then extrapolated, with an uncertainty to match. `area` is that of
+    `station.volume`. Nothing is stored: every epoch is read. Raises StoreError if there is no series, no
+    reference or no usable epoch, StationError if there is no area of this name. Source: equations.md, 6.12.
+    """
+    from station.archive.series.index import series_in
+    from station.queries.grid_arrays import to_mask
+    from station.queries.levels import filter_levels
+
+    series = series_in(site_or_folder)
+    return filter_levels(series, to_mask(area, series), lambda: None)
+
+
 def point_covariance(
     site_or_folder: str | Path, points_m: npt.ArrayLike, epoch: Epoch
 ) -> npt.NDArray[np.float64]:

@@ -11,6 +11,7 @@ import pytest
 from benchmarks.accuracy_measures import RECORD, SCALES, summarise
 from benchmarks.accuracy_rows import ROWS
 from benchmarks.accuracy_table import BEGIN, END, missed, write_markdown
+from benchmarks.levels import measure
 from benchmarks.peers import GridTask, Peer, peer_cost
 from benchmarks.process_cost import Cost, FailedError, Row, cost_of, job_cost, median_cost
 
@@ -175,3 +176,16 @@ def test_accuracy_tables_replace_those_of_a_page(tmp_path):
     row = r"\| rough: rough valley, rock all round \| 0\.010 / 0\.0(19|20) \| 0\.015 / 0\.03 \("
     assert len(re.findall(row, text)) == 1
     assert "old" not in text
+
+
+def test_filter_of_levels_is_as_good_as_a_plain_one_and_keeps_steps():
+    quiet, avalanche = (
+        {
+            method: measure((method, kind, 100, 6))["level [mm]"]
+            for method in ("single scans", "plain Kalman", "station")
+        }
+        for kind in ("quiet", "avalanche")
+    )
+    assert quiet["station"] == pytest.approx(quiet["plain Kalman"], rel=0.15)
+    assert quiet["station"] < quiet["single scans"] / 3
+    assert avalanche["station"] < avalanche["plain Kalman"] / 3

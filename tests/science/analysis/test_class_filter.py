@@ -1,0 +1,121 @@
+"""Learned process noise and error shares: against explicit weights, and simulated seasons with a truth."""
+
+import numpy as np
+import pytest
+
+from station.science.analysis.cell_filter import CellFilter, ProcessNoise
+from station.science.analysis.class_filter import CORRELATION_D, SAMPLE_CELLS, ClassFilter, ErrorShares
+from station.science.analysis.filter_errors import filter_errors
+
+HOUR_D = 1 / 24
+RNG = np.random.default_rng
+
+
+def test_shares_are_those_of_the_weights_of_each_scan():
+    noise, random_m2, systematic_m2, count = ProcessNoise(1e-5, 1e-4), 4e-4, 1e-4, 30
+    shares, weights = ErrorShares.first(random_m2, systematic_m2), np.zeros((2, count))
+    weights[0, 0] = 1.0  # of each scan in level and rate
+    for index in range(1, count):
+        moved = shares.moved(HOUR_D, noise)
+        gain = moved.total[:, 0] / (moved.total[0, 0] + random_m2 + systematic_m2)
+        weights = np.array([[1.0, HOUR_D], [0.0, 1.0]]) @ weights
+        weights -= np.outer(gain, weights[0])
+        weights[:, index] += gain
+        shares = moved.updated(random_m2, systematic_m2)
+    lag_d = HOUR_D * np.abs(np.subtract.outer(np.arange(count), np.arange(count)))
+    assert shares.random == pytest.approx(random_m2 * weights @ weights.T)
+    assert shares.systematic == pytest.approx(weights @ np.exp(-lag_d / CORRELATION_D) @ weights.T)
+    assert shares.random + shares.process + systematic_m2 * weights @ weights.T == pytest.approx(shares.total)
+
+
+def season(kind, random_m, systematic_m, seed, *, lasting=False, cells=600, days=12):
+    """True levels (t, n), true rates over the last day without steps, and hourly observations with gaps."""
+    rng = RNG(seed)
+    day = HOUR_D * np.arange(24 * days)
+    factor = rng.uniform(0.7, 1.3, cells)
+    sun = np.maximum(0, 2.4 * np.sin(2 * np.pi * (day - 0.3)))
+    weather = np.interp(day, np.arange(days + 1), 1 + 0.3 * rng.standard_normal(days + 1))
+    settling_m = -0.04 * (1 - np.exp(-np.maximum(day - 4.4, 0) / 2))
+    course_m = {
+        "stable": np.zeros(len(day)),
+        "creep": 0.01 * day,
+        "melt": np.cumsum(-0.06 * weather * sun) * HOUR_D,
+        "snow": settling_m,
+    }[kind]
+    rate_m_d = (course_m - np.roll(course_m, 24))[:, None] * factor
+    fall_m = 0.3 * np.clip((day - 4.0) / 0.4, 0, 1) if kind == "snow" else 0.0
+    level_m = (course_m + fall_m)[:, None] * factor
+    shared = rng.standard_normal(len(day))
+    if lasting:
+        kept = np.exp(-HOUR_D / CORRELATION_D)
+        for index in range(1, len(day)):
+            shared[index] = kept * shared[index - 1] + np.sqrt(1 - kept**2) * shared[index]
+    change_m = level_m + random_m * rng.standard_normal(level_m.shape) + systematic_m * shared[:, None]
+    change_m[rng.random(change_m.shape) < 0.1] = np.nan
+    change_m[170:178] = np.nan
+    return level_m, rate_m_d, change_m
+
+
+def filtered(change_m, random_m, systematic_m, *, stable=False):
+    """Yield state and errors after each hourly scan (t, n)."""
+    count = change_m.shape[1]
+    sample = np.linspace(0, count - 1, SAMPLE_CELLS).astype(int)
+    cells, ground = CellFilter.empty(count), ClassFilter(SAMPLE_CELLS, stable=stable)
+    random_m2, systematic_m2 = np.full(count, random_m**2), np.full(count, systematic_m**2)
+    for index, scan_m in enumerate(change_m):
+        days = HOUR_D if index else 0.0
+        noise = ground.advance(days, scan_m[sample], random_m2[sample], systematic_m2[sample])
+        cells.advance(days, noise, scan_m, random_m2 + systematic_m2)
+        state = cells.estimates()
+        unseen_d = cells.cells["unseen_min"] / 1440
+        yield state, filter_errors(state, unseen_d, random_m2, systematic_m2, ground.shares)
+
+
+def calibration(kind, random_m, systematic_m, **options):
+    """Root mean square of z of level and rate, and the error of 12 hours over that of a single difference."""
+    level_z, rate_z, error_m = [], [], []
+    for seed in range(2):
+        level_m, rate_m_d, change_m = season(kind, random_m, systematic_m, seed, **options)
+        for index, (state, errors) in enumerate(
+            filtered(change_m, random_m, systematic_m, stable=kind == "stable")
+        ):
+            error_m.append(state.level_m - level_m[index])
+            if index < 72:
+                continue
+            level_sigma_m = np.sqrt(errors.level_random_m2 + errors.level_systematic_m2)
+            rate_sigma_m_d = np.sqrt(errors.rate_random_m2_d2 + errors.rate_systematic_m2_d2)
+            level_z.append(error_m[-1] / level_sigma_m)
+            rate_z.append((state.rate_m_d - rate_m_d[index]) / rate_sigma_m_d)
+        drop = len(error_m) - len(change_m) + 72
+        change_error_m = np.subtract(error_m[drop + 12 :], error_m[drop:-12])
+    rms = [float(np.sqrt(np.mean(np.square(values)))) for values in (level_z, rate_z, change_error_m)]
+    return rms[0], rms[1], rms[2] / np.sqrt(2 * (random_m**2 + systematic_m**2))
+
+
+@pytest.mark.parametrize(
+    ("kind", "level_z", "rate_z", "twelve_hours"),
+    [
+        ("stable", (0.85, 1.05), (0.6, 1.05), 0.12),
+        ("creep", (0.8, 1.05), (0.45, 1.05), 0.2),  # nothing but creep: the rate is better than it says
+        ("melt", (0.8, 1.25), (0.5, 1.25), 0.47),
+        ("snow", (0.8, 1.25), (0.5, 1.25), 0.33),
+    ],
+)
+def test_sigma_of_level_and_rate_and_error_of_twelve_hours(kind, level_z, rate_z, twelve_hours):
+    levels, rates, change = calibration(kind, 0.03, 0.003)
+    assert level_z[0] < levels < level_z[1]
+    assert rate_z[0] < rates < rate_z[1]
+    assert change < twelve_hours
+
+
+def test_errors_that_last_for_hours_are_in_the_systematic_part():
+    levels, rates, _ = calibration("stable", 0.02, 0.02, lasting=True)
+    assert 0.7 < levels < 1.25
+    assert 0.5 < rates < 1.25
+
+
+def test_live_equals_reprocessed_and_a_longer_series_changes_nothing_before():
+    change_m = season("melt", 0.03, 0.003, 1, days=4)[2]
+    live = [state.level_m for state, _ in filtered(change_m[:60], 0.03, 0.003)]
+    again = [state.level_m for state, _ in filtered(change_m, 0.03, 0.003)]
+    assert np.array_equal(live, again[:60], equal_nan=True)
