@@ -22,8 +22,8 @@ import numpy as np
 from scipy import ndimage
 
 from station.quantities import Bools, Floats
-from station.science.analysis.event_tracks import Track, track_events
-from station.science.analysis.events import (
+from station.science.time_series.event_tracks import Track, track_events
+from station.science.time_series.events import (
     BlockLevels,
     Region,
     detect_regions,

@@ -22,8 +22,8 @@ from tempfile import TemporaryDirectory
 import numpy as np
 
 from station.quantities import Floats
-from station.science.analysis.cell_filter import CellFilter
-from station.science.analysis.class_filter import SAMPLE_CELLS, ClassFilter
+from station.science.time_series.cell_filter import CellFilter
+from station.science.time_series.class_filter import SAMPLE_CELLS, ClassFilter
 
 HOUR_D = 1 / 24
 RANDOM_M, SYSTEMATIC_M = 0.03, 0.003

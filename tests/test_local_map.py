@@ -16,9 +16,9 @@ from station.config import read_site
 from station.errors import ConfigError
 from station.operations.site_check import site_findings
 from station.processing.pipeline import to_map
-from station.processing.scan_inputs import load_scan_inputs
-from station.processing.site_files import open_scan_for
-from station.readers.scan import utc_interval
+from station.processing.scans.epoch_inputs import load_scan_inputs
+from station.processing.scans.open_scans import open_scan_for
+from station.processing.scans.scan_files import scan_file
 from station.readers.sop import read_matrix
 from station.service.store_repair import require_same_map
 
@@ -55,11 +55,9 @@ def test_the_log_makes_the_map_level(folder):
     site = read_site(folder / "site.toml")
     scan = folder / "inbox" / f"{tiny_station.scan_name(0)}.laz"
     true_rotation = read_matrix(folder / "sop.dat")[:3, :3]
-    log = scan.with_name(f"{tiny_station.scan_name(0)}-incl.txt")
-    with open_scan_for(site, scan) as reader:
-        start, end, _ = utc_interval(reader, site.scans.pattern)
-        inputs = load_scan_inputs(site, reader, log, start, end, save_tilt_offset=False)
-        shots = next(iter(reader.blocks()))
+    with open_scan_for(site, scan_file(site, scan)) as opened:
+        inputs = load_scan_inputs(site, opened, save_tilt_offset=False)
+        shots = next(iter(inputs.shots(opened, "none")))
         local_m = to_map(shots, inputs.pose)
     scanner_m = np.asarray(shots.xyz_m, dtype=float)
     true_height_m = (true_rotation @ scanner_m)[2]

@@ -103,7 +103,6 @@ def position_inputs(
 ) -> ScanInputs:
     """Return the inputs of what was scanned from one position; raises as `load_scan_inputs`."""
     reader, start, end, sop = position.reader, position.start, position.end, position.sop
-    assert sop is not None  # noqa: S101 - of a scan in the scanner's frame
     transform, sop_id = scanner_to_map(site, sop), sop_identity(sop)
     warnings: list[str] = []
     registered = registration(site, position, warnings)

@@ -20,8 +20,8 @@ from station.products.area_tables import REFERENCE, AreaRecord, Span, area_cells
 from station.products.exports.selection import PERIODS
 from station.queries.aggregates import Aggregates
 from station.queries.common_errors import common_error_share
-from station.science.analysis.trend import MIN_EPOCHS, Trend, fit_trend
 from station.science.geometry.robust_statistics import NORMAL_95
+from station.science.time_series.trend import MIN_EPOCHS, Trend, fit_trend
 
 SIGNIFICANT = NORMAL_95  # an acceleration, or a rate whose inverse is given, is at least so many sigma
 

@@ -33,8 +33,10 @@ from station.queries.block_sums import epoch_sums
 from station.queries.blocks import BlockQueries, Blocks
 from station.queries.epoch_cells import EpochCells, EpochReader
 from station.science.analysis.calibration import SparseJacobian
-from station.science.analysis.event_tracks import Track, pair_tracks, track_events
-from station.science.analysis.events import (
+from station.science.analysis.voids import area_weights, void_variance
+from station.science.geometry.robust_statistics import nmad
+from station.science.time_series.event_tracks import Track, pair_tracks, track_events
+from station.science.time_series.events import (
     PATCH_BLOCKS,
     BlockLevels,
     Region,
@@ -44,8 +46,6 @@ from station.science.analysis.events import (
     scan_scatter,
     surrounding_weights,
 )
-from station.science.analysis.voids import area_weights, void_variance
-from station.science.geometry.robust_statistics import nmad
 
 HISTORY = 24  # scans before the two newest, which show how a block scatters
 LEAST_HISTORY = 8

@@ -20,9 +20,9 @@ from station.quantities import Bools, Floats, Floats32, Ints, Reference
 from station.queries.aggregates import Aggregates
 from station.queries.common_errors import common_error_share
 from station.queries.epoch_cells import CHANGE, RANDOM, bounding_box
-from station.science.analysis.cell_filter import CellFilter, ProcessNoise
-from station.science.analysis.class_filter import SAMPLE_CELLS, ClassFilter
-from station.science.analysis.filter_errors import filter_errors
+from station.science.time_series.cell_filter import CellFilter, ProcessNoise
+from station.science.time_series.class_filter import SAMPLE_CELLS, ClassFilter
+from station.science.time_series.filter_errors import filter_errors
 
 DAY_S = 86_400.0
 BLOCK_CELLS = 50_000  # filtered at once

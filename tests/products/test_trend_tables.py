@@ -12,7 +12,7 @@ from station.cli import app
 from station.errors import StationError
 from station.products.area_tables import Span, area_records
 from station.products.trend_tables import TrendRecord, as_csv, as_text, trend_records
-from station.science.analysis.trend import Trend
+from station.science.time_series.trend import Trend
 
 ALL = Span.parse(None, None)
 

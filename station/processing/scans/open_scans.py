@@ -30,7 +30,7 @@ class PositionScan:
     reader: ScanReader
     logs: tuple[Path, ...]
     matrix: Path | None  # its registration
-    sop: SopSection | None  # None if the points are on the map
+    sop: SopSection | None  # None if the points are on the map, or the map is local
     start: datetime
     end: datetime
 

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from station.science.analysis.cell_filter import CellFilter, ProcessNoise
-from station.science.analysis.class_filter import CORRELATION_D, SAMPLE_CELLS, ClassFilter, ErrorShares
-from station.science.analysis.filter_errors import filter_errors
+from station.science.time_series.cell_filter import CellFilter, ProcessNoise
+from station.science.time_series.class_filter import CORRELATION_D, SAMPLE_CELLS, ClassFilter, ErrorShares
+from station.science.time_series.filter_errors import filter_errors
 
 HOUR_D = 1 / 24
 RNG = np.random.default_rng

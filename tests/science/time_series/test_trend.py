@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from station.science.analysis.trend import fit_trend
 from station.science.gridding.reference_surface import REFRACTION_CORRELATION_S
+from station.science.time_series.trend import fit_trend
 
 HOUR_S = 3600.0
 DAYS_S = 1.7e9 + HOUR_S * np.delete(np.arange(60.0), [7, 8, 30, 41])  # hourly, with gaps

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from station.quantities import Floats
-from station.science.analysis.cell_filter import LevelRate
-from station.science.analysis.class_filter import ErrorShares
+from station.science.time_series.cell_filter import LevelRate
+from station.science.time_series.class_filter import ErrorShares
 
 TINY_M2 = 1e-12  # against division by zero
 

@@ -13,7 +13,8 @@ from itertools import product
 import numpy as np
 
 from station.quantities import Bools, Floats
-from station.science.analysis.cell_filter import (
+from station.science.gridding.reference_surface import REFRACTION_CORRELATION_S
+from station.science.time_series.cell_filter import (
     STEP_SIGMAS,
     LevelRate,
     ProcessNoise,
@@ -21,7 +22,6 @@ from station.science.analysis.cell_filter import (
     predict,
     update,
 )
-from station.science.gridding.reference_surface import REFRACTION_CORRELATION_S
 
 LEVEL_NOISES_M2_D = (1e-9, 1e-7, 1e-6, 1e-5, 1e-4, 3e-4, 1e-3)
 STABLE_RATE_NOISES_M2_D3 = (1e-9, 1e-7, 1e-6, 1e-5)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy import ndimage
 
-from station.science.analysis.events import (
+from station.science.time_series.events import (
     BlockLevels,
     before_level,
     detect_regions,

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from station.science.analysis.cell_filter import (
+from station.science.time_series.cell_filter import (
     CELL_DTYPE,
     INITIAL_RATE_M_D,
     CellFilter,

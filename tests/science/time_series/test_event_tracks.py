@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from station.science.analysis.event_tracks import REST_SCANS, pair_tracks, track_events
-from station.science.analysis.events import Region
+from station.science.time_series.event_tracks import REST_SCANS, pair_tracks, track_events
+from station.science.time_series.events import Region
 
 SHAPE = 40, 50
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from station.quantities import Bools, Floats
-from station.science.analysis.events import Region, distance_blocks, overlaps
+from station.science.time_series.events import Region, distance_blocks, overlaps
 
 REST_SCANS = 3  # an event that so many scans no longer show has come to rest
 GROWN = 1.2  # factor of the volume by which an event has grown

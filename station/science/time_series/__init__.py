@@ -1,0 +1,1 @@
+"""What a series of scans tells: trends, filtered levels and rates, events."""
