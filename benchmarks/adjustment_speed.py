@@ -29,7 +29,7 @@ from station.science.adjustment import prior
 from station.science.adjustment.normal_equations import LineInclination
 from station.science.gridding.gridder import Gridder
 from station.science.uncertainty import parameters
-from station.sections import ScannerSection
+from station.sections.inputs import ScannerSection
 
 GRID = Grid(west_m=0.0, north_m=5000.0, cell_m=1.0, nx=4000, ny=5000)
 RIDGE_M = (2000.0, -50.0, 700.0)  # outside the grid: the head covers half a turn, as at Hintereisferner

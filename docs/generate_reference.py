@@ -24,7 +24,7 @@ from station.archive.derived.boxes import DAILY_VARIABLES
 from station.archive.schema import VARIABLES
 from station.cli import app
 from station.section_types import Section
-from station.sections import SiteFile
+from station.sections.site_file import SiteFile
 
 ROOT = Path(__file__).parents[1]
 REFERENCE = ROOT / "docs" / "reference"

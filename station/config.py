@@ -20,7 +20,7 @@ from station._version import __version__
 from station.errors import ConfigError
 from station.quantities import Grid, Scanner
 from station.section_types import Section
-from station.sections import SiteFile
+from station.sections.site_file import SiteFile
 
 PLAIN_MESSAGES = {  # instead of those of pydantic, which name Python classes
     "path_type": "give a path in quotes",

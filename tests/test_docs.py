@@ -12,7 +12,7 @@ from pydantic import BaseModel
 from station import config
 from station.config import read_site, write_site
 from station.scanners import SCANNERS, scanner_model
-from station.sections import SiteFile
+from station.sections.site_file import SiteFile
 
 ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from station.quantities import Air
 from station.science.geometry import air, beam
 from station.science.uncertainty import shot_noise
-from station.sections import ScannerSection
+from station.sections.inputs import ScannerSection
 
 IHE = Air(temperature_c=-2.0, pressure_hpa=684.0, humidity_pct=28.0)  # V section 2.2: the scanner's setting
 GREEN_UM = 1.064
@@ -67,7 +67,7 @@ def test_error_ellipse_contains_68_percent():
 def test_published_budget_of_a_cell():
     """V Eq. 1 by hand for box 5, and the linear sum of V Eq. 3."""
     from station.scanners import SCANNERS
-    from station.sections import ScannerSection
+    from station.sections.inputs import ScannerSection
 
     assert SCANNERS["riegl-vz-6000"]["beam_divergence_mrad"] == 0.12
     vz6000 = ScannerSection.model_validate({"model": "riegl-vz-6000"}).instrument

@@ -15,7 +15,7 @@ from station.scan_names import (
     scan_stem,
     start_in_name,
 )
-from station.sections import ScansSection
+from station.sections.inputs import ScansSection
 
 START = datetime(2025, 7, 15, 9, 0, 5, tzinfo=UTC)
 

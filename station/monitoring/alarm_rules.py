@@ -26,7 +26,7 @@ from station.readers.formats.conversion import scan_suffixes
 from station.science.analysis.change_detection import ChangeDetections, detect_changes, threshold_sigmas
 from station.science.geometry.robust_statistics import NORMAL_95
 from station.science.gridding.significance import SIGNIFICANT_SIGMAS
-from station.sections import AlarmsSection, ChangeAlarm, EventAlarm
+from station.sections.results import AlarmsSection, ChangeAlarm, EventAlarm
 
 log = logging.getLogger("station")
 

@@ -47,7 +47,7 @@ from station.scan_names import name_below, scan_stem
 from station.science.analysis.verdict import NO_BRIGHTNESS
 from station.science.geometry import inclination
 from station.science.geometry.pose import ScannerToMap
-from station.sections import SopSection
+from station.sections.inputs import SopSection
 
 Finding = dict[str, str]  # level (ok, warning, fault), what, message
 EPOCH_BYTES_PER_CELL = 16  # typical, uncompressed

@@ -24,7 +24,7 @@ from station.readers.sop import read_matrix
 from station.readers.weather_dialects import recognise_dialect
 from station.scan_names import start_in_name
 from station.scanners import SCANNERS
-from station.sections import ScansSection
+from station.sections.inputs import ScansSection
 
 LOG_SUFFIX = "-incl.txt"
 MATRIX_SUFFIXES = (".dat", ".txt", ".sop")

@@ -20,7 +20,7 @@ from station.science.geometry import pose
 from station.science.geometry.registration import POSE, Features, Registration, solve
 from station.science.uncertainty.point_covariance import shot_covariance
 from station.section_types import require_projected
-from station.sections import ScannerSection
+from station.sections.inputs import ScannerSection
 
 MAX_STANDARDISED = 3.3  # sigmas: exceeded by chance by one residual in a thousand
 

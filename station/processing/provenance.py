@@ -30,7 +30,7 @@ from station.processing.scanner_pose import scanner_height_m, sop_identity_at
 from station.quantities import Air
 from station.readers.flags import read_flags, reasons_for
 from station.readers.sop import valid_sop
-from station.sections import WeatherSection
+from station.sections.inputs import WeatherSection
 
 MIN_AIR_CHANGE = 1e-4  # °C, hPa, %; floating-point error of the interpolation in time is smaller
 

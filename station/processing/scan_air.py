@@ -9,7 +9,7 @@ from station.errors import NotReadyError, ScanError
 from station.quantities import Air
 from station.readers.weather import interpolate_air, read_weather
 from station.science.geometry.air import standard_air
-from station.sections import WeatherSection
+from station.sections.inputs import WeatherSection
 
 MAX_PRESSURE_DEVIATION_HPA = 60.0  # from the standard atmosphere; weather amounts to 40 hPa
 

@@ -50,7 +50,7 @@ from station.science.geometry import inclination
 from station.science.geometry.air import air_correction
 from station.science.geometry.inclination import NO_CYCLIC_ERROR, CyclicError, TiltRecord
 from station.science.uncertainty import parameters
-from station.sections import SopSection
+from station.sections.inputs import SopSection
 
 MEAN_TILT = "one mean tilt for the whole scan"
 MIN_LOG_COVERAGE = 0.97  # of the scan duration that a complete log covers

@@ -14,7 +14,8 @@ from station.errors import ConfigError
 from station.quantities import VERTICAL_AXIS, Floats, ScanGeometry
 from station.readers.sop import read_matrix, valid_sop
 from station.science.geometry import pose
-from station.sections import Origin, SopSection
+from station.sections.inputs import SopSection
+from station.sections.results import Origin
 
 NO_SOP = "local"  # identity of the missing SOP of a local map
 

@@ -14,7 +14,7 @@ import numpy as np
 from station.errors import ConfigError, ScanError
 from station.quantities import Floats
 from station.readers.regular_file import read_text
-from station.sections import SopSection
+from station.sections.inputs import SopSection
 
 ROTATION_TOLERANCE = 1e-6  # moves a point 1,000 km away by 1 m; files with nine digits reach 1e-9
 MAX_CORRECTABLE = 1e-4  # a few digits lost in writing; beyond that it is not a rotation

@@ -15,7 +15,7 @@ from station.quantities import Air, Floats, WeatherLog
 from station.readers.regular_file import open_regular
 from station.readers.scan import decoder_errors
 from station.readers.weather_dialects import MAX_LINE_BYTES, Header, decode, read_header, split_line
-from station.sections import WeatherSection
+from station.sections.inputs import WeatherSection
 
 # Physical limits (temperature_c, pressure_hpa, humidity_pct); loggers write -7999 and the like for faults.
 VALID_RANGES = ((-60.0, 50.0), (300.0, 1100.0), (0.0, 110.0))

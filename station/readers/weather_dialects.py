@@ -17,7 +17,7 @@ from typing import BinaryIO
 from zoneinfo import ZoneInfo
 
 from station.errors import ScanError
-from station.sections import WeatherSection
+from station.sections.inputs import WeatherSection
 
 MAX_LINE_BYTES = 1 << 16
 MAX_HEADER_LINES = 100

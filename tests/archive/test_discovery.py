@@ -12,7 +12,7 @@ from station.archive import epochs
 from station.archive.discovery import extent, time_coverage
 from station.archive.series.virtual import build_series
 from station.quantities import Grid
-from station.sections import MetadataSection
+from station.sections.results import MetadataSection
 
 GRID = Grid(west_m=632000.0, north_m=5186000.0, cell_m=10.0, nx=150, ny=140)
 

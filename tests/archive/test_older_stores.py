@@ -17,7 +17,7 @@ from station.archive.series.virtual import build_series
 from station.errors import StoreError
 from station.products.epoch_table import read_epoch_table
 from station.quantities import Reference, VarianceComponents
-from station.sections import ScannerSection
+from station.sections.inputs import ScannerSection
 
 
 def with_older_name(path):

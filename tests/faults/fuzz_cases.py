@@ -34,7 +34,7 @@ from station.readers.scan import open_scan, utc_interval
 from station.readers.sop import read_matrix
 from station.readers.weather import VALID_RANGES, interpolate_air, read_weather
 from station.science.geometry import inclination, pose
-from station.sections import WeatherSection
+from station.sections.inputs import WeatherSection
 
 TIMEOUT_S = 5  # for one case of a few kilobytes
 MEMORY_BYTES = 1 << 29  # in addition to the imported modules

@@ -12,7 +12,7 @@ from station.inbox.inbox import Inbox
 from station.inbox.journal import Journal
 from station.inbox.journal_reader import State
 from station.inbox.listing import ScanListing
-from station.sections import InclinationSection, RegistrationSection
+from station.sections.inputs import InclinationSection, RegistrationSection
 
 EPOCH = '[epoch]\nname = "%Y-%m-%d"\nwait_s = 600\n{files}'
 DAY = "2026-11-21"

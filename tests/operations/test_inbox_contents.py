@@ -3,7 +3,7 @@
 import pytest
 
 from station.operations.inbox_contents import inbox_findings
-from station.sections import EpochSection
+from station.sections.inputs import EpochSection
 
 
 @pytest.fixture

@@ -13,7 +13,7 @@ from station.config import read_site
 from station.inbox import listing
 from station.operations import site_check
 from station.operations import site_plausibility as plausibility
-from station.sections import FlagsSection, RetentionSection
+from station.sections.results import FlagsSection, RetentionSection
 from station.simulation.station import simulate, small
 
 

@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from station.errors import ConfigError, ScanError
 from station.readers.sop import read_matrix, valid_sop
-from station.sections import SopSection
+from station.sections.inputs import SopSection
 
 ROTATION = Rotation.from_euler("xyz", [0.1, 0.59, -1.2]).as_matrix()
 

@@ -9,7 +9,7 @@ from station.errors import NotReadyError, ScanError
 from station.quantities import Air, WeatherLog
 from station.readers import weather
 from station.readers.weather import interpolate_air
-from station.sections import WeatherColumns, WeatherSection
+from station.sections.inputs import WeatherColumns, WeatherSection
 
 REAL = WeatherColumns(temperature_c="TAact_2m_Avg", humidity_pct="RHact_2m_Avg", pressure_hpa="Pact")
 PLAIN = WeatherColumns(time="time", temperature_c="t", humidity_pct="rh", pressure_hpa="p")

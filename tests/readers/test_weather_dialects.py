@@ -10,7 +10,7 @@ from pydantic import ValidationError
 from station.errors import NotReadyError, ScanError
 from station.readers.weather import read_weather
 from station.readers.weather_dialects import recognise_dialect
-from station.sections import WeatherSection
+from station.sections.inputs import WeatherSection
 
 # Each: lines of the site file, and the file. All say: 15 July 2025, 00:10 and 00:20 UTC; at first -1.5 °C,
 # 684.5 hPa and 51 %.

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from station.sections import MetadataSection
+from station.sections.results import MetadataSection
 
 
 def tool(name):

@@ -18,7 +18,7 @@ from station.readers.scan import ScanReader, utc_interval
 from station.readers.sop import valid_sop
 from station.scan_names import scan_id, start_in_name
 from station.science.geometry.pose import horizontal_crs, is_same_map
-from station.sections import SopSection
+from station.sections.inputs import SopSection
 
 
 @dataclass(frozen=True)

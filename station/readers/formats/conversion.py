@@ -22,7 +22,7 @@ from isal import igzip
 from station.errors import InconclusiveError, NotReadyError, ScanError
 from station.readers.scan import ScanReader, decoder_errors, open_scan, suffixes
 from station.scan_names import COMPRESSED, scan_stem
-from station.sections import ScansSection
+from station.sections.inputs import ScansSection
 
 MAX_EXPANSION = 50  # of a copy against its scan: text from a compressed format is some 20 times as long
 MIN_LIMIT_BYTES = 1 << 28  # that a copy may have however short its scan is

@@ -13,7 +13,7 @@ from station.errors import InconclusiveError, NotReadyError, ScanError
 from station.processing.workers.isolation import TaskRunner
 from station.readers.formats.conversion import convert, open_site_scan
 from station.readers.inclination import read_inclination
-from station.sections import ScansSection
+from station.sections.inputs import ScansSection
 
 COPY = "import shutil, sys; shutil.copy(sys.argv[1], sys.argv[2])"
 LIMITS = {"timeout_s": 20.0, "limit_bytes": 1 << 20}

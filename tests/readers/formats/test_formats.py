@@ -14,7 +14,7 @@ from readers.conftest import TURN_RAD_S, sweep
 from station.errors import NotReadyError, ScanError
 from station.readers.formats.conversion import open_site_scan, scan_suffixes
 from station.readers.scan import open_scan, suffixes, utc_interval
-from station.sections import ScansSection
+from station.sections.inputs import ScansSection
 
 COUNT = 3000
 RANGE_MAX_M = 1000.0

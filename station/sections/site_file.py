@@ -1,0 +1,111 @@
+"""The tables of the site file: every key, its valid values and its default.
+
+The commented files in `config/` explain the keys.
+"""
+
+from __future__ import annotations
+
+from pydantic import model_validator
+
+from station.scan_names import ZONE_MARK
+from station.section_types import (
+    Section,
+)
+from station.sections.inputs import (
+    AirSection,
+    EpochSection,
+    InclinationSection,
+    RegistrationSection,
+    ScannerSection,
+    ScansSection,
+    SopSection,
+    WeatherSection,
+)
+from station.sections.results import (
+    AdjustmentSection,
+    AlarmsSection,
+    AreasSection,
+    FlagsSection,
+    GridSection,
+    MapSection,
+    MetadataSection,
+    MirrorSection,
+    ProductsSection,
+    ReferenceSection,
+    RetentionSection,
+    ServiceSection,
+    StationSection,
+    UncertaintySection,
+)
+
+
+class SiteFile(Section):
+    """The whole file."""
+
+    station: StationSection
+    metadata: MetadataSection = MetadataSection()
+    scans: ScansSection
+    epoch: EpochSection | None = None
+    registration: RegistrationSection | None = None
+    scanner: ScannerSection = ScannerSection.model_validate({})
+    sop: tuple[SopSection, ...] = ()
+    map: MapSection = MapSection()
+    grid: GridSection
+    inclination: InclinationSection | None = None
+    weather: WeatherSection | None = None
+    air: AirSection | None = None
+    adjustment: AdjustmentSection = AdjustmentSection()
+    uncertainty: UncertaintySection = UncertaintySection()
+    reference: ReferenceSection = ReferenceSection()
+    areas: AreasSection | None = None
+    flags: FlagsSection | None = None
+    retention: RetentionSection = RetentionSection()
+    service: ServiceSection = ServiceSection()
+    products: ProductsSection = ProductsSection()
+    mirror: MirrorSection | None = None
+    alarms: AlarmsSection | None = None
+
+    @model_validator(mode="after")
+    def _chain_is_complete(self) -> SiteFile:
+        if self.scans.frame == "scanner" and not self.sop:
+            self._require_local_map()
+        starts = [(sop.from_, sop.files) for sop in self.sop]
+        if len(set(starts)) < len(starts):
+            raise ValueError("two [[sop]] have the same from: which of them is valid then?")
+        if any(sop.files for sop in self.sop) and self.epoch is None:
+            raise ValueError("sop.files, for several scan positions, needs [epoch]")
+        if self.registration and (self.registration.suffix is None) != (self.scans.frame == "map"):
+            raise ValueError(
+                'registration.suffix names the matrices beside scans: needed with scans.frame = "scanner",'
+                ' and none with "map"'
+            )
+        if self.registration and self.scans.frame == "map" and self.map.origin is None:
+            raise ValueError("registration needs map.origin, from which its rotation and our own are counted")
+        if self.map.crs is None and (self.map.pop or self.map.origin):
+            raise ValueError("map.pop and map.origin need map.crs, the map they refer to")
+        if self.map.pop and self.map.origin and self.scans.frame == "scanner":
+            raise ValueError("map.pop and map.origin both place the project frame on the map: keep one")
+        if self.alarms and self.alarms.change and not self.areas:
+            raise ValueError("alarms.change needs areas: give their file in [areas]")
+        return self
+
+    @property
+    def row_pattern(self) -> str:
+        """The pattern of the names of scans in the journal: of epochs, if several files are one."""
+        if self.epoch is None:
+            return self.scans.pattern
+        return f"{self.epoch.name}{ZONE_MARK}{self.scans.zone}"
+
+    def _require_local_map(self) -> None:
+        """Raise ValueError unless scans without an SOP can be on a local map that their logs make level."""
+        if self.map.crs is not None:
+            raise ValueError(
+                "map.crs needs an [[sop]], which transforms the points to that map; without both, the map is"
+                " local, with its origin at the scanner"
+            )
+        if self.registration is not None:
+            raise ValueError("registration needs an [[sop]], which says where the scanner stands in general")
+        if self.inclination is not None and self.inclination.mode == "relative":
+            raise ValueError(
+                'without an [[sop]] the log makes the map level: set inclination.mode = "absolute"'
+            )
