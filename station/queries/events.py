@@ -27,6 +27,7 @@ from station.archive.derived.event_table import (
 from station.archive.netcdf_layout import Series
 from station.archive.schema import VERDICTS
 from station.archive.series.index import SeriesIndex
+from station.errors import StoreError
 from station.quantities import Bools, Floats, Grid, SharedParameters
 from station.queries.aggregates import common_error_covariance
 from station.queries.block_sums import epoch_sums
@@ -99,9 +100,28 @@ class EventQueries:
         )
 
     def update(self, progress: Callable[[], None]) -> set[str]:
-        """Bring the table up to date; return the epochs whose sums the next scan will need."""
+        """Bring the table up to date; return the epochs whose sums the next scan will need.
+
+        While a reference is damaged, which stops no scan that is measured from another, the table remains as
+        it is. Raises StoreError if an epoch is damaged or the table cannot be written.
+        """
         if not self._usable:
             return set()
+        try:
+            return self._update(progress)
+        except StoreError:
+            if all(map(self._is_readable, {version for _, version in self._usable})):
+                raise
+            return set()
+
+    def _is_readable(self, version: str) -> bool:
+        try:
+            self._queries.reference_blocks(version)
+        except StoreError:
+            return False
+        return True
+
+    def _update(self, progress: Callable[[], None]) -> set[str]:
         tracks = track_events(self._detections(progress))
         write_events(self._series, self._events(tracks))
         if self._used != self._found:
