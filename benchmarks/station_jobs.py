@@ -31,11 +31,11 @@ from station.processing import scan_tasks
 from station.processing.pipeline import Pose
 from station.processing.reference_tasks import build_reference_version
 from station.processing.scans.epoch_inputs import load_scan_inputs
+from station.processing.scans.open_scans import open_scan_for
 from station.processing.scans.scan_files import scan_file
 from station.processing.workers.fork_server import PRELOAD
 from station.quantities import Shots
 from station.readers.las import LasScan
-from station.readers.scan import utc_interval
 from station.science.gridding.gridder import Gridder
 
 CHUNK_POINTS = 1_000_000
@@ -54,10 +54,8 @@ def grid_task(site: str, scan: str, earlier_scan: str) -> dict[str, Any]:
     """Return the task of the peers for a scan: the grid, and the transformation to it as a matrix (4, 4)."""
     settings = read_site(Path(site))
     grid = settings.grid_cells
-    paths = scan_file(settings, Path(scan))
-    with scan_tasks.open_scan_for(settings, paths.path) as reader:
-        start, end, _ = utc_interval(reader, settings.scans.name)
-        inputs = load_scan_inputs(settings, reader, paths.log, start, end, save_tilt_offset=False)
+    with open_scan_for(settings, scan_file(settings, Path(scan))) as opened:
+        inputs = load_scan_inputs(settings, opened, save_tilt_offset=False)
     frame = inputs.pose.frame
     assert frame is not None  # noqa: S101 - the scan is in the scanner's frame
     corners_m = np.hstack([np.zeros((3, 1)), np.eye(3)])
