@@ -12,11 +12,9 @@ from dataclasses import dataclass, replace
 from itertools import combinations
 from typing import Any
 
-import h5py
 import numpy as np
 from scipy import sparse
 
-from station.archive.chunk_codec import read_column
 from station.archive.derived.boxes import (
     BOX_M,
     Entries,
@@ -27,8 +25,7 @@ from station.archive.derived.boxes import (
 )
 from station.archive.epochs import EpochRef
 from station.archive.netcdf_layout import Series
-from station.archive.schema import VERDICTS
-from station.archive.series.index import SeriesIndex
+from station.archive.series.index import SeriesIndex, references_and_usable
 from station.quantities import Bools, Floats, Ints, Reference, SharedParameters
 from station.queries.block_sums import Sums, cells_per_block, drop_epoch_sums, epoch_sums, reference_sums
 from station.queries.epoch_cells import CHANGE, RANDOM, EpochCells, EpochReader
@@ -231,9 +228,7 @@ def update_boxes(
     index = SeriesIndex(series)
     if not len(index):
         return
-    with h5py.File(series.path, "r") as file:
-        versions = read_column(file["reference_version"]).view(index.epoch_file.dtype)[:, 0]
-        usable = read_column(file["verdict"]) != VERDICTS.index("unusable")
+    versions, usable = references_and_usable(series)
     measured = np.flatnonzero(versions != b"")
     start_s, end_s = index.start_s, 2 * index.time_s - index.start_s
     update_blocks(

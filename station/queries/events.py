@@ -9,12 +9,10 @@ from datetime import UTC, datetime
 from functools import lru_cache, partial
 from typing import Any
 
-import h5py
 import numpy as np
 import shapely
 from scipy import ndimage, sparse
 
-from station.archive.chunk_codec import read_column
 from station.archive.derived.event_table import (
     Event,
     decode_blocks,
@@ -25,8 +23,7 @@ from station.archive.derived.event_table import (
     write_found,
 )
 from station.archive.netcdf_layout import Series
-from station.archive.schema import VERDICTS
-from station.archive.series.index import SeriesIndex
+from station.archive.series.index import SeriesIndex, references_and_usable
 from station.errors import StoreError
 from station.quantities import Bools, Floats, Grid, SharedParameters
 from station.queries.aggregates import common_error_covariance
@@ -85,9 +82,7 @@ class EventQueries:
         """Return the position and the reference version of each usable epoch that has one."""
         if not len(self._index):
             return []
-        with h5py.File(self._series.path, "r") as file:
-            versions = read_column(file["reference_version"]).view(self._index.epoch_file.dtype)[:, 0]
-            usable = read_column(file["verdict"]) != VERDICTS.index("unusable")
+        versions, usable = references_and_usable(self._series)
         positions = np.flatnonzero((versions != b"") & usable).tolist()
         return [(position, versions[position].decode()) for position in positions]
 

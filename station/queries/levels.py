@@ -5,16 +5,14 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
-import h5py
 import numpy as np
 import xarray as xr
 
-from station.archive.chunk_codec import read_column
 from station.archive.epochs import EpochRef
 from station.archive.netcdf_layout import Series
 from station.archive.raster_io import LazyRaster
-from station.archive.schema import FILL, VERDICTS
-from station.archive.series.index import SeriesIndex
+from station.archive.schema import FILL
+from station.archive.series.index import SeriesIndex, references_and_usable
 from station.errors import StoreError
 from station.quantities import Bools, Floats, Floats32, Ints, Reference
 from station.queries.aggregates import Aggregates
@@ -79,9 +77,7 @@ def filter_levels(series: Series, cells: Bools, progress: Callable[[], None]) ->
 
 def _usable_epochs(series: Series, version: str) -> list[EpochRef]:
     index = SeriesIndex(series)
-    with h5py.File(series.path, "r") as file:
-        versions = read_column(file["reference_version"]).view(index.epoch_file.dtype)[:, 0]
-        usable = read_column(file["verdict"]) != VERDICTS.index("unusable")
+    versions, usable = references_and_usable(series)
     chosen = np.flatnonzero(usable & (versions == version.encode()))
     epochs = [index[position] for position in chosen.tolist()]
     if not epochs:

@@ -1,4 +1,4 @@
-"""Tables of the site file on what the station computes, keeps and tells."""
+"""Tables of the site file on what the station computes, stores and reports."""
 
 from __future__ import annotations
 

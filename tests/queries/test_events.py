@@ -1,4 +1,4 @@
-"""`events.geojson`: events of a store, live and anew, with late and damaged files, and their volume."""
+"""`events.geojson`: events of a store, live and rebuilt, with late and damaged files, and their volume."""
 
 import json
 import shutil

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import TYPE_CHECKING, overload
+from typing import TYPE_CHECKING, Any, overload
 
 import h5py
 import netCDF4
@@ -26,15 +26,17 @@ from station.archive.epochs import (
 )
 from station.archive.netcdf_layout import Series, read_scanner
 from station.archive.read_errors import read_errors
-from station.archive.schema import TEXT_LENGTH
+from station.archive.schema import TEXT_LENGTH, VERDICTS
 from station.archive.series.epoch_reader import middle
 from station.errors import StationError, StoreError
-from station.quantities import Grid
+from station.quantities import Bools, Grid
 
 if TYPE_CHECKING:
     from station.config import Site
 
 NEAREST_TOLERANCE_S = 12 * 3600.0  # so that a date finds the first or last epoch of its day
+Array = np.ndarray[Any, Any]
+
 MAX_TRIED = 5  # files of the store, if the newest are damaged
 
 
@@ -91,6 +93,16 @@ def _drop_simultaneous(refs: list[EpochRef]) -> list[EpochRef]:
         if not kept or epoch.time_s > kept[-1].time_s:
             kept.append(epoch)
     return kept
+
+
+def references_and_usable(series: Series) -> tuple[Array, Bools]:
+    """Return the reference version (n,) of each epoch, b"" if it has none, and whether it is usable.
+
+    Raises StoreError if the file cannot be read.
+    """
+    with read_errors(series.path), h5py.File(series.path, "r") as file:
+        versions = read_column(file["reference_version"]).view(f"S{TEXT_LENGTH['text']}")[:, 0]
+        return versions, read_column(file["verdict"]) != VERDICTS.index("unusable")
 
 
 class SeriesIndex(Sequence[EpochRef]):

@@ -29,7 +29,7 @@ NEIGHBOURS = np.ones((3, 3), np.bool_)  # of a block, itself included
 EXTENT_SIGMAS = 3.0  # of a block that belongs to an event
 MIN_BLOCKS = 2  # of an event: a single block may be an edge that was hit otherwise
 TAIL_QUANTILE, TAIL_SIGMAS = 0.99, 2.576  # two-sided, of a normal distribution
-OUTLIER_SIGMAS = 6.0  # beyond, a window tells nothing of the errors: it has changed
+OUTLIER_SIGMAS = 6.0  # beyond, a window has changed, and is no sample of the errors
 MEDIAN_VARIANCE = np.pi / 2  # of a median, over that of the mean
 SCATTER_QUANTILE, SCATTER_SIGMAS = 0.9, 1.645  # of absolute values, two-sided
 EDGE_RATIO = 3.0  # of the observed scatter over the random variance, beyond which a block is at an edge
@@ -110,9 +110,9 @@ def before_level(before: list[BlockLevels], least: int) -> BlockLevels:
 def scan_scatter(history_m: Floats) -> Floats:
     """Return the variance (by, bx) of the change of a block in one scan, as consecutive scans differ [m²].
 
-    `history_m` (n, by, bx) are scans in order of time. The tenth largest of a hundred differences tells it,
-    so that one event does not, but a block at an edge does, which beams hit in some scans only.
-    As its neighbours are on the same edge, a block has the largest variance of those around it.
+    `history_m` (n, by, bx) are scans in order of time. The tenth largest of a hundred differences is used:
+    one event does not raise it, but a block at an edge does, which beams hit in some scans only. Its
+    neighbours are on the same edge, so that a block has the largest variance of those around it.
     """
     differences_m = np.abs(np.diff(history_m, axis=0))
     ordered = np.sort(differences_m, axis=0)  # NaN last
@@ -255,7 +255,7 @@ def _window_scores(contrast: _Contrast, size: int) -> tuple[Floats, Floats]:
 def _tail_factor(absolute_z: Floats) -> float:
     """Return by how much z is larger than of normal errors, at least 1: in the middle, and in the tail.
 
-    What the middle tells to be an outlier is left out of the tail: it may be an event.
+    What is an outlier by the middle is left out of the tail: it may be an event.
     """
     if not len(absolute_z):
         return 1.0
