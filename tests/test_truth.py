@@ -438,3 +438,22 @@ def test_disturbed_scan_gets_its_verdict(tmp_path, changes, damage, verdict, mes
     (result,) = ProcessedStation(folder).results
     assert result.verdict == verdict
     assert message in result.reason
+
+
+def test_a_scanner_that_turned_in_a_season_does_not_seem_to_have_shifted(tmp_path):
+    """0.05° of rotation and 3 m of melt: the position, which changed by 2 mm, is found within its sigma."""
+    summer = replace(named("summer", hours=6, seed=2), reference_scans=REFERENCE, season_hour=REFERENCE)
+    simulate(tmp_path / "station", summer)
+    processed = ProcessedStation(tmp_path / "station")
+    assert [result.verdict for result in processed.results] == ["good"] * 3
+    series = processed.series
+    estimate = series.shared_parameter.values
+    names = series.parameter_name.values.astype(str).tolist()
+    covariance = series.shared_parameter_covariance.values
+    for axis in ("east", "north"):
+        index = names.index(f"translation_{axis}")
+        assert np.abs(estimate[:, index]).max() < 0.02
+        assert rms(estimate[:, index] / np.sqrt(covariance[:, index, index])) < 2.5
+    error_m, sigma_m, _ = processed.boxes()
+    assert rms(error_m) < 0.05
+    assert 0.4 < rms(error_m / sigma_m) < 1.4

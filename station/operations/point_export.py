@@ -20,10 +20,10 @@ from station.config import Site
 from station.errors import StationError
 from station.inbox.journal_reader import JournalReader
 from station.inbox.listing import ScanFile
-from station.processing.pipeline import grid_scan, new_gridder, stacking_inputs, to_map
+from station.processing.pipeline import stacking_inputs, to_map
 from station.processing.provenance import stored_epochs
 from station.processing.scan_inputs import ScanInputs
-from station.processing.scan_tasks import adjust_scan, load_viewing_geometry
+from station.processing.scan_tasks import grid_and_adjust, load_viewing_geometry
 from station.processing.scans.epoch_inputs import load_scan_inputs
 from station.processing.scans.open_scans import OpenScan, open_scan_for
 from station.processing.scans.scan_files import find_scan
@@ -95,7 +95,7 @@ def write_points(
     with open_scan_for(site, scan) as opened:
         inputs = load_scan_inputs(site, opened, save_tilt_offset=False)
         cells, method = _cells(epoch)
-        correction_m = _correction(site, opened, inputs, version if method == "joint" else "", progress)
+        inputs, correction_m = _adjusted(site, opened, inputs, version if method == "joint" else "", progress)
         header = _header(site, cells["elevation"])
 
         def blocks() -> Iterator[laspy.ScaleAwarePointRecord]:
@@ -126,15 +126,19 @@ def _write_octree(path: Path, header: laspy.LasHeader, blocks: Iterable[laspy.Sc
             write_copc(file, header, np.memmap(unsorted, header.point_format.dtype(), mode="r"))
 
 
-def _correction(site: Site, scan: OpenScan, inputs: ScanInputs, version: str, progress: Progress) -> Floats32:
-    """Return what the adjustment subtracts from heights (ny, nx) [m]; zero without one."""
+def _adjusted(
+    site: Site, scan: OpenScan, inputs: ScanInputs, version: str, progress: Progress
+) -> tuple[ScanInputs, Floats32]:
+    """Return the inputs as an adjustment used them, and what it subtracts from heights (ny, nx) [m].
+
+    Without an adjustment nothing is subtracted.
+    """
     reference = open_reference(series_for(site), version) if version else None
     if reference is None:
-        return np.zeros(site.grid_cells.shape, np.float32)
+        return inputs, np.zeros(site.grid_cells.shape, np.float32)
     viewing = load_viewing_geometry(site, inputs.geometry, reference)
-    gridder = new_gridder(inputs.geometry, viewing)
-    grid_scan(gridder, inputs.shots(scan, site.scans.intensity), inputs.pose, progress)
-    return stacking_inputs(gridder, viewing, adjust_scan(site, gridder, inputs, viewing))[1]
+    inputs, gridder, _, adjustment = grid_and_adjust(site, scan, inputs, viewing, progress)
+    return inputs, stacking_inputs(gridder, viewing, None if inputs.is_given else adjustment)[1]
 
 
 def _cells(epoch: EpochRef) -> tuple[dict[str, np.ndarray[Any, Any]], str]:

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property, partial
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from station.quantities import (
     Bools,
@@ -65,6 +66,14 @@ class Pose:
     def rotation(self) -> TimedRotation:
         """Rotation of shots into the local frame at the scanner: tilt at the time of the shot, then SOP."""
         return timed_rotation(self.tilt, np.eye(3) if self.frame is None else self.frame.to_local[:3, :3])
+
+    def rotated(self, rotation_rad: Floats) -> Pose:
+        """Return the pose after a further rotation (3,) about east, north and up [rad]."""
+        if self.frame is None:
+            return self
+        to_local = self.frame.to_local.copy()
+        to_local[:3, :3] = Rotation.from_rotvec(rotation_rad).as_matrix() @ to_local[:3, :3]
+        return replace(self, frame=replace(self.frame, to_local=to_local))
 
 
 def reference_viewing_geometry(

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from fnmatch import fnmatchcase
 from functools import partial
 from pathlib import Path
@@ -87,6 +87,21 @@ class ScanInputs:
         for position, pose in zip(scan.positions, self.position_poses, strict=True):
             for shots in position.reader.blocks(intensity=intensity):
                 yield Shots(to_map(shots, pose), shots.time_s, shots.intensity)
+
+    @property
+    def can_rotate(self) -> bool:
+        """True if all points have the same pose, which an adjustment may change."""
+        return self.pose.frame is not None and not self.position_poses and not self.is_given
+
+    def rotated(self, rotation_rad: Floats) -> ScanInputs:
+        """Return the inputs with a further rotation (3,) of all points about east, north and up [rad]."""
+        assert self.adjustment_inputs is not None  # noqa: S101 - the scan was adjusted
+        assumed_rad = self.adjustment_inputs.assumed_rad + rotation_rad[:, None]
+        return replace(
+            self,
+            pose=self.pose.rotated(rotation_rad),
+            adjustment_inputs=replace(self.adjustment_inputs, assumed_rad=assumed_rad),
+        )
 
     def log_only_shared(self, components: VarianceComponents) -> SharedParameters | None:
         """Return the systematic errors of all points without an adjustment, from SOP and log."""

@@ -11,6 +11,8 @@ from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from pathlib import Path
 
+import numpy as np
+
 from station._version import __version__
 from station.archive import epochs
 from station.archive.geometry_cache import cached_viewing_geometry
@@ -38,7 +40,7 @@ from station.processing.pipeline import (
 )
 from station.processing.scan_inputs import ScanInputs
 from station.processing.scans.epoch_inputs import load_scan_inputs
-from station.processing.scans.open_scans import open_scan_for
+from station.processing.scans.open_scans import OpenScan, open_scan_for
 from station.processing.scans.registration import registration_difference
 from station.processing.site_files import (
     exclusion_reason,
@@ -63,6 +65,8 @@ from station.science.gridding.gridder import Gridder
 from station.science.gridding.viewing_geometry import ViewingGeometry
 from station.science.uncertainty.variance_factors import UNIT_FACTORS
 
+# Estimated rotation that the points of a scan may lack, 0.35 m at 1 km; beyond, they are gridded again.
+MAX_UNAPPLIED_RAD = np.radians(0.02)
 UNUSABLE_REJECTED_SHARE = 0.6  # of the stable ground; above it the filtered log alone is safer
 
 
@@ -231,19 +235,13 @@ def _compute_epoch(
         )
         viewing = load_viewing_geometry(site, inputs.geometry, reference) if reference else None
         progress()
-        # Decoding starts here.
-        blocks = inputs.shots(opened, site.scans.intensity if site.adjusts else "none")
-        gridder = new_gridder(inputs.geometry, viewing)
-        point_counts = opened.point_count, grid_scan(gridder, blocks, inputs.pose, progress)
-    if gridder.is_empty():
-        raise ScanError("no point falls on the grid: wrong scans.frame, SOP, CRS or units?")
-    progress()
+        inputs, gridder, gridded_points, adjustment = grid_and_adjust(site, opened, inputs, viewing, progress)
+        point_counts = opened.point_count, gridded_points
     brightness_known = not site.adjusts or has_brightness(gridder, viewing)
-    adjustment = adjust_scan(site, gridder, inputs, viewing, even_if_given=True)
     flag = exclusion_reason(site, start.timestamp(), end.timestamp())
     attempt = adjustment[1] if adjustment else None
     registration, registration_warnings = registration_difference(site, scan, attempt)
-    if adjustment is not None and (inputs.is_given or adjustment[1].rejected_share > UNUSABLE_REJECTED_SHARE):
+    if adjustment is not None and (inputs.is_given or not _is_usable(adjustment[1])):
         adjustment = None
     components = usual_motion(reference, start.timestamp()) if reference else VarianceComponents()
     shared, factors = inputs.log_only_shared(components), UNIT_FACTORS
@@ -300,6 +298,47 @@ def _compute_epoch(
             **inputs.provenance,
         },
     )
+
+
+def grid_and_adjust(
+    site: Site, opened: OpenScan, inputs: ScanInputs, viewing: ViewingGeometry | None, progress: Progress
+) -> tuple[ScanInputs, Gridder, int, tuple[AdjustmentInputs, Adjustment] | None]:
+    """Return the inputs of a scan, its grid, the number of its points, and its adjustment to the reference.
+
+    If the scanner turned so far that its points lie beside the ground they hit, as after a season, they are
+    gridded a second time, at the estimated pose, which the returned inputs have: ground does not respond to a
+    motion of the beams as the slope of the reference tells, so that the first estimate is off.
+    Raises ScanError if no point falls on the grid.
+    """
+
+    def gridded(inputs: ScanInputs) -> tuple[Gridder, int]:
+        blocks = inputs.shots(opened, site.scans.intensity if site.adjusts else "none")  # decodes
+        gridder = new_gridder(inputs.geometry, viewing)
+        return gridder, grid_scan(gridder, blocks, inputs.pose, progress)
+
+    gridder, count = gridded(inputs)
+    if gridder.is_empty():
+        raise ScanError("no point falls on the grid: wrong scans.frame, SOP, CRS or units?")
+    progress()
+    first = adjust_scan(site, gridder, inputs, viewing, even_if_given=True)
+    if first is None or not inputs.can_rotate or not _is_usable(first[1]):
+        return inputs, gridder, count, first
+    unapplied_rad = first[1].unapplied_rad
+    if np.linalg.norm(unapplied_rad) <= MAX_UNAPPLIED_RAD:
+        return inputs, gridder, count, first
+    del gridder  # the memory of a worker does not hold two
+    rotated = inputs.rotated(unapplied_rad)
+    gridder, count = gridded(rotated)
+    second = adjust_scan(site, gridder, rotated, viewing)
+    if second is not None and _is_usable(second[1]):
+        return rotated, gridder, count, second
+    del gridder
+    return inputs, *gridded(inputs), first
+
+
+def _is_usable(adjustment: Adjustment) -> bool:
+    """Return True unless so much stable ground was rejected that the filtered log alone is safer."""
+    return adjustment.rejected_share <= UNUSABLE_REJECTED_SHARE
 
 
 def load_viewing_geometry(site: Site, geometry: ScanGeometry, reference: Reference) -> ViewingGeometry:

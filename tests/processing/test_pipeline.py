@@ -16,6 +16,7 @@ from station.processing.pipeline import (
     new_gridder,
     reference_viewing_geometry,
     stacking_inputs,
+    to_map,
 )
 from station.quantities import (
     Air,
@@ -314,3 +315,12 @@ def test_adjustment_to_a_sample_of_stable_ground_agrees_with_all_of_it(monkeypat
     ]
     assert sigma == sorted(sigma)
     assert sigma[-1] < 2 * sigma[0]
+
+
+def test_a_rotated_pose_turns_points_about_east_north_and_up():
+    pose = Pose(scanner_to_local_map(np.eye(4)), None)
+    points_m = np.array([[1000.0, 0.0, 0.0], [0.0, 1000.0, 0.0]]).T
+    turned_m = to_map(Shots(points_m, None, None), pose.rotated(np.array([0.0, 0.0, 0.001])))
+    np.testing.assert_allclose(turned_m.T, [[1000.0, 1.0, 0.0], [-1.0, 1000.0, 0.0]], atol=1e-3)
+    tilted_m = to_map(Shots(points_m, None, None), pose.rotated(np.array([0.001, 0.002, 0.0])))
+    np.testing.assert_allclose(tilted_m.T, [[1000.0, 0.0, -2.0], [0.0, 1000.0, 1.0]], atol=3e-3)

@@ -42,6 +42,7 @@ MAX_MOVING_EXCESS_M = 1.0  # upper bound for moving patches
 # not make the response of many cells together more uncertain than the bound.
 RESPONSE_ERROR, MAX_RESPONSE_ERROR = 0.15, 0.03
 MAX_GROUP_SIZE = 40.0  # patches that share one error
+HEADING_CLOCKWISE = np.array([1.0, 1.0, -1.0])  # against a rotation about up
 
 
 @dataclass(frozen=True)
@@ -54,7 +55,8 @@ class Adjustment:
     from the state. `redundancy` (p,) is the share of the prior variance of each parameter that the scan has
     removed: 0 if its value is the prior's, 1 if the observations alone determine it. `log` is the inclination
     log that was used, and `predicted_log_rad` (lines,) is what the adjustment predicts for it, without the
-    errors of the sensor.
+    errors of the sensor. `unapplied_rad` (3,) is the estimated rotation about east, north and up that the
+    points lack, as a mean over the lines.
     """
 
     params: ParameterLayout
@@ -67,6 +69,7 @@ class Adjustment:
     redundancy: Floats
     log: LineInclination | None
     predicted_log_rad: Floats
+    unapplied_rad: Floats
 
     def effect(self, jacobian: HeightJacobian) -> Reals:
         """Return the effect of the estimated state on heights (n,) [m], to be subtracted from them."""
@@ -95,11 +98,14 @@ class Adjustment:
         """Return the estimate and its covariance on knots, for the store.
 
         `sampling_ratio` is the mean of that of stable cells (`reference_cells.sampling_ratio`): rough ground
-        responds to a motion of the beams by a little more or less than modelled. Source: equations.md, 6.8.
+        responds to a motion of the beams that the points lack by a little more or less than modelled.
+        Source: equations.md, 6.8.
         """
         shared = self.posterior.to_shared_parameters(self.estimate)
         response_error = min(RESPONSE_ERROR * sampling_ratio, MAX_RESPONSE_ERROR)
-        beam = np.where(self.params.moves_beam, response_error * shared.estimate, 0.0)
+        motion = shared.estimate.copy()
+        motion[:3] = self.unapplied_rad * HEADING_CLOCKWISE
+        beam = np.where(self.params.moves_beam, response_error * motion, 0.0)
         return replace(shared, covariance=shared.covariance + np.outer(beam, beam))
 
 
@@ -172,6 +178,7 @@ def adjust_scan(
         _redundancy(prior, posterior, state),
         log,
         predicted_log_rad,
+        state[:3] * HEADING_CLOCKWISE - applied_rad.mean(axis=1),
     )
 
 
