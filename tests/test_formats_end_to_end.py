@@ -178,3 +178,36 @@ def test_scans_without_scan_lines_are_measured_like_others(tmp_path):
     assert np.isfinite(expected["elevation_change"]).any()
     for name in ("point_count", "elevation", "elevation_change", "elevation_change_uncertainty"):
         np.testing.assert_array_equal(actual[name], expected[name], name)
+
+
+def with_inclination_in_points(scan, log):
+    """Write the last reading of a log into the extra bytes of each point, as PDAL does from RXP."""
+    las = laspy.read(scan)
+    time_s, *tilt_deg = np.loadtxt(log, delimiter=",", skiprows=1).T
+    last = np.clip(np.searchsorted(time_s, las.gps_time, side="right") - 1, 0, None)
+    las.add_extra_dims([laspy.ExtraBytesParams(axis, "float32") for axis in ("Roll", "Pitch")])
+    las["Roll"], las["Pitch"] = (column[last] for column in tilt_deg)
+    las.write(scan)
+    log.unlink()
+
+
+def test_inclination_in_the_points_is_used_like_a_log_file(tmp_path):
+    """A log file tells each reading's own time, points within 0.1 s: change is the same within 0.1 sigma."""
+    series = {}
+    for name in ("file", "points"):
+        folder = tiny_station.build(tmp_path / name, method="joint", hours=4)
+        (folder / "inbox").rmdir()
+        (folder / tiny_station.PENDING).rename(folder / "inbox")
+        for scan in sorted((folder / "inbox").glob("*.laz")) if name == "points" else ():
+            with_inclination_in_points(scan, scan.with_name(f"{scan.stem}-incl.txt"))
+        result = station("process", folder / "site.toml", *sorted((folder / "inbox").glob("*.laz")))
+        assert result.returncode == 0, result.stdout + result.stderr
+        assert "log missing" not in result.stderr
+        series[name] = open_series(folder / "data")
+        assert (series[name]["verdict"] == 0).all()  # good, which it is not without a log
+    expected, actual = (one["elevation_change"].to_numpy() for one in series.values())
+    z = (actual - expected) / series["file"]["elevation_change_uncertainty"].to_numpy()
+    known = np.isfinite(z)
+    assert np.count_nonzero(known) > 0.95 * np.count_nonzero(np.isfinite(expected)) > 100
+    assert np.sqrt(np.mean(z[known] ** 2)) < 0.1
+    assert np.abs(z[known]).max() > 0
