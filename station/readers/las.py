@@ -21,9 +21,9 @@ from laspy.header import GpsTimeType
 
 from station.errors import NotReadyError, ScanError
 from station.quantities import AzimuthTrack, Bools, Floats, InclinationLog, IntensityScale, Ints, Shots
+from station.readers.formats.point_inclination import PointInclination
 from station.readers.las_echoes import Brightness, Records, brightness_candidates, discard_tables
 from station.readers.las_header import LasFileHeader, read_header
-from station.readers.point_inclination import PointInclination
 from station.readers.prefetch import Buffer, prefetch
 from station.readers.scan import (
     MAX_SCAN_S,

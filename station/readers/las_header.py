@@ -20,7 +20,7 @@ from laspy import LasHeader
 
 from station.errors import ScanError
 from station.quantities import Ints
-from station.readers.point_inclination import AXES, tilt_field
+from station.readers.formats.point_inclination import AXES, tilt_field
 from station.readers.scan import decoder_errors
 
 FIXED = struct.Struct("<24xBB68xHIIBHI")  # the fields of _Start

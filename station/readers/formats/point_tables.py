@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 
 from station.errors import NotReadyError, ScanError
 from station.quantities import AzimuthTrack, Bools, Floats, InclinationLog, IntensityScale, Shots
+from station.readers.formats.point_inclination import AXES, UNITS, PointInclination, tilt_field
 from station.readers.las_echoes import LOWEST_DB, MAX_INTENSITY, NOISE_CLASSES, SPAN_DB, from_decibels
-from station.readers.point_inclination import AXES, UNITS, PointInclination, tilt_field
 from station.readers.scan import (
     MAX_SCAN_S,
     ScanHeader,

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from readers.conftest import sweep
 
-from station.readers.point_inclination import PointInclination, tilt_field
+from station.readers.formats.point_inclination import PointInclination, tilt_field
 from station.readers.scan import open_scan
 
 COUNT, RATE_HZ, FIRST_S = 60_000, 2000.0, 40.0
