@@ -7,9 +7,11 @@ from datetime import datetime
 from pathlib import Path
 
 import pytest
+from pydantic import ValidationError
 
 from station.config import SCHEMA_NAME, read_site, site_schema, write_site
 from station.errors import ConfigError
+from station.sections.inputs import ScannerSection
 
 GOOD = """
 [station]
@@ -256,3 +258,14 @@ def test_init_writes_the_schema_next_to_the_site_file(tmp_path):
     directive, *_ = path.read_text(encoding="utf-8").splitlines()
     assert directive == f"#:schema ./{SCHEMA_NAME}"
     assert (path.parent / SCHEMA_NAME).read_text(encoding="utf-8") == site_schema()
+
+
+def test_a_scanner_that_is_not_in_the_table_is_described_as_the_manual_says():
+    manual = (Path(__file__).parents[1] / "docs" / "how-to" / "your-own-files.md").read_text()
+    example = re.search(r'```toml\n(\[scanner\]\nmodel = "my-scanner".*?)```', manual, re.DOTALL)[1]
+    values = tomllib.loads(example)["scanner"]
+    scanner = ScannerSection(**values)
+    assert (scanner.model, scanner.instrument.range_max_m) == ("my-scanner", 2000.0)
+    del values["range_max_m"]
+    with pytest.raises(ValidationError, match=r"unknown scanner 'my-scanner'.* or give range_max_m"):
+        ScannerSection(**values)

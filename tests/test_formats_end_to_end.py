@@ -2,6 +2,7 @@
 
 import gzip
 import json
+import os
 import re
 import shutil
 import subprocess
@@ -13,6 +14,7 @@ import pytest
 import xarray as xr
 from readers.formats import test_formats as written
 from support import tiny_station
+from support.programs import tool
 
 from station import open as open_series
 
@@ -101,6 +103,27 @@ def copc(path, points):
     return path / "a.copc.laz"
 
 
+def cloudcompare(path, points, name, *options):
+    """Let CloudCompare read a PLY file and save it in a format of its own; it keeps scalar fields."""
+    program, plyfile = tool("CloudCompare"), pytest.importorskip("plyfile")
+    fields = {
+        "time": points.time_s,
+        "intensity": points.intensity,
+        "return_number": points.return_number,
+        "number_of_returns": points.number_of_returns,
+    }
+    columns = [*points.xyz_m, *(np.asarray(values, np.float32) for values in fields.values())]
+    records = np.rec.fromarrays(columns, names=["x", "y", "z", *(f"scalar_{field}" for field in fields)])
+    source = path.parent / "source.ply"
+    plyfile.PlyData([plyfile.PlyElement.describe(np.asarray(records), "vertex")]).write(str(source))
+    subprocess.run(
+        [program, "-SILENT", "-NO_TIMESTAMP", "-AUTO_SAVE", "OFF", "-C_EXPORT_FMT", *options,
+         "-O", "-GLOBAL_SHIFT", "AUTO", source, "-SAVE_CLOUDS", "FILE", path / name],
+        check=True, capture_output=True, timeout=60, env={**os.environ, "QT_QPA_PLATFORM": "offscreen"},
+    )  # fmt: skip
+    return path / name
+
+
 COPY = [sys.executable, "-c", "import shutil, sys; shutil.copy(*sys.argv[1:3])", "{in}", "{out}"]
 FORMATS = {
     "laz": (lambda path, points: las(path / "a.laz", points), ""),
@@ -116,6 +139,16 @@ FORMATS = {
             'suffix = ".csv"\n'
             'columns = ["x", "y", "z", "intensity", "time", "return_number", "number_of_returns"]'
         ),
+    ),
+    "cloudcompare ply": (
+        lambda path, points: cloudcompare(path, points, "a.ply", "PLY", "-PLY_EXPORT_FMT", "BINARY_LE"),
+        "",
+    ),
+    "cloudcompare text": (
+        lambda path, points: cloudcompare(
+            path, points, "a.asc", "ASC", "-PREC", "6", "-SEP", "SEMICOLON", "-ADD_HEADER", "-ADD_PTS_COUNT"
+        ),
+        "",
     ),
     "convert": (foreign, f'suffix = ".rxp"\nconvert = {json.dumps(COPY)}'),
 }
@@ -145,7 +178,10 @@ def test_counts_are_exact_and_means_to_the_storage_quantum(kind, tmp_path):
     with xr.open_dataset(next((tmp_path / "data" / "epochs").rglob("*.nc"))) as epoch:
         stored = epoch.isel(time=0) if "time" in epoch.dims else epoch
         np.testing.assert_array_equal(stored["point_count"], count)
-        assert np.abs(stored["elevation"].to_numpy() - mean_m).max() <= 2**-11 + (kind == "pcd") * 1e-4
+        assert (
+            np.abs(stored["elevation"].to_numpy() - mean_m).max()
+            <= 2**-11 + (kind in {"pcd", "cloudcompare ply", "cloudcompare text"}) * 1e-4
+        )  # single precision
         assert float(stored["point_total"]) == COUNT
     assert not list((tmp_path / "data").glob("converting-*"))
 
@@ -178,3 +214,36 @@ def test_scans_without_scan_lines_are_measured_like_others(tmp_path):
     assert np.isfinite(expected["elevation_change"]).any()
     for name in ("point_count", "elevation", "elevation_change", "elevation_change_uncertainty"):
         np.testing.assert_array_equal(actual[name], expected[name], name)
+
+
+def with_inclination_in_points(scan, log):
+    """Write the last reading of a log into the extra bytes of each point, as PDAL does from RXP."""
+    las = laspy.read(scan)
+    time_s, *tilt_deg = np.loadtxt(log, delimiter=",", skiprows=1).T
+    last = np.clip(np.searchsorted(time_s, las.gps_time, side="right") - 1, 0, None)
+    las.add_extra_dims([laspy.ExtraBytesParams(axis, "float32") for axis in ("Roll", "Pitch")])
+    las["Roll"], las["Pitch"] = (column[last] for column in tilt_deg)
+    las.write(scan)
+    log.unlink()
+
+
+def test_inclination_in_the_points_is_used_like_a_log_file(tmp_path):
+    """A log file tells each reading's own time, points within 0.1 s: change is the same within 0.1 sigma."""
+    series = {}
+    for name in ("file", "points"):
+        folder = tiny_station.build(tmp_path / name, method="joint", hours=4)
+        (folder / "inbox").rmdir()
+        (folder / tiny_station.PENDING).rename(folder / "inbox")
+        for scan in sorted((folder / "inbox").glob("*.laz")) if name == "points" else ():
+            with_inclination_in_points(scan, scan.with_name(f"{scan.stem}-incl.txt"))
+        result = station("process", folder / "site.toml", *sorted((folder / "inbox").glob("*.laz")))
+        assert result.returncode == 0, result.stdout + result.stderr
+        assert "log missing" not in result.stderr
+        series[name] = open_series(folder / "data")
+        assert (series[name]["verdict"] == 0).all()  # good, which it is not without a log
+    expected, actual = (one["elevation_change"].to_numpy() for one in series.values())
+    z = (actual - expected) / series["file"]["elevation_change_uncertainty"].to_numpy()
+    known = np.isfinite(z)
+    assert np.count_nonzero(known) > 0.95 * np.count_nonzero(np.isfinite(expected)) > 100
+    assert np.sqrt(np.mean(z[known] ** 2)) < 0.1
+    assert np.abs(z[known]).max() > 0

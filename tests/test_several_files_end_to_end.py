@@ -287,3 +287,27 @@ def test_two_positions_are_adjusted_as_the_one_scan_that_they_are_halves_of(tmp_
     assert np.isfinite(difference_m).sum() > 20_000
     assert np.nanstd(difference_m) < 0.006
     assert np.nanstd(difference_m / sigma_m) < 0.25
+
+
+def test_sigma_contains_the_errors_of_positions_against_each_other(tmp_path):
+    """The same files as tiles of one position, and as three positions that move on their own."""
+    sigma_rad = []
+    for name in ("tiles", "positions"):
+        folder = without_log(tiled(tmp_path / name))
+        if name == "positions":
+            path = folder / "site.toml"
+            entry = re.search(r"\[\[sop\]\]\n(?:[^\[\n].*\n|\n)*", path.read_text())[0]
+            entries = []
+            for number in range(TILES):
+                shutil.copy(folder / "sop.dat", folder / f"sop{number}.dat")
+                files = f'file = "sop{number}.dat"\nfiles = "*_{number}.laz"'
+                entries.append(re.sub(r"scan = .*", "", entry.replace('file = "sop.dat"', files)))
+            path.write_text(path.read_text().replace(entry, "".join(entries)))
+        result = station("process", folder / "site.toml", *deliver(folder))
+        assert result.returncode == 0, result.stdout + result.stderr
+        last = max((folder / "data" / "epochs").rglob("*.nc"))
+        with xr.open_dataset(last) as epoch:
+            covariance = np.squeeze(epoch["shared_parameter_covariance"].to_numpy())
+        sigma_rad.append(np.sqrt(covariance[0, 0]))
+    added_rad = np.sqrt(sigma_rad[1] ** 2 - sigma_rad[0] ** 2)
+    assert np.degrees(added_rad) == pytest.approx(0.008 * np.sqrt(2 / 3), rel=0.4)  # equations.md, 6.13

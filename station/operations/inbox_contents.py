@@ -49,7 +49,7 @@ def inbox_findings(site: Site) -> Iterator[LevelAndMessage]:
     if others:
         where = "in folders of scans.name only" if depth else "in the inbox itself, not below it"
         message = f"{len(others)} scans, such as {others[0]}, are not read: they are looked for {where}"
-        pattern = _fitting_pattern(others)
+        pattern = fitting_pattern(others)
         yield "warning", f'{message}: name = "{pattern}" would, see {MANUAL}' if pattern else message
     yield from _names(site, scans)
     if site.scans.convert is not None and shutil.which(site.scans.convert[0]) is None:
@@ -89,25 +89,32 @@ def _names(site: Site, scans: list[str]) -> Iterator[LevelAndMessage]:
 
     Another one if several files have the same start, but are no epoch.
     """
-    starts = {name: start_in_name(name, site.scans.pattern) for name in scans}
-    counts = Counter(start for start in starts.values() if start)
-    same = [name for name, start in starts.items() if start and counts[start] > 1][:2]
+    same, epoch = epoch_advice(scans, site.scans.pattern)
     if same and site.epoch is None:
-        epoch = "%Y-%m-%d" if resolution_s(site.scans.pattern) > HOUR_S else "%Y%m%d_%H%M%S"
         message = f"{' and '.join(same)} have the same start: such files are one epoch"
         yield "warning", f'{message} with [epoch] name = "{epoch}", see {MANUAL}'
-    names = [name for name, start in starts.items() if start is None]
+    names = [name for name in scans if start_in_name(name, site.scans.pattern) is None]
     if not names:
         return
     message = (
         f'{len(names)} of {len(scans)} names, such as {names[0]}, do not match name = "{site.scans.name}"'
     )
-    pattern = _fitting_pattern(names)
+    pattern = fitting_pattern(names)
     advice = f'name = "{pattern}" would' if pattern else f"the start of {scan_stem(names[0])} must be in it"
     yield "warning", f"{message}: {advice}"
 
 
-def _fitting_pattern(names: list[str]) -> str | None:
+def epoch_advice(names: list[str], pattern: str) -> tuple[list[str], str]:
+    """Return two scans with the same start, and the name of epochs that joins such; [], '' without."""
+    starts = {name: start_in_name(name, pattern) for name in names}
+    counts = Counter(start for start in starts.values() if start)
+    same = [name for name, start in starts.items() if start and counts[start] > 1][:2]
+    if not same:
+        return [], ""
+    return same, "%Y-%m-%d" if resolution_s(pattern) > HOUR_S else "%Y%m%d_%H%M%S"
+
+
+def fitting_pattern(names: list[str]) -> str | None:
     """Return a pattern that all names match, at the depth of the first one; None if there is none."""
     depth = names[0].count("/")
     names = [name for name in names if name.count("/") == depth]

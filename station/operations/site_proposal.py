@@ -13,7 +13,7 @@ from pyproj.exceptions import CRSError
 
 from station.errors import ConfigError, StationError
 from station.inbox.listing import is_scan
-from station.operations.inbox_contents import PATTERNS, files_below
+from station.operations.inbox_contents import epoch_advice, files_below, fitting_pattern
 from station.operations.riscan_import import import_riscan, matrix_text, site_text, write_new
 from station.processing.workers import isolation
 from station.quantities import Floats
@@ -41,6 +41,7 @@ class _Found:
 
     scan: Path  # the newest
     pattern: str  # of the names, "" if none of the usual ones fits
+    epoch: str  # name of epochs, if several scans have the same start; else ""
     has_logs: bool
     sops: list[Path]
     pop: Path | None
@@ -71,7 +72,7 @@ def propose_site(source: Path, folder: Path) -> list[Path]:
     texts: dict[Path, str] = {}
     if on_map:
         project = Project(source.resolve().name, None, ())
-        more = [*_map_frame_lines(header), *_more_lines(found, mode="relative")]
+        more = [*_map_frame_lines(header), *_more_lines(found, header, mode="relative")]
     else:
         sop = read_matrix(found.sops[0]) if found.sops else np.eye(4)
         project = _project(source.resolve().name, sop, found, header)
@@ -79,7 +80,7 @@ def propose_site(source: Path, folder: Path) -> list[Path]:
             texts[folder / "SOP-SOP.dat"] = matrix_text(sop)
         if project.pop is not None:
             texts[folder / "POP.dat"] = matrix_text(project.pop)
-        more = _more_lines(found, mode="relative" if found.sops else "absolute")
+        more = _more_lines(found, header, mode="relative" if found.sops else "absolute")
     has_sop = on_map or bool(found.sops)
     site = site_text(f"what lies in {source}", project, lines, more, has_sop=has_sop)
     return write_new(folder, {folder / "site.toml": site, **texts})
@@ -94,14 +95,16 @@ def _header(path: Path, _progress: object) -> ScanHeader:
 
 def _look_into(source: Path) -> _Found:
     files = list(files_below(source))
-    scans = [path for path in files if is_scan(path.name, suffixes()) and path.parent == source]
+    scans = [path for path in files if is_scan(path.name, suffixes())]
+    depth = min((len(path.relative_to(source).parts) for path in scans), default=0)
+    scans = [path for path in scans if len(path.relative_to(source).parts) == depth]
     if not scans:
         raise ConfigError(f"{source}: no scan that can be read lies in it: see docs/how-to/your-own-files.md")
     common = Counter(path.suffix.lower() for path in scans).most_common(1)[0][0]
     scans = [path for path in scans if path.suffix.lower() == common]
-    patterns = (*PATTERNS, *(f"*{pattern}" for pattern in PATTERNS))
-    pattern = next((p for p in patterns if all(start_in_name(path.name, p) for path in scans)), "")
-    newest = max(scans, key=lambda path: (start_in_name(path.name, pattern) or 0) if pattern else path.name)
+    names = {path.relative_to(source).as_posix(): path for path in scans}
+    pattern = fitting_pattern(list(names)) or ""
+    newest = max(names, key=lambda name: (start_in_name(name, pattern) or 0) if pattern else name)
     matrices = {
         path: matrix
         for path in files
@@ -109,8 +112,9 @@ def _look_into(source: Path) -> _Found:
     }
     pops = [path for path, matrix in matrices.items() if np.linalg.norm(matrix[:3, 3]) > GEOCENTRIC_M]
     return _Found(
-        scan=newest,
+        scan=names[newest],
         pattern=pattern,
+        epoch=epoch_advice(list(names), pattern)[1] if pattern else "",
         has_logs=any(path.name.endswith(LOG_SUFFIX) for path in files),
         sops=[path for path in matrices if path not in pops],
         pop=pops[0] if pops else None,
@@ -190,11 +194,17 @@ def _code(header: ScanHeader) -> str:
     return f"EPSG:{code or '…'}"
 
 
-def _more_lines(found: _Found, *, mode: str) -> list[str]:
+def _more_lines(found: _Found, header: ScanHeader, *, mode: str) -> list[str]:
     lines: list[str] = []
-    if found.has_logs:
+    if found.epoch:
+        note = "# check: files with the same start; scan positions need an [[sop]] each, with files"
+        lines += [f"[epoch]   {note}", f'name = "{found.epoch}"', ""]
+    if found.has_logs or header.has_inclination:
         note = "   # check: without an SOP, the log makes the map level" if mode == "absolute" else ""
-        lines += ["[inclination]", f'suffix = "{LOG_SUFFIX}"', f'mode = "{mode}"{note}', ""]
+        source = (
+            f'suffix = "{LOG_SUFFIX}"' if found.has_logs else "wait_s = 0   # the points carry roll and pitch"
+        )
+        lines += ["[inclination]", source, f'mode = "{mode}"{note}', ""]
     if found.weather is not None:
         path, kind = found.weather
         weather = ["[weather]", f'file = "{path.resolve()}"', f'format = "{kind}"']

@@ -50,6 +50,7 @@ from station.science.geometry import inclination
 from station.science.geometry.air import air_correction
 from station.science.geometry.inclination import NO_CYCLIC_ERROR, CyclicError, TiltRecord
 from station.science.uncertainty import parameters
+from station.science.uncertainty.propagation import with_errors_of_positions
 from station.sections.inputs import SopSection
 
 MEAN_TILT = "one mean tilt for the whole scan"
@@ -103,6 +104,16 @@ class ScanInputs:
             adjustment_inputs=replace(self.adjustment_inputs, assumed_rad=assumed_rad),
         )
 
+    def with_errors_of_positions(
+        self, shared: SharedParameters, components: VarianceComponents
+    ) -> SharedParameters:
+        """Return adjusted parameters with what several positions do not have in common, if there are any."""
+        positions_m = [pose.frame.position_m for pose in self.position_poses if pose.frame is not None]
+        if len(positions_m) < 2:
+            return shared
+        usual_motion = prior.globals_sigma(components, weather_known=True)[:7]
+        return with_errors_of_positions(shared, usual_motion, np.array(positions_m))
+
     def log_only_shared(self, components: VarianceComponents) -> SharedParameters | None:
         """Return the systematic errors of all points without an adjustment, from SOP and log."""
         return self.log_only_covariance(components) if self.log_only_covariance else None
@@ -127,8 +138,7 @@ def position_inputs(
         cause = "azimuth does not follow time" if has_time else "no time per point"
         warnings.append(f"{cause}: {MEAN_TILT}")
     rotation = transform.to_local[:3, :3]
-    log_paths = position.logs or _converted_log(site, reader)
-    log = _load_log(site, log_paths, track, rotation, warnings)
+    log = _load_log(site, position.logs, reader, track, rotation, warnings)
     faults = _static_tilt_faults(site, log) if registered is None else ()
     if registered is not None:  # it contains the mean tilt of the scan
         tilt_offset = _own_tilt_offset(site, log, track)
@@ -241,22 +251,26 @@ def _converted_log(site: Site, reader: ScanReader) -> tuple[Path, ...]:
 
 
 def _load_log(
-    site: Site, paths: Sequence[Path], track: AzimuthTrack | None, rotation: Floats, warnings: list[str]
+    site: Site,
+    paths: Sequence[Path],
+    reader: ScanReader,
+    track: AzimuthTrack | None,
+    rotation: Floats,
+    warnings: list[str],
 ) -> InclinationLog | None:
     """Return the cleaned inclination log of a scan, or None; append what is wrong with it to `warnings`.
-
-    Logs of several files are one, in order of their times.
 
     `rotation` (3, 3) of the SOP contains the tilt of the mount, which shows whether the axes are right.
     """
     if site.inclination is None:
         return None
-    if not paths:
-        if site.inclination.required:
-            warnings.append("inclination log missing")
-        return None
     try:
-        log = _clean_log(site, inclination.joined([read_inclination(path) for path in paths]), warnings)
+        raw = _raw_log(site, paths, reader)
+        if raw is None:
+            if site.inclination.required:
+                warnings.append("inclination log missing")
+            return None
+        log = _clean_log(site, raw, warnings)
     except ScanError as error:
         warnings.append(f"inclination log unusable: {error}")
         return None
@@ -267,6 +281,12 @@ def _load_log(
         return log
     log = align_gps_week(log, float(track.time_s[0]))
     return log if _overlaps(site, log, track, warnings) else None
+
+
+def _raw_log(site: Site, paths: Sequence[Path], reader: ScanReader) -> InclinationLog | None:
+    """Return the log of files, in order of their times, else the one that the points carry; None without."""
+    paths = paths or _converted_log(site, reader)
+    return inclination.joined([read_inclination(path) for path in paths]) if paths else reader.inclination()
 
 
 def _clean_log(site: Site, raw: InclinationLog, warnings: list[str]) -> InclinationLog | None:
@@ -399,12 +419,13 @@ def _load_earlier_log(site: Site, sop: SopSection) -> tuple[InclinationLog | Non
         if sop.files is None or fnmatchcase(file.name, sop.files)
     ]
     logs = list(dict.fromkeys(file.log for file in files if file.log is not None))
-    if not logs:
+    if not files:
         return None, None
     with open_files(site, files) as reader:
-        track = reader.azimuth_track()
-    log = inclination.joined([read_inclination(path) for path in logs])
-    log, _ = inclination.clean(log, site.instrument.inclination_range_rad)
+        track, raw = reader.azimuth_track(), _raw_log(site, logs, reader)
+    if raw is None:
+        return None, None
+    log, _ = inclination.clean(raw, site.instrument.inclination_range_rad)
     if track is not None and len(log.time_s):
         log = align_gps_week(log, float(track.time_s[0]))
     return log, track

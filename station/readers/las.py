@@ -20,7 +20,8 @@ from laspy import DecompressionSelection, LasHeader
 from laspy.header import GpsTimeType
 
 from station.errors import NotReadyError, ScanError
-from station.quantities import AzimuthTrack, Bools, Floats, IntensityScale, Ints, Shots
+from station.quantities import AzimuthTrack, Bools, Floats, InclinationLog, IntensityScale, Ints, Shots
+from station.readers.formats.point_inclination import PointInclination
 from station.readers.las_echoes import Brightness, Records, brightness_candidates, discard_tables
 from station.readers.las_header import LasFileHeader, read_header
 from station.readers.prefetch import Buffer, prefetch
@@ -33,7 +34,8 @@ from station.readers.scan import (
     require_in_range,
 )
 
-POSITION_AND_TIME = DecompressionSelection.base().decompress_z().decompress_gps_time()  # of formats 6 and up
+TIME = DecompressionSelection.base().decompress_gps_time()  # of formats 6 and up
+POSITION_AND_TIME = TIME.decompress_z()
 GROUND = POSITION_AND_TIME.decompress_flags().decompress_classification()
 BLOCKS_PER_BUFFER = 4  # decoded together, two chunks per core; converted one by one, in the cache
 SAMPLE_COUNT = 200  # points sampled from a scan with no or few chunks
@@ -67,6 +69,7 @@ class LasScan:
             has_time=self._las_header.has_time,
             standard_time=las.global_encoding.gps_time_type is GpsTimeType.STANDARD,
             crs_wkt=_crs_wkt(las),
+            has_inclination=self._las_header.tilt is not None and self._las_header.has_time,
         )
         nearest_m = float(np.linalg.norm(np.clip(0.0, las.mins, las.maxs)))
         if range_max_m is not None and nearest_m > range_max_m:
@@ -157,6 +160,27 @@ class LasScan:
             ]
             time_s, x_m, y_m = np.array(first_shots).T
         return head_track(time_s, x_m, y_m)
+
+    def inclination(self) -> InclinationLog | None:
+        """Return the inclination log of extra bytes called roll and pitch; None if there are none.
+
+        Decodes the times and extra bytes of all points.
+        """
+        tilt, decoder = self._las_header.tilt, _ShotDecoder(self._las_header.las, self._range_max_m)
+        if tilt is None or self.time_range_s() is None:
+            return None
+        collected, layers = PointInclination(), TIME.decompress_all_extra_bytes()
+        fields = [(self._las_header.only(field.dtype, field.position), field, unit) for field, unit in tilt]
+        with self._open_points(layers, all_cores=True) as points:
+            while count := min(SKIP_POINTS * BLOCKS_PER_BUFFER, self.header.point_count - points.position):
+                records = points.read(count)
+                with np.errstate(all="ignore"):  # whatever the extra bytes hold
+                    roll_rad, pitch_rad = (
+                        (records.view(dtype)["value"].astype(np.float64) * field.scale + field.offset) * unit
+                        for dtype, field, unit in fields
+                    )
+                collected.add(decoder.decode_times(records), roll_rad, pitch_rad)
+        return collected.log()
 
     @cached_property
     def _sample(self) -> tuple[Floats, Floats, Floats]:
@@ -284,7 +308,7 @@ class _ShotDecoder:
         xyz_m = np.empty((3, len(records)))
         for axis, axis_m in enumerate(xyz_m):
             self._scale_axis(records, axis, axis_m)
-        time_s = self._decode_times(records) if has_time else None
+        time_s = self.decode_times(records) if has_time else None
         intensity = None if brightness is None else brightness.intensity(records)
         if ground is not None:
             xyz_m = xyz_m.take(ground, axis=1)
@@ -308,7 +332,8 @@ class _ShotDecoder:
                 f" {self._las.maxs[axis]:.3f} m"
             )
 
-    def _decode_times(self, records: Records) -> Floats:
+    def decode_times(self, records: Records) -> Floats:
+        """Return the times of records (n,), which must be those of one scan [s]."""
         time_s = np.array(records["gps_time"], dtype=np.float64)  # a copy: the buffer is used again
         low_s, high_s = float(time_s.min()), float(time_s.max())
         if not (np.isfinite(low_s) and np.isfinite(high_s)):

@@ -66,18 +66,13 @@ def brightness_candidates(header: LasFileHeader, scale: IntensityScale) -> list[
     """Return the fields that may hold the brightness as the site file states it, the best one first."""
     candidates = []
     if scale in {"auto", "reflectance"} and (extra := header.reflectance) is not None:
-        field = _single_field(extra.dtype, extra.position, header)
+        field = header.only(extra.dtype, extra.position)
         candidates.append(Brightness(field, from_decibels(extra.scale, extra.offset), in_extra_bytes=True))
     if scale in {"auto", "linear", "decibel"}:
-        field = _single_field("<u2", INTENSITY_POSITION, header)
+        field = header.only("<u2", INTENSITY_POSITION)
         convert = from_decibels(SPAN_DB / MAX_INTENSITY, LOWEST_DB) if scale == "decibel" else _from_linear
         candidates.append(Brightness(field, convert, in_extra_bytes=False))
     return candidates
-
-
-def _single_field(dtype: str, position: int, header: LasFileHeader) -> np.dtype[np.void]:
-    size = header.record_dtype.itemsize
-    return np.dtype({"names": ["value"], "formats": [dtype], "offsets": [position], "itemsize": size})
 
 
 def _from_linear(values: NDArray[np.number]) -> Floats:

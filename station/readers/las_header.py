@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 import struct
+from collections.abc import Iterator
 from dataclasses import dataclass
 from io import BytesIO
 from typing import BinaryIO, NamedTuple
@@ -19,6 +20,7 @@ from laspy import LasHeader
 
 from station.errors import ScanError
 from station.quantities import Ints
+from station.readers.formats.point_inclination import AXES, tilt_field
 from station.readers.scan import decoder_errors
 
 FIXED = struct.Struct("<24xBB68xHIIBHI")  # the fields of _Start
@@ -38,9 +40,9 @@ LAYERS_BY_ITEM = {10: 9, 11: 1, 12: 2, 13: 1}  # by item type: Point14, RGB14, R
 BYTE14_ITEM = 14  # item type with one layer per byte
 EXTRA_BYTES = np.dtype(  # LAS 1.4 R15, table 24
     {
-        "names": ["type", "options", "name", "scale", "offset"],
-        "formats": ["u1", "u1", "S32", "<f8", "<f8"],
-        "offsets": [2, 3, 4, 112, 136],
+        "names": ["type", "options", "name", "scale", "offset", "description"],
+        "formats": ["u1", "u1", "S32", "<f8", "<f8", "S32"],
+        "offsets": [2, 3, 4, 112, 136, 160],
         "itemsize": 192,
     }
 )
@@ -52,6 +54,8 @@ SCALED, SHIFTED = 8, 16  # bits of the options: scale and offset are valid
 class ExtraField:
     """A number in the extra bytes of a record; its value is `scale` times the stored one plus `offset`."""
 
+    name: str
+    description: str
     position: int  # in the record [bytes]
     dtype: str
     scale: float
@@ -66,7 +70,7 @@ class LasFileHeader:
     laszip: bytes | None  # the record that describes the compression; None if there is none
     first_points: bytes  # the first point of each chunk, which is stored uncompressed
     equal_chunks: bool  # all chunks but the last have the same length
-    reflectance: ExtraField | None  # the extra bytes called Reflectance, if any
+    extra_fields: tuple[ExtraField, ...]
 
     @property
     def record_dtype(self) -> np.dtype[np.void]:
@@ -78,6 +82,25 @@ class LasFileHeader:
     def has_time(self) -> bool:
         """True if the point format has a time field."""
         return "gps_time" in (self.record_dtype.names or ())
+
+    @property
+    def reflectance(self) -> ExtraField | None:
+        """The extra bytes called Reflectance, if any."""
+        return next((field for field in self.extra_fields if field.name.lower() == "reflectance"), None)
+
+    @property
+    def tilt(self) -> tuple[tuple[ExtraField, float], ...] | None:
+        """The extra bytes that hold roll and pitch of the scanner, with factors to radians; None without."""
+        found: dict[str, tuple[ExtraField, float]] = {}
+        for field in self.extra_fields:
+            if (known := tilt_field(field.name, field.description)) is not None:
+                found.setdefault(known[0], (field, known[1]))
+        return tuple(found[axis] for axis in AXES) if set(AXES) <= found.keys() else None
+
+    def only(self, dtype: str, position: int) -> np.dtype[np.void]:
+        """Return the dtype of a record with one field `value`, which is at a position [bytes]."""
+        size = self.record_dtype.itemsize
+        return np.dtype({"names": ["value"], "formats": [dtype], "offsets": [position], "itemsize": size})
 
 
 class _Start(NamedTuple):
@@ -129,7 +152,7 @@ def read_header(file: BinaryIO, size: int) -> LasFileHeader:
     file.seek(0)
     raw = bytearray(file.read(start.points_offset))
     records = _variable_length_records(raw, start)
-    laszip, reflectance = _find_laszip(raw, start, records), _find_reflectance(raw, start, records)
+    laszip, extra_fields = _find_laszip(raw, start, records), tuple(_extra_fields(raw, start, records))
     _erase_owners(raw, records)
     with decoder_errors("corrupt header"):
         las = LasHeader.read_from(BytesIO(raw))
@@ -142,12 +165,12 @@ def read_header(file: BinaryIO, size: int) -> LasFileHeader:
     points_end = _points_end(las, size)
     if not start.format_byte & 0xC0:
         _check_point_count(las, points_end)
-        return LasFileHeader(las, None, b"", equal_chunks=False, reflectance=reflectance)
+        return LasFileHeader(las, None, b"", equal_chunks=False, extra_fields=extra_fields)
     if laszip is None:
         raise ScanError("compressed, but the record that says how (LASzip VLR) is missing")
     first_points = _check_chunks(file, las, laszip, points_end)
     equal_chunks = laszip.chunk_points != VARIABLE_CHUNKS
-    return LasFileHeader(las, laszip.record, first_points, equal_chunks, reflectance)
+    return LasFileHeader(las, laszip.record, first_points, equal_chunks, extra_fields)
 
 
 def _check_start(raw: bytes, size: int) -> _Start:
@@ -211,24 +234,24 @@ def _find_laszip(raw: bytearray, start: _Start, records: list[_Record]) -> _LasZ
     return _parse_laszip(content[-1], start.record_bytes) if content else None
 
 
-def _find_reflectance(raw: bytearray, start: _Start, records: list[_Record]) -> ExtraField | None:
-    """Return the first extra bytes called Reflectance that hold one number; None if there are none."""
+def _extra_fields(raw: bytearray, start: _Start, records: list[_Record]) -> Iterator[ExtraField]:
+    """Yield the extra bytes that hold one number each."""
     content = b"".join(record.content(raw) for record in records if record.key == EXTRA_BYTES_KEY)
     position = POINT_BYTES[start.format_byte & 0x3F]
     for row in np.frombuffer(content, EXTRA_BYTES, len(content) // EXTRA_BYTES.itemsize):
         kind, options = int(row["type"]), int(row["options"])
         if kind > 3 * len(EXTRA_TYPES):  # of unknown size: what follows cannot be located
-            return None
+            return
         values, index = divmod(kind - 1, len(EXTRA_TYPES))  # deprecated types have two or three values
         size = np.dtype(EXTRA_TYPES[index]).itemsize * (values + 1) if kind else options
         scale = float(row["scale"]) if options & SCALED else 1.0
         offset = float(row["offset"]) if options & SHIFTED else 0.0
         is_number = 1 <= kind <= len(EXTRA_TYPES) and np.isfinite([scale, offset]).all() and scale
         is_inside = position + size <= start.record_bytes
-        if is_number and is_inside and row["name"].strip().lower() == b"reflectance":
-            return ExtraField(position, EXTRA_TYPES[index], scale, offset)
+        if is_number and is_inside:
+            name, description = (row[key].decode("latin-1").strip() for key in ("name", "description"))
+            yield ExtraField(name, description, position, EXTRA_TYPES[index], scale, offset)
         position += size
-    return None
 
 
 def _parse_laszip(record: bytes, record_bytes: int) -> _LasZip:

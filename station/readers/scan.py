@@ -21,7 +21,7 @@ from typing import ClassVar, Protocol, Self
 import numpy as np
 
 from station.errors import InconclusiveError, NotReadyError, ScanError, StationError
-from station.quantities import AzimuthTrack, Floats, IntensityScale, Shots
+from station.quantities import AzimuthTrack, Floats, InclinationLog, IntensityScale, Shots
 from station.scan_names import COMPRESSED, resolution_s, start_in_name
 
 log = logging.getLogger(__name__)
@@ -73,6 +73,7 @@ class ScanHeader:
     standard_time: bool  # the flag for adjusted standard GPS time, which not every writer sets correctly
     crs_wkt: str | None  # None if the file declares none that can be parsed
     start_utc: datetime | None = None  # that the file states; its name and standard times come first
+    has_inclination: bool = False  # the points carry roll and pitch of the scanner
 
 
 class ScanReader(Protocol):
@@ -100,6 +101,9 @@ class ScanReader(Protocol):
 
     def azimuth_track(self) -> AzimuthTrack | None:
         """Return the azimuth of the scanner head over time, from samples; None if it is unknown."""
+
+    def inclination(self) -> InclinationLog | None:
+        """Return the inclination log that the points carry, uncleaned; None if they carry none."""
 
     def close(self) -> None:
         """Close the file."""

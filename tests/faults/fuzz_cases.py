@@ -46,6 +46,7 @@ VALID_FILES = {  # kind: file of the corpus, in the order of `write_corpus`
     "laz": "250715_000000.laz",
     "old_laz": "250715_010000.laz",
     "week_las": "250720_000000.las",
+    "tilt_laz": "250715_020000.laz",
     "e57": "250715_000000.e57",
     "ply": "250715_000000.ply",
     "pcd": "250715_000000.pcd",
@@ -162,7 +163,7 @@ def check_scan(path, rng):
     with open_scan(path, range_max_m=range_max_m) as scan:
         start, end, _ = utc_interval(scan, pattern)
         blocks = list(scan.blocks(500))
-        track = scan.azimuth_track()
+        track, log = scan.azimuth_track(), scan.inclination()
     # A flipped bit may mark a point as noise, as withheld, or as an earlier return, which is not used.
     assert 0 < sum(len(block) for block in blocks) <= scan.header.point_count, (
         "no points, or more than the header counts"
@@ -182,6 +183,10 @@ def check_scan(path, rng):
         if track is not None:
             assert np.isfinite(track.azimuth_rad).all(), "azimuths are not finite"
             assert (np.diff(track.time_s) > 0).all(), "times of the head do not increase"
+        if log is not None:
+            assert (np.diff(log.time_s) > 0).all(), "times of the points' inclination do not increase"
+            cleaned, _ = inclination.clean(log, np.radians(10.0))
+            assert np.isfinite([cleaned.time_s, cleaned.roll_rad, cleaned.pitch_rad]).all()
 
 
 def check_inclination(path, _dice):

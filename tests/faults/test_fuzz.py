@@ -76,14 +76,20 @@ def write_scans(scan, target):
         ("250715_000000.laz", 6, "1.4", 100.0),
         ("250715_010000.laz", 3, "1.2", 100.0),
         ("250720_000000.las", 1, "1.2", 604_790.0),  # across the end of the GPS week
+        ("250715_020000.laz", 6, "1.4", 100.0),  # with roll and pitch
     ):
         header = laspy.LasHeader(point_format=form, version=version)
+        tilt = ("Roll", "Pitch") if name.startswith("250715_02") else ()
+        for axis in tilt:
+            header.add_extra_dim(laspy.ExtraBytesParams(axis, "float32"))
         header.scales, header.offsets = [0.001] * 3, [0.0] * 3
         las = laspy.LasData(header)
         las.x, las.y, las.z = (np.asarray(axis[subset])[order] for axis in (scan.x, scan.y, scan.z))
         las.intensity = np.asarray(scan.intensity[subset])[order]
         las.gps_time = (first_s + np.linspace(0, 60, len(order))) % 604_800
         las.return_number[:] = las.number_of_returns[:] = 1
+        for axis in tilt:
+            las[axis] = 0.003 * (las.gps_time.astype(int) % 7)
         las.write(target / name)
 
 

@@ -4,6 +4,7 @@ import shutil
 import subprocess
 import sys
 
+import laspy
 import numpy as np
 import pytest
 from pyproj import CRS
@@ -12,6 +13,7 @@ from support import tiny_station
 from station.config import read_site
 from station.errors import ConfigError
 from station.operations.site_proposal import propose_site
+from station.processing.scans.scan_files import inbox_scans
 from station.readers.weather import read_weather
 
 
@@ -102,3 +104,25 @@ def test_scans_on_the_map_and_other_names(tmp_path):
 def test_a_folder_without_scans_is_refused(tmp_path):
     with pytest.raises(ConfigError, match="no scan that can be read"):
         propose_site(tmp_path, tmp_path / "site")
+
+
+def test_scans_in_folders_and_of_several_files_are_found(source, tmp_path):
+    day = source / "2025-07-15"
+    day.mkdir()
+    for number, path in enumerate(sorted(source.glob("*.laz")), start=1):
+        path.rename(day / f"ScanPos{number:03d}.laz")
+    site = read_site(propose_site(source, tmp_path / "site")[0])
+    assert site.scans.name == "%Y-%m-%d/*"
+    assert site.epoch.name == "%Y-%m-%d"
+    assert [scan.name for scan in inbox_scans(site)] == ["2025-07-15"]
+
+
+def test_inclination_in_the_points_is_used(source, tmp_path):
+    for log in source.glob("*-incl.txt"):
+        log.unlink()
+    for scan in source.glob("*.laz"):
+        las = laspy.read(scan)
+        las.add_extra_dims([laspy.ExtraBytesParams(axis, "float32") for axis in ("Roll", "Pitch")])
+        las.write(scan)
+    site = read_site(propose_site(source, tmp_path / "site")[0])
+    assert (site.inclination.wait_s, site.inclination.mode) == (0.0, "absolute")

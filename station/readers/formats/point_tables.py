@@ -17,7 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from station.errors import NotReadyError, ScanError
-from station.quantities import AzimuthTrack, Bools, Floats, IntensityScale, Shots
+from station.quantities import AzimuthTrack, Bools, Floats, InclinationLog, IntensityScale, Shots
+from station.readers.formats.point_inclination import AXES, UNITS, PointInclination, tilt_field
 from station.readers.las_echoes import LOWEST_DB, MAX_INTENSITY, NOISE_CLASSES, SPAN_DB, from_decibels
 from station.readers.scan import (
     MAX_SCAN_S,
@@ -28,7 +29,7 @@ from station.readers.scan import (
     require_in_range,
 )
 
-Table = dict[str, NDArray[Any]]  # columns (n,) by the names of FIELDS; x, y and z are always there
+Table = dict[str, NDArray[Any]]  # columns (n,) by the names of FIELDS and TILT; x, y and z are always there
 
 MAX_COORDINATE_M = 1e8  # no map of the Earth is larger
 SURVEY_POINTS = 16_384  # read at a time when a file is opened
@@ -50,12 +51,16 @@ FIELDS = {
     "classification": ("classification", "class"),
 }
 
+TILT = {f"{axis}_{unit}": (axis, factor) for axis in AXES for unit, factor in UNITS.items()}
+
 
 def field_of(name: str) -> str | None:
-    """Return what a column of the given name holds, by the keys of FIELDS; None if it is not needed.
+    """Return what a column of the given name holds, by the keys of FIELDS and TILT; None if it is not needed.
 
     Units in brackets and the prefix that CloudCompare writes to PLY files do not count.
     """
+    if (tilt := tilt_field(name)) is not None:
+        return next(key for key, known in TILT.items() if known == tilt)
     plain = name.strip(" \"'/#\r\n").lower().partition("[")[0].partition("(")[0].strip(" _")
     plain = plain.removeprefix("scalar_").replace(" ", "_").replace(".", "_")
     return next((key for key, names in FIELDS.items() if plain in names), None)
@@ -82,6 +87,8 @@ class _Survey:
     time_range_s: tuple[float, float] = (np.inf, -np.inf)
     limits: dict[str, tuple[float, float]] = field(default_factory=dict)  # of the brightness, by its field
     samples: list[Floats] = field(default_factory=list)  # time [s], x, y [m] (3, k)
+    has_inclination: bool = False
+    inclination: PointInclination = field(default_factory=PointInclination)
 
 
 class TableScan(ABC):
@@ -106,6 +113,7 @@ class TableScan(ABC):
             standard_time=False,
             crs_wkt=self._contents.crs_wkt,
             start_utc=self._contents.start_utc,
+            has_inclination=self._survey.has_inclination,
         )
 
     @abstractmethod
@@ -159,6 +167,10 @@ class TableScan(ABC):
         if self._range_max_m is None or self.time_range_s() is None:
             return None
         return head_track(*np.concatenate(self._survey.samples, axis=1))
+
+    def inclination(self) -> InclinationLog | None:
+        """Return the inclination log of columns called roll and pitch; None if there are none."""
+        return None if self.time_range_s() is None else self._survey.inclination.log()
 
     def _checked_tables(self, size: int) -> Iterator[Table]:
         """Yield the tables; turn what the library raises into ScanError."""
@@ -227,6 +239,11 @@ class TableScan(ABC):
         low_s, high_s = survey.time_range_s
         survey.time_range_s = min(low_s, float(time_s.min())), max(high_s, float(time_s.max()))
         survey.samples.append(np.stack([time_s, xyz_m[0], xyz_m[1]])[:, ::step])
+        tilts = [(axis, key, factor) for key, (axis, factor) in TILT.items() if key in table]
+        tilt_rad = {axis: table[key].astype(np.float64) * factor for axis, key, factor in tilts}
+        survey.has_inclination = set(AXES) <= tilt_rad.keys()
+        if survey.has_inclination and self._range_max_m is not None:  # else the times have no limit
+            survey.inclination.add(time_s, *(tilt_rad[axis] for axis in AXES))
 
     def _times(self, table: Table) -> Floats:
         assert self._survey.first_s is not None  # noqa: S101 - there are times

@@ -109,7 +109,7 @@ def _layout(lines: Sequence[str], column_names: Sequence[str]) -> _Layout:
         if _is_number(fields[0], decimal_comma=decimal_comma):
             if text.startswith(COMMENTS):
                 continue
-            if len(fields) == 1 and text.isdigit() and number == 0:
+            if len(fields) == 1 and text.isdigit() and point_count is None:
                 point_count = int(text)
                 continue
             return _Layout(_columns(names, len(fields)), delimiter, decimal_comma, number, point_count)

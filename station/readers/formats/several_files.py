@@ -7,8 +7,9 @@ from typing import ClassVar, Self
 
 import numpy as np
 
-from station.quantities import AzimuthTrack, IntensityScale, Shots
+from station.quantities import AzimuthTrack, InclinationLog, IntensityScale, Shots
 from station.readers.scan import MAX_SCAN_S, ScanHeader, ScanReader, head_track
+from station.science.geometry.inclination import joined
 
 MAX_TURN_RAD = 2.2 * np.pi  # of the head in one scan: a full circle and some overlap
 
@@ -32,6 +33,7 @@ class SeveralFiles:
             standard_time=all(header.standard_time for header in headers),
             crs_wkt=headers[0].crs_wkt,
             start_utc=min((header.start_utc for header in headers if header.start_utc), default=None),
+            has_inclination=any(header.has_inclination for header in headers),
         )
 
     def __enter__(self) -> Self:
@@ -73,6 +75,11 @@ class SeveralFiles:
         if track is None or np.ptp(track.time_s) > MAX_SCAN_S or np.ptp(track.azimuth_rad) > MAX_TURN_RAD:
             return None
         return track
+
+    def inclination(self) -> InclinationLog | None:
+        """Return the inclination that the points of the files carry; None if they carry none."""
+        logs = [log for reader in self._readers if (log := reader.inclination()) is not None]
+        return joined(logs) if logs else None
 
 
 def as_one(readers: Sequence[ScanReader]) -> ScanReader:

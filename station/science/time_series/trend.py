@@ -45,8 +45,8 @@ def fit_trend(time_s: Floats, change_m: Floats, sigma_m: Floats, common_share: f
 
     def last_coefficient(degree: int) -> tuple[float, float]:
         weights = np.linalg.pinv(np.vander(day, degree + 1, increasing=True))[degree]
-        variance = max(float(weights @ covariance_m2 @ weights) for covariance_m2 in covariances_m2)
-        return float(weights @ change_m), float(np.sqrt(variance))
+        variances = [float(weights @ covariance_m2 @ weights) for covariance_m2 in covariances_m2]
+        return float(weights @ change_m), float(np.sqrt(max(0.0, *variances)))  # rounding makes zero negative
 
     rate_m_d, rate_sigma_m_d = last_coefficient(1)
     if len(time_s) <= MIN_EPOCHS:

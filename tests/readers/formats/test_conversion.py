@@ -57,10 +57,10 @@ def test_commands_that_fail_are_told(tmp_path, script, error, message):
 
 PDAL = """#!/bin/sh
 # Stand-in: takes the options of pdal translate and of two of its stages, and copies.
-[ "$1" = translate ] && [ -f "$2" ] && source="$2" && out="$3" && shift 3 || exit 64
+[ "$1" = translate ] && [ -f "$2" ] && [ "$4" = ferry ] && source="$2" && out="$3" && shift 4 || exit 64
 for option; do
     case "$option" in
-    --readers.rxp.sync_to_pps=false|--writers.las.*=*) ;;
+    --readers.rxp.sync_to_pps=false|--writers.las.*=*|--filters.ferry.dimensions="InternalTime=>GpsTime") ;;
     *) echo "unknown option $option" >&2; exit 1 ;;
     esac
 done
@@ -76,7 +76,7 @@ def test_recipes_for_rxp_run_with_programs_of_their_interface(tmp_path, monkeypa
     """The real PDAL with RiVLib, and rivlib-utils, never ran here."""
     manual = (Path(__file__).parents[3] / "docs" / "how-to" / "your-own-files.md").read_text()
     script = re.search(r'```sh title="rxp_to_laz.sh"\n(.*?)```', manual, re.DOTALL)[1]
-    plain = re.search(r'convert = (\["pdal".*?\])\n', manual, re.DOTALL)[1]
+    plain = re.search(r'(convert = \["pdal".*?\])\n\[inclination', manual, re.DOTALL)[1]
     for name, text in (("pdal", PDAL), ("ri-inclination", RI_INCLINATION), ("rxp_to_laz.sh", script)):
         (tmp_path / name).write_text(text)
         (tmp_path / name).chmod(0o755)
@@ -84,7 +84,7 @@ def test_recipes_for_rxp_run_with_programs_of_their_interface(tmp_path, monkeypa
     source = write_sweep("250715_090000.laz", 5000).rename(tmp_path / "250715_090000.rxp")
     for recipe in (
         (str(tmp_path / "rxp_to_laz.sh"), "{in}", "{out}"),
-        tuple(tomllib.loads(f"convert = {plain}")["convert"]),
+        tuple(tomllib.loads(plain)["convert"]),
     ):
         convert(recipe, source, tmp_path / "out.laz", **LIMITS)
         assert (tmp_path / "out.laz").read_bytes() == source.read_bytes()

@@ -503,3 +503,14 @@ def test_suffixes_of_logs_are_those_of_scans_only_if_chosen(tmp_path):
     assert scan_suffixes(scans) == (".csv",)
     path = text_file(tmp_path / "a.csv", Points(30), fields="xyz", delimiter=",")
     assert read(path)[0].shape == (3, 30)
+
+
+def test_text_may_state_its_count_before_or_after_the_names(tmp_path):
+    """CloudCompare writes the count after the names."""
+    for lines in (("//X;Y;Z;Intensity", "3"), ("3", "//X;Y;Z;Intensity")):
+        rows = [f"{100 + index};50;2;{index}" for index in range(3)]
+        (tmp_path / "a.asc").write_text("\n".join([*lines, *rows, ""]))
+        assert read(tmp_path / "a.asc")[0][0].tolist() == [100, 101, 102]
+        (tmp_path / "a.asc").write_text("\n".join([*lines, *rows[:2], ""]))
+        with pytest.raises(ScanError, match="cut off: 2 of 3 points"):
+            read(tmp_path / "a.asc")
