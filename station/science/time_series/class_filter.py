@@ -7,6 +7,7 @@ and reprocessed.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from itertools import product
 
@@ -102,6 +103,25 @@ class ClassFilter:
         self._likelihood = np.zeros(self._shape[0])
         self._best = LEVEL_NOISES_M2_D.index(1e-5) * len(rate_noises)
         self.shares: ErrorShares | None = None  # None before the first scan with a cell of the sample
+
+    def to_arrays(self) -> dict[str, Floats]:
+        """Return everything that the next scan is filtered with, by name."""
+        shares = () if self.shares is None else tuple(vars(self.shares).values())
+        return {
+            "states": np.stack(list(vars(self._states).values())),
+            "likelihood": self._likelihood,
+            "best": np.array([self._best], np.float64),
+            "shares": np.concatenate([np.ravel(matrix) for matrix in shares] or [np.empty(0)]),
+        }
+
+    def restore(self, arrays: Mapping[str, Floats]) -> None:
+        """Continue from what `to_arrays` returned."""
+        self._states = LevelRate(*arrays["states"])
+        self._likelihood, self._best = arrays["likelihood"], int(arrays["best"][0])
+        self.shares = None
+        if len(shares := arrays["shares"]):
+            total, random, process, systematic = shares[:16].reshape(4, 2, 2)
+            self.shares = ErrorShares(total, random, process, systematic, shares[16:])
 
     @property
     def learned(self) -> ProcessNoise:

@@ -65,10 +65,9 @@ def filtered(change_m, random_m, systematic_m, *, stable=False):
     for index, scan_m in enumerate(change_m):
         days = HOUR_D if index else 0.0
         noise = ground.advance(days, scan_m[sample], random_m2[sample], systematic_m2[sample])
-        cells.advance(days, noise, scan_m, random_m2 + systematic_m2)
+        cells.advance(days, noise, scan_m, random_m2, systematic_m2)
         state = cells.estimates()
-        unseen_d = cells.cells["unseen_min"] / 1440
-        yield state, filter_errors(state, unseen_d, random_m2, systematic_m2, ground.shares)
+        yield state, filter_errors(state, cells.unseen_d, random_m2, systematic_m2, ground.shares)
 
 
 def calibration(kind, random_m, systematic_m, **options):
