@@ -103,14 +103,14 @@ def levels(
 ) -> xr.Dataset:
     """Return level [m] and rate [m/d] of the cells of an area at the end of each day, with their uncertainty.
 
-    The level is the elevation change filtered over time, cell by cell, from all usable epochs; the rate is its
-    slope without steps. Both have a random uncertainty, independent between cells, and a systematic one,
+    The level is the elevation change filtered over time, cell by cell, from all usable epochs; the rate is
+    its slope without steps. Both have a random uncertainty, independent between cells, and a systematic one,
     which cells have in common. `coverage` is the share of the day's epochs that saw the cell: where it is 0
     the level is extrapolated, with an uncertainty to match. `area` is that of `station.volume`. Days in
-    `levels/` are read; the others are computed from their epochs, with the same values. With `every` "1M" there is
-    one entry for each month in `levels/`, and the rate is the mean of the month, steps included. Raises
-    StoreError if there is no series, no usable epoch with a reference or no such month, StationError if there
-    is no area of this name. Source: equations.md, 6.12.
+    `levels/` are read; the others are computed from their epochs, with the same values. With `every` "1M"
+    there is one entry for each month in `levels/`, and the rate is the mean of the month, steps included.
+    Raises StoreError if there is no series, no usable epoch with a reference or no such month, StationError
+    if there is no area of this name. Source: equations.md, 6.12.
     """
     from station.archive.series.index import series_in
     from station.queries.grid_arrays import to_mask

@@ -21,7 +21,6 @@ from station.archive.discovery import time_coverage
 from station.archive.netcdf_layout import Series, create_file, create_variable, encode_text
 from station.archive.raster_io import Array, LazyRaster, rounded, write_rasters
 from station.archive.schema import BY_NAME, FILL, RASTER, Variable
-from station.errors import StoreError
 
 FOLDER, STATE_FOLDER = "levels", ".levels"
 KEY_DIGITS = 8  # of the hash in the name of a file
@@ -211,10 +210,3 @@ def delete_states(series: Series, kept: Iterable[LevelPeriod]) -> None:
 
 def _state_path(series: Series, period: LevelPeriod) -> Path:
     return series.folder / STATE_FOLDER / f"{series.station_id}_{period.name}_{period.key[:KEY_DIGITS]}.npz"
-
-
-def require_levels(path: Path) -> Path:
-    """Return a file of levels; raise StoreError if it is damaged."""
-    if not is_intact(path):
-        raise StoreError(f"{path}: damaged: station reprocess computes it again")
-    return path
