@@ -16,7 +16,7 @@ from station.archive.schema import FILL
 from station.quantities import Bools, Floats, Floats32, Reference
 from station.queries.blocks import BlockQueries, mean_covariances
 from station.queries.epoch_cells import CHANGE, RANDOM
-from station.science.time_series.cell_filter import CellFilter, ProcessNoise
+from station.science.time_series.cell_filter import CellFilter, Motion, ProcessNoise
 from station.science.time_series.class_filter import SAMPLE_CELLS, ClassFilter
 from station.science.time_series.filter_errors import filter_errors
 
@@ -95,23 +95,19 @@ class LevelFilter:
         days = 0.0 if np.isnan(self._time_s) else (epoch.time_s - self._time_s) / DAY_S
         self._time_s = epoch.time_s
         observations = self._read(epoch)
-        noises = [
+        steps = [
             ground.advance(days, *observations.take(self._sample[first:end]))
             for ground, first, end in zip(self._classes, self._bounds[:-1], self._bounds[1:], strict=True)
         ]
-        level_m2_d, rate_m2_d3 = (
-            np.array([getattr(noise, name) for noise in noises]) for name in ("level_m2_d", "rate_m2_d3")
-        )
+        noises, motions = (_stacked(values) for values in zip(*steps, strict=True))
         for block in self._cell_blocks():
-            index = (
-                block
-                if len(self._read_cells) == len(self._cell)
-                else np.searchsorted(self._read_cells, self._cell[block])
-            )
+            index: Array | slice = block
+            if len(self._read_cells) > len(self._cell):
+                index = np.searchsorted(self._read_cells, self._cell[block])
             change_m, random_m2, systematic_m2 = observations.take(index)
             classes = self._class[block]
-            noise = ProcessNoise(level_m2_d[classes], rate_m2_d3[classes])
-            self._part(block).advance(days, noise, change_m, random_m2, systematic_m2)
+            noise, motion = ProcessNoise(*noises[:, classes]), Motion(*motions[:, classes])
+            self._part(block).advance(days, noise, motion, change_m, random_m2, systematic_m2)
             self._seen[block] += np.isfinite(change_m)
 
     def _cell_blocks(self) -> Iterator[slice]:
@@ -174,16 +170,15 @@ class LevelFilter:
         random_m2, systematic_m2 = part.last_variances()
         variances = np.full((4, len(unseen_d)), np.nan)
         for number in np.unique(self._class[band]).tolist():
-            shares, inside = self._classes[number].shares, self._class[band] == number
-            if shares is not None:
-                errors = filter_errors(
-                    state.take(inside),
-                    unseen_d[inside],
-                    random_m2[inside],
-                    systematic_m2[inside] * (1 - self._common_share),
-                    shares,
-                )
-                variances[:, inside] = list(vars(errors).values())
+            inside = self._class[band] == number
+            errors = filter_errors(
+                state.take(inside),
+                unseen_d[inside],
+                random_m2[inside],
+                systematic_m2[inside] * (1 - self._common_share),
+                self._classes[number],
+            )
+            variances[:, inside] = list(vars(errors).values())
         variances[0] += self._reference_m2[band]
         variances[1] += self._common_share * systematic_m2
         sigmas = np.sqrt(variances)
@@ -213,6 +208,11 @@ class LevelFilter:
         self._time_s, self._common_share = arrays["scalars"].tolist()
         for number, ground in enumerate(self._classes):
             ground.restore({name: arrays[f"{name}_{number}"] for name in ground.to_arrays()})
+
+
+def _stacked(values: tuple[ProcessNoise | Motion, ...]) -> Floats:
+    """Return the numbers of each class as an array (fields, classes)."""
+    return np.array([list(vars(of_class).values()) for of_class in values]).T
 
 
 def _classes(stable: Bools, variance_m2: Floats32) -> NDArray[np.uint8]:

@@ -36,7 +36,9 @@ def add(series, hours):
     for hour in hours:
         epoch = random_epoch(hour, GRID, SIGMA_M, scatter_m=0.02, provenance={"reference_version": "1"})
         change_m = epoch.measurement.change_m - np.float32(hour / 10 + 0.05 * hour / 24)
-        measurement = replace(epoch.measurement, change_m=change_m)
+        cells = epoch.measurement.cells.copy()
+        cells["uncertainty_m"] = 1.02 * cells["random_uncertainty_m"]
+        measurement = replace(epoch.measurement, change_m=change_m, cells=cells)
         write_epoch(series, replace(epoch, measurement=measurement))
     build_series(series)
 

@@ -19,6 +19,7 @@ STEP_SIGMAS = 4.5  # an innovation beyond is an outlier, and a step once the nex
 CONFIRMED_SIGMAS = 3.0  # the largest difference of two scans after a step
 MAX_CORRELATION = 0.999  # below 1 after rounding to half precision
 MAX_UNSEEN_MIN = 65_535
+MAX_SHARE = 2.0  # of the daily wave of the class, in a cell
 
 CELL_DTYPE = np.dtype(  # 20 bytes per cell
     [
@@ -57,6 +58,17 @@ class ProcessNoise:
     rate_m2_d3: Floats
 
 
+@dataclass(frozen=True)
+class Motion:
+    """What the class of cells did since the last scan [m]; numbers, or arrays (n,) of cells."""
+
+    anomaly_m: Floats | float = 0.0  # in excess of its mean rate: the daily wave
+    surge_m: Floats | float = 0.0  # all at once, such as snowfall
+    mean_rate_m_d: Floats | float = 0.0  # over the last day
+    faster_m_d: Floats | float = 0.0  # change of the mean rate
+    common_error_m: Floats | float = 0.0  # of the scan, in all cells of the class
+
+
 def first_estimate(change_m: Floats, variance_m2: Floats) -> LevelRate:
     """Return level and rate after the first observation of a cell."""
     zero = np.zeros_like(change_m)
@@ -74,6 +86,23 @@ def predict(state: LevelRate, days: float, noise: ProcessNoise) -> LevelRate:
         + days * (noise.level_m2_d + wander * days / 3),
         state.covariance_m2_d + days * (state.rate_m2_d2 + wander / 2),
         state.rate_m2_d2 + wander,
+    )
+
+
+def shifted(state: LevelRate, motion: Motion) -> LevelRate:
+    """Return the state after what the class did: the cell has as much of its daily wave as of its mean rate.
+
+    Where the class moves more slowly than the rate of the cell is uncertain, the cell moves as the class.
+    Source: equations.md, 6.12.
+    """
+    squared = motion.mean_rate_m_d**2 + state.rate_m2_d2
+    with np.errstate(invalid="ignore"):
+        share = (motion.mean_rate_m_d * state.rate_m_d + state.rate_m2_d2) / squared
+    share = np.clip(share, 0.0, MAX_SHARE)
+    return replace(
+        state,
+        level_m=state.level_m + share * motion.anomaly_m + motion.surge_m,
+        rate_m_d=state.rate_m_d + share * motion.faster_m_d,
     )
 
 
@@ -135,7 +164,13 @@ class CellFilter:
         return random_m**2, systematic_m**2
 
     def advance(
-        self, days: float, noise: ProcessNoise, change_m: Floats, random_m2: Floats, systematic_m2: Floats
+        self,
+        days: float,
+        noise: ProcessNoise,
+        motion: Motion,
+        change_m: Floats,
+        random_m2: Floats,
+        systematic_m2: Floats,
     ) -> Bools:
         """Take the next scan, some days after the last one, and return the cells where a step is confirmed.
 
@@ -145,7 +180,8 @@ class CellFilter:
         """
         if days < 0:
             raise ValueError(f"a scan {-days:g} d before the last one: scans must be in order of time")
-        state = predict(self.estimates(), days, noise)
+        state = shifted(predict(self.estimates(), days, noise), motion)
+        change_m = change_m - motion.common_error_m
         variance_m2 = random_m2 + systematic_m2
         observed = np.isfinite(change_m) & np.isfinite(variance_m2)
         is_first = observed & np.isnan(state.level_m)

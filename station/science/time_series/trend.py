@@ -46,7 +46,7 @@ def fit_trend(time_s: Floats, change_m: Floats, sigma_m: Floats, common_share: f
     def last_coefficient(degree: int) -> tuple[float, float]:
         weights = np.linalg.pinv(np.vander(day, degree + 1, increasing=True))[degree]
         variance = max(float(weights @ covariance_m2 @ weights) for covariance_m2 in covariances_m2)
-        return float(weights @ change_m), float(np.sqrt(variance))
+        return float(weights @ change_m), float(np.sqrt(max(variance, 0.0)))  # rounding
 
     rate_m_d, rate_sigma_m_d = last_coefficient(1)
     if len(time_s) <= MIN_EPOCHS:
