@@ -1,6 +1,7 @@
 """Levels as files: the same bits live, late, interrupted and rebuilt, and only what changed is written."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import netCDF4
 import numpy as np
@@ -13,6 +14,9 @@ from station.archive.epochs import write_epoch
 from station.archive.netcdf_layout import Series
 from station.archive.reference_files import write_reference
 from station.archive.series.virtual import build_series
+from station.errors import StationError
+from station.products.area_tables import Span
+from station.products.export import export
 from station.quantities import Grid, Reference
 from station.queries.levels import update_levels
 
@@ -158,3 +162,18 @@ def test_files_are_what_cf_wants(rebuilt):
         assert float(month["epoch_count"][0]) == 8
         assert "steps included" in month["rate"].comment
         assert "without steps" in day["rate"].comment
+
+
+def test_export_as_geotiff(rebuilt, tmp_path):
+    rasterio = pytest.importorskip("rasterio")
+    site = SimpleNamespace(station=SimpleNamespace(data=rebuilt.folder))
+    paths = export(site, "levels", None, tmp_path)
+    assert {path.name for path in paths} == {f"hef_20251202_{name}.tif" for name in LEVEL_NAMES}
+    newest = station.levels(rebuilt.folder, EVERYWHERE).isel(time=-2)
+    with rasterio.open(tmp_path / "hef_20251202_rate.tif") as raster:
+        assert raster.units == ("m d-1",)
+        assert np.array_equal(raster.read(1), newest.rate.values, equal_nan=True)
+    months = export(site, "levels", Span.parse("2025-11-01", "2025-11-02"), tmp_path)
+    assert {path.name for path in months} == {f"hef_202511_{name}.tif" for name in LEVEL_NAMES}
+    with pytest.raises(StationError, match="no day of levels"):
+        export(site, "levels", Span.parse("2024-11-01", "2024-11-02"), tmp_path)
