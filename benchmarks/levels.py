@@ -91,8 +91,8 @@ def station_filter(change_m: Floats) -> Estimates:
     estimates = np.empty((2, *change_m.shape))
     for index, scan_m in enumerate(change_m):
         days = HOUR_D if index else 0.0
-        noise = ground.advance(days, scan_m[sample], random_m2[sample], systematic_m2[sample])
-        cells.advance(days, noise, scan_m, random_m2 + systematic_m2)
+        noise, motion = ground.advance(days, scan_m[sample], random_m2[sample], systematic_m2[sample])
+        cells.advance(days, noise, motion, scan_m, random_m2, systematic_m2)
         state = cells.estimates()
         estimates[:, index] = state.level_m, state.rate_m_d
     return estimates[0], estimates[1]

@@ -7,7 +7,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 from station._version import __version__ as __version__
 
@@ -96,22 +96,28 @@ def volume(
     return volumes.volume_change(to_mask(area, volumes.series), volumes.find_epoch(epoch), other)
 
 
-def levels(site_or_folder: str | Path, area: str | npt.ArrayLike | shapely.Geometry) -> xr.Dataset:
+def levels(
+    site_or_folder: str | Path,
+    area: str | npt.ArrayLike | shapely.Geometry,
+    every: Literal["1D", "1M"] = "1D",
+) -> xr.Dataset:
     """Return level [m] and rate [m/d] of the cells of an area at the end of each day, with their uncertainty.
 
-    The level is the elevation change filtered over time, cell by cell, from all usable epochs of the newest
-    reference; the rate is its slope without steps. Both have a random uncertainty, independent between
-    cells, and a systematic one, which cells have in common. `filled` is 1 where the last epoch of the day did
-    not see the cell: its level is then extrapolated, with an uncertainty to match. `area` is that of
-    `station.volume`. Nothing is stored: every epoch is read. Raises StoreError if there is no series, no
-    reference or no usable epoch, StationError if there is no area of this name. Source: equations.md, 6.12.
+    The level is the elevation change filtered over time, cell by cell, from all usable epochs; the rate is
+    its slope without steps. Both have a random uncertainty, independent between cells, and a systematic one,
+    which cells have in common. `coverage` is the share of the day's epochs that saw the cell: where it is 0
+    the level is extrapolated, with an uncertainty to match. `area` is that of `station.volume`. Days in
+    `levels/` are read; the others are computed from their epochs, with the same values. With `every` "1M"
+    there is one entry for each month in `levels/`, and the rate is the mean of the month, steps included.
+    Raises StoreError if there is no series, no usable epoch with a reference or no such month, StationError
+    if there is no area of this name. Source: equations.md, 6.12.
     """
     from station.archive.series.index import series_in
     from station.queries.grid_arrays import to_mask
     from station.queries.levels import filter_levels
 
     series = series_in(site_or_folder)
-    return filter_levels(series, to_mask(area, series), lambda: None)
+    return filter_levels(series, to_mask(area, series), lambda: None, monthly=every == "1M")
 
 
 def point_covariance(

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from benchmarks import events
 from benchmarks.accuracy_measures import RECORD, SCALES, summarise
 from benchmarks.accuracy_rows import ROWS
 from benchmarks.accuracy_table import BEGIN, END, missed, write_markdown
@@ -189,3 +190,11 @@ def test_filter_of_levels_is_as_good_as_a_plain_one_and_keeps_steps():
     assert quiet["station"] == pytest.approx(quiet["plain Kalman"], rel=0.15)
     assert quiet["station"] < quiet["single scans"] / 3
     assert avalanche["station"] < avalanche["plain Kalman"] / 3
+
+
+def test_events_of_the_table_are_found_by_the_station_and_none_in_a_quiet_series():
+    total = events.Score()
+    for seed, area_m2 in ((1, 1000), (2, 0)):
+        series = events.simulate(seed, 60, 36, area_m2)
+        events.score(series, events.station_objects(series), total, 1)
+    assert (total.found, total.events, total.false_alarms, total.hours) == (1, 1, 0, 72)

@@ -34,6 +34,7 @@ class ExportFormat(StrEnum):
     stac = "stac"
     points = "points"
     transformations = "transformations"
+    levels = "levels"
     netcdf = "netcdf"
     zarr = "zarr"
     references = "references"
@@ -47,6 +48,7 @@ OF_EPOCHS = {
     ExportFormat.stac,
     ExportFormat.points,
     ExportFormat.transformations,
+    ExportFormat.levels,
 }  # the others are of the series
 
 
@@ -66,7 +68,7 @@ def export(
     kind: Annotated[
         ExportFormat,
         typer.Argument(
-            metavar="geotiff|csv|stac|points|transformations|netcdf|zarr|references|ncml|erddap",
+            metavar="geotiff|csv|stac|points|transformations|levels|netcdf|zarr|references|ncml|erddap",
             help="The format.",
             show_default=False,
         ),
@@ -118,7 +120,8 @@ def export(
     QGIS styles, a STAC catalogue of these, or scans and areas as CSV.
     points: the scans of these epochs as LAZ or COPC, corrected, on the map, each point with change, sigma and
     quality of its cell. transformations: how the scanner had moved at these epochs, as 4 x 4 matrices, and
-    their covariance.
+    their covariance. levels: level and rate of each cell as GeoTIFF, of the newest day that is over, or of
+    the days and months of a span.
     """
     from station.config import read_site
     from station.products.area_tables import Span

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from station.config import Site
 
 MAX_LISTED = 50  # scans of a kind, in the text
-MIRROR_FAULT = ".mirror_fault"  # file in the data folder: why the mirror could not be renewed
+RENEWALS = {"mirror": "the mirror is", "levels": "the files of levels are"}  # in the background, by name
 Status = dict[str, Any]  # printed by `station status --json`
 
 
@@ -91,7 +91,7 @@ def _queue_status(site: Site, journal: JournalReader, entries: list[Entry]) -> S
         clock_problem(site.station.data, time.time()),
         *site.input_faults,
         weather_fault(site),
-        _mirror_fault(site),
+        *(_renewal_fault(site, name) for name in RENEWALS),
         pause_reason(site.station.data),
     )
     return {
@@ -101,13 +101,19 @@ def _queue_status(site: Site, journal: JournalReader, entries: list[Entry]) -> S
     }
 
 
-def _mirror_fault(site: Site) -> str:
-    """Return why the service could not renew the mirror; '' if it could, or there is none."""
+def fault_file(site: Site, name: str) -> Path:
+    """Return the file that says why the service could not renew the files of RENEWALS with this name."""
+    return site.station.data / f".{name}_fault"
+
+
+def _renewal_fault(site: Site, name: str) -> str:
+    """Return why the service could not renew some files; '' if it could, or is not to."""
+    is_wanted = {"mirror": site.mirror is not None, "levels": site.products.levels}[name]
     try:
-        fault = (site.station.data / MIRROR_FAULT).read_text(encoding="utf-8") if site.mirror else ""
+        fault = fault_file(site, name).read_text(encoding="utf-8") if is_wanted else ""
     except (OSError, ValueError):
         return ""
-    return fault and f"the mirror is not up to date: {fault}"
+    return fault and f"{RENEWALS[name]} not up to date: {fault}"
 
 
 def _service_state(data: Path) -> str:

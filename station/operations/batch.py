@@ -36,6 +36,7 @@ def process_scans(site: Site, scans: Sequence[Path], report: Report) -> int:
                 report(entry)
             requeued = {other.name for other in journal.waiting() if other.state is State.WAITING} - set(todo)
             todo[:0] = [name for name in files if name in requeued]  # before later scans, as in the service
+        worker.finish_levels(verify=False)
         states = {other.state for other in journal.rows() if other.name in files}
     if State.SET_ASIDE in states:
         return ScanError.exit_status

@@ -143,6 +143,8 @@ class Reprocessing(_Planning):
             finally:
                 if todo:
                     self._publish()
+                if not self._was_stopped:
+                    self._finish_levels()
         finally:
             executor.close()
         if self._was_stopped:
@@ -275,6 +277,11 @@ class Reprocessing(_Planning):
             self._worker.compact()
             self._worker.store.reconcile()
             self._worker.publish()
+
+    def _finish_levels(self) -> None:
+        """Bring the files of levels up to date, also where one is damaged or an epoch came late."""
+        with self._console.status("filtering levels …"):
+            self._worker.finish_levels(verify=True)
 
     def _progress_bar(self) -> Progress:
         columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())

@@ -18,6 +18,7 @@ from station.archive.atomic_files import DAMAGED
 from station.archive.derived.boxes import BOXES, DAILY
 from station.archive.derived.event_table import FILE_NAME as EVENTS
 from station.archive.derived.fingerprints import is_intact as is_derived_intact
+from station.archive.derived.level_files import damaged_levels
 from station.archive.epochs import (
     EpochRef,
     compacted_files,
@@ -277,7 +278,11 @@ def _check_derived(series: Series) -> list[tuple[str, str, str]]:
     derived = [series.folder / name for name in (AREAS, BOXES, DAILY, EVENTS)]
     paths += [path for path in derived if path.exists() and not is_derived_intact(path)]
     message = "damaged: the service restores it with the next scan"
-    return [("fault", "file", f"{path.relative_to(series.folder)}: {message}") for path in paths]
+    findings = [("fault", "file", f"{path.relative_to(series.folder)}: {message}") for path in paths]
+    message = "damaged: station reprocess computes it again"
+    return findings + [
+        ("fault", "file", f"{path.relative_to(series.folder)}: {message}") for path in damaged_levels(series)
+    ]
 
 
 def _check_series(series: Series, refs: list[EpochRef], *, is_complete: bool) -> list[tuple[str, str, str]]:

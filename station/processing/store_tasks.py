@@ -10,6 +10,7 @@ from pathlib import Path
 
 from station.archive import compaction, epochs
 from station.archive.areas import update_areas
+from station.archive.derived.level_files import damaged_levels, delete_levels
 from station.archive.reference_files import repair_reference_link
 from station.archive.series.manifest import source_count
 from station.archive.series.virtual import build_series
@@ -21,6 +22,7 @@ from station.processing.workers.worker_process import Progress
 from station.queries.aggregates import Aggregates
 from station.queries.blocks import BlockQueries, update_boxes
 from station.queries.events import EventQueries
+from station.queries.levels import update_levels
 
 Checksums = dict[str, str]  # SHA-256 by file, relative to the data folder
 
@@ -50,6 +52,29 @@ def update_series(site: Site, progress: Progress) -> int:
     except (OSError, RuntimeError) as error:
         raise StoreError(f"{series.folder}: an epoch is damaged: {error}") from error
     return compaction.count_compactable(series)
+
+
+def update_stored_levels(site: Site, verify: bool, progress: Progress) -> int:  # noqa: FBT001 - a task
+    """Bring the files of levels up to date; return the number of files written.
+
+    With `verify`, damaged ones are replaced. Raises StoreError if an epoch is damaged.
+    """
+    series = series_for(site)
+    for path in damaged_levels(series) if verify else ():
+        delete_levels(path)
+    try:
+        return update_levels(series, progress)
+    except (OSError, RuntimeError) as error:
+        raise StoreError(f"{series.folder}: an epoch is damaged: {error}") from error
+
+
+def renew_levels(site: Site, progress: Progress) -> str:
+    """Bring the files of levels up to date; return why they could not be, or ''."""
+    try:
+        update_stored_levels(site, False, progress)
+    except StoreError as error:
+        return str(error)
+    return ""
 
 
 def compact_epochs(

@@ -11,6 +11,7 @@ import numpy as np
 
 from station._version import __version__
 from station.archive.atomic_files import atomic_write
+from station.archive.derived.level_files import LEVEL_VARIABLES, level_raster
 from station.archive.epochs import EpochRef
 from station.archive.netcdf_layout import Series
 from station.errors import StationError
@@ -47,7 +48,28 @@ def export_geotiff(series: Series, epoch: EpochRef, folder: Path, limit_m: float
     return paths
 
 
-def write_cog(path: Path, series: Series, values: Any, description: str, tags: dict[str, str]) -> None:  # noqa: ANN401
+def export_levels(series: Series, source: Path, folder: Path) -> list[Path]:
+    """Write the variables of a file of levels into a folder, one GeoTIFF for each; return them.
+
+    Raises StationError if rasterio is not installed, StoreError if a file is damaged or cannot be written.
+    """
+    paths = []
+    for spec in LEVEL_VARIABLES:
+        path = folder / f"{source.stem.rpartition('_')[0]}_{spec.name}.tif"
+        tags = {"station": series.station_id, "source": source.name, "software": f"station {__version__}"}
+        write_cog(path, series, level_raster(source, spec.name)[:], spec.long_name, tags, spec.units or "1")
+        paths.append(path)
+    return paths
+
+
+def write_cog(
+    path: Path,
+    series: Series,
+    values: Any,  # noqa: ANN401
+    description: str,
+    tags: dict[str, str],
+    units: str = "m",
+) -> None:
     """Write a raster as a COG of GDAL: tiled, with overviews by mean, the coarsest first in the file."""
     try:
         import rasterio  # noqa: PLC0415 - an extra
@@ -71,7 +93,7 @@ def write_cog(path: Path, series: Series, values: Any, description: str, tags: d
             with memory.open(**profile) as raster:
                 raster.write(values, 1)
                 raster.set_band_description(1, description)
-                raster.set_band_unit(1, "m")
+                raster.set_band_unit(1, units)
                 raster.update_tags(AREA_OR_POINT="Area", **tags)
             with atomic_write(path) as tmp_path, memory.open() as raster:
                 copy(

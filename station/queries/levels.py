@@ -1,217 +1,292 @@
-"""Filtered level and rate of the cells of an area at the end of each day, from the epochs of a store."""
+"""Level and rate of cells at the end of each day and month: as products of the store, and of an area.
+
+Days depend on those before them since the newest state of the filter that is kept, and on nothing else: live,
+late and rebuilt stores contain the same bits. Source: equations.md, 6.12.
+"""
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from datetime import UTC, datetime
+from itertools import groupby
+from pathlib import Path
 
 import numpy as np
 import xarray as xr
 
+from station.archive.derived.level_files import (
+    LEVEL_NAMES,
+    LEVEL_VARIABLES,
+    LevelPeriod,
+    decoded,
+    delete_other_files,
+    delete_states,
+    encoded,
+    has_state,
+    is_current,
+    level_path,
+    level_raster,
+    read_state,
+    write_levels,
+    write_state,
+)
 from station.archive.epochs import EpochRef
-from station.archive.netcdf_layout import Series
-from station.archive.raster_io import LazyRaster
-from station.archive.schema import FILL
+from station.archive.netcdf_layout import Series, attributes
 from station.archive.series.index import SeriesIndex, references_and_usable
 from station.errors import StoreError
-from station.quantities import Bools, Floats, Floats32, Ints, Reference
-from station.queries.aggregates import Aggregates
-from station.queries.common_errors import common_error_share
-from station.queries.epoch_cells import CHANGE, RANDOM, bounding_box
-from station.science.time_series.cell_filter import CellFilter, ProcessNoise
-from station.science.time_series.class_filter import SAMPLE_CELLS, ClassFilter
-from station.science.time_series.filter_errors import filter_errors
+from station.quantities import Bools, Floats32
+from station.queries.blocks import BlockQueries
+from station.queries.epoch_cells import EpochReader, bounding_box
+from station.queries.level_filter import DAY_S, LevelFilter
 
-DAY_S = 86_400.0
-BLOCK_CELLS = 50_000  # filtered at once
-BAND_ROWS = 128  # read at once
-MIN_RANDOM_SHARE = 0.01  # of the random variance of a change that is the scan's, at least
-LEVEL_VARIABLES = {
-    "level": ("m", "elevation above the reference surface, filtered"),
-    "level_random_uncertainty": ("m", "random uncertainty of the level, independent between cells"),
-    "level_systematic_uncertainty": ("m", "uncertainty of the level that cells have in common"),
-    "rate": ("m d-1", "rate of the level without steps"),
-    "rate_random_uncertainty": ("m d-1", "random uncertainty of the rate, independent between cells"),
-    "rate_systematic_uncertainty": ("m d-1", "uncertainty of the rate that cells have in common"),
-}
+FORMAT = 1  # of the filter: another one computes all files again
+RECENT_DAYS = 3  # whose states are kept, besides those of the last days of months
+Progress = Callable[[], None]
 
 
 @dataclass(frozen=True)
-class _Observations:
-    """Change and variances of an epoch at cells (n,), NaN where there is none."""
+class LevelDay:
+    """A day with usable epochs, and those epochs, which have one reference."""
 
-    change_m: Floats32
-    random_m2: Floats32  # without the reference's
-    systematic_m2: Floats32
-
-    def take(self, index: Ints | slice) -> tuple[Floats, Floats, Floats]:
-        """Return change and variances of some cells in double precision."""
-        change_m, random_m2, systematic_m2 = (
-            values[index].astype(np.float64) for values in vars(self).values()
-        )
-        return change_m, random_m2, systematic_m2
+    period: LevelPeriod
+    epochs: list[EpochRef]
+    is_first: bool  # of its reference
 
 
-def filter_levels(series: Series, cells: Bools, progress: Callable[[], None]) -> xr.Dataset:
-    """Return level and rate of the cells (ny, nx) of an area at the last epoch of each day, on their rows.
+def level_days(series: Series) -> list[LevelDay]:
+    """Return the days of a series that have usable epochs, the last one included, which may not be over.
 
-    Takes the usable epochs of the newest reference in order of time. The noise of the surface is learned
-    from cells of the whole grid, so that a cell has the same level in any area. `filled` is 1 where the last
-    epoch did not see the cell. `progress` is called after each epoch. Raises StoreError if there is no
-    reference, or no usable epoch. Source: equations.md, 6.12.
+    The epochs of a day are those of the reference of its last one, as in `daily.nc`.
     """
-    aggregates = Aggregates(series)
-    reference = aggregates.reference()
-    epochs = _usable_epochs(series, reference.version)
-    filters = _AreaFilter(reference, cells)
-    common_share = common_error_share(aggregates, cells, epochs)
-    days: list[tuple[float, dict[str, Floats]]] = []
-    for index, epoch in enumerate(epochs):
-        filters.advance(epoch)
-        is_last = index == len(epochs) - 1 or epochs[index + 1].time_s // DAY_S > epoch.time_s // DAY_S
-        if is_last:
-            days.append((epoch.time_s, filters.products(common_share)))
-        progress()
-    return _to_dataset(series, cells, days)
-
-
-def _usable_epochs(series: Series, version: str) -> list[EpochRef]:
     index = SeriesIndex(series)
+    if not len(index):
+        return []
     versions, usable = references_and_usable(series)
-    chosen = np.flatnonzero(usable & (versions == version.encode()))
-    epochs = [index[position] for position in chosen.tolist()]
-    if not epochs:
-        raise StoreError(f"{series.folder}: no usable epoch of the newest reference yet: no levels")
-    return epochs
-
-
-class _AreaFilter:
-    """Filters of the cells of an area, and of the classes of cells of the grid."""
-
-    def __init__(self, reference: Reference, cells: Bools) -> None:
-        known = np.isfinite(np.asarray(reference.elevation_m))
-        self._cell = np.flatnonzero(cells & known)
-        variance_m2 = np.asarray(reference.random_variance_m2)
-        classes = _classes(known, np.asarray(reference.stable), variance_m2)
-        self._class = classes.ravel()[self._cell]
-        samples = [_spread(np.flatnonzero(classes == number)) for number in range(int(classes.max()) + 1)]
-        stable = np.asarray(reference.stable).ravel()
-        self._classes = [ClassFilter(len(sample), stable=bool(stable[sample].all())) for sample in samples]
-        self._sample = np.concatenate(samples)
-        self._bounds = np.cumsum([0, *map(len, samples)])
-        self._read_cells = np.union1d(self._cell, self._sample)
-        self._reference_m2 = variance_m2.ravel()[self._read_cells].astype(np.float32)
-        self._filters = [CellFilter.empty(block.stop - block.start) for block in self._blocks()]
-        self._last_m2 = np.zeros((2, len(self._cell)), np.float32)  # of the last observation
-        self._area = np.searchsorted(self._read_cells, self._cell)
-        self._samples = np.searchsorted(self._read_cells, self._sample)
-        self._nx = cells.shape[1]
-        self._time_s: float | None = None
-        self._cells = cells
-
-    def _blocks(self) -> Iterator[slice]:
-        for first in range(0, len(self._cell), BLOCK_CELLS):
-            yield slice(first, min(first + BLOCK_CELLS, len(self._cell)))
-
-    def advance(self, epoch: EpochRef) -> None:
-        """Take the next epoch in order of time."""
-        days = 0.0 if self._time_s is None else (epoch.time_s - self._time_s) / DAY_S
-        self._time_s = epoch.time_s
-        observations = self._read(epoch)
-        noises = []
-        for number, ground in enumerate(self._classes):
-            sample = self._samples[self._bounds[number] : self._bounds[number + 1]]
-            noises.append(ground.advance(days, *observations.take(sample)))
-        level_m2_d, rate_m2_d3 = (
-            np.array([getattr(noise, name) for noise in noises]) for name in ("level_m2_d", "rate_m2_d3")
+    chosen = np.flatnonzero(usable & (versions != b"")).tolist()
+    days: list[LevelDay] = []
+    for number, positions in groupby(chosen, lambda position: index.start_s[position] // DAY_S):
+        day = list(positions)
+        version = versions[day[-1]]
+        day = [position for position in day if versions[position] == version]
+        before = days[-1].period if days else None
+        is_first = before is None or before.version != version.decode()
+        names = b"\n".join(index.epoch_file[day].tolist())
+        key = b"" if before is None or is_first else before.key.encode()
+        text = b"\n".join([str(FORMAT).encode(), key, version, names])
+        first, last = index.start_s[day[0]], index.time_s[day[-1]]
+        period = LevelPeriod(
+            name=f"{datetime.fromtimestamp(number * DAY_S, UTC):%Y%m%d}",
+            key=hashlib.sha256(text).hexdigest(),
+            version=version.decode(),
+            start_s=float(first),
+            end_s=float(2 * last - index.start_s[day[-1]]),
+            time_s=float(last),
+            epoch_count=len(day),
         )
-        for block, cell_filter in zip(self._blocks(), self._filters, strict=True):
-            change_m, random_m2, systematic_m2 = observations.take(self._area[block])
-            classes = self._class[block]
-            noise = ProcessNoise(level_m2_d[classes], rate_m2_d3[classes])
-            cell_filter.advance(days, noise, change_m, random_m2 + systematic_m2)
-            seen = np.isfinite(change_m)
-            for kept, variance_m2 in zip(self._last_m2, (random_m2, systematic_m2), strict=True):
-                np.copyto(kept[block], variance_m2, where=seen, casting="same_kind")
-
-    def _read(self, epoch: EpochRef) -> _Observations:
-        names = CHANGE, RANDOM, f"{CHANGE}_uncertainty"
-        rasters = [LazyRaster(epoch.path, name, index=epoch.index) for name in names]
-        row, column = np.divmod(self._read_cells, self._nx)
-        values = np.empty((len(rasters), len(row)), np.float32)
-        for top in range(0, rasters[0].shape[0], BAND_ROWS):
-            band = slice(*np.searchsorted(row, (top, top + BAND_ROWS)))
-            if band.start < band.stop:
-                for kept, raster in zip(values, rasters, strict=True):
-                    kept[band] = raster[top : top + BAND_ROWS][row[band] - top, column[band]]
-        values[values == np.float32(FILL)] = np.nan
-        change_m, random_m, total_m = values
-        own_m2 = np.maximum(random_m**2 - self._reference_m2, MIN_RANDOM_SHARE * random_m**2)
-        return _Observations(change_m, own_m2, np.maximum(total_m**2 - random_m**2, 0))
-
-    def products(self, common_share: float) -> dict[str, Floats]:
-        """Return the variables at the area's known cells (n,); `filled` is 1 where it was not observed."""
-        columns: dict[str, list[Floats]] = {name: [] for name in (*LEVEL_VARIABLES, "filled")}
-        for block, cell_filter in zip(self._blocks(), self._filters, strict=True):
-            state = cell_filter.estimates()
-            unseen_d = cell_filter.cells["unseen_min"] / 1440
-            random_m2, systematic_m2 = self._last_m2[:, block].astype(np.float64)
-            variances = np.full((4, len(unseen_d)), np.nan)
-            for number in np.unique(self._class[block]).tolist():
-                shares, inside = self._classes[number].shares, self._class[block] == number
-                if shares is not None:
-                    errors = filter_errors(
-                        state.take(inside),
-                        unseen_d[inside],
-                        random_m2[inside],
-                        systematic_m2[inside] * (1 - common_share),
-                        shares,
-                    )
-                    variances[:, inside] = list(vars(errors).values())
-            variances[0] += self._reference_m2[self._area[block]]
-            variances[1] += common_share * systematic_m2
-            sigmas = np.sqrt(variances)
-            filled = np.where(np.isnan(state.level_m), np.nan, unseen_d > 0)
-            sigmas[:, np.isnan(state.level_m)] = np.nan
-            rate_m_d = np.where(np.isnan(state.level_m), np.nan, state.rate_m_d)
-            values = state.level_m, *sigmas[:2], rate_m_d, *sigmas[2:], filled
-            for column, value in zip(columns.values(), values, strict=True):
-                column.append(value)
-        return {name: self._on_area(np.concatenate([[], *parts])) for name, parts in columns.items()}
-
-    def _on_area(self, values: Floats) -> Floats:
-        """Return values of the known cells at all cells of the area, row by row."""
-        all_values = np.full(self._cells.size, np.nan, np.float32)
-        all_values[self._cell] = values
-        return np.asarray(all_values[self._cells.ravel()])
+        days.append(LevelDay(period, [index[position] for position in day], is_first))
+    return days
 
 
-def _classes(known: Bools, stable: Bools, variance_m2: Floats32) -> Ints:
-    """Return the class of each cell (ny, nx): by ground and octave of the reference's σ; -1 if not known."""
-    sigma_m = np.sqrt(variance_m2, where=known, out=np.ones(known.shape, np.float32))
-    octave = np.round(np.log2(np.maximum(sigma_m, 1e-4)))
-    low, high = np.percentile(octave[known], (2, 98)) if known.any() else (0, 0)
-    number = 2 * np.clip(octave, low, high) + stable
-    classes = np.full(known.shape, -1)
-    classes[known] = np.unique(number[known], return_inverse=True)[1]
-    return classes
+class _Passage:
+    """A filter that goes through days in their order, and begins at the newest state that helps."""
+
+    def __init__(self, series: Series, days: list[LevelDay], area: Bools | None, progress: Progress) -> None:
+        self._series, self._days, self._area, self._progress = series, days, area, progress
+        self._blocks, self._reader = BlockQueries(series), EpochReader(series)
+        self._filter: LevelFilter | None = None
+        self._next = 0  # day that the filter takes next
+
+    def reach(
+        self, number: int, on_day: Callable[[LevelDay, LevelFilter], None] | None = None
+    ) -> LevelFilter:
+        """Return the filter at the end of a day; `on_day` is called at the end of each day on the way."""
+        first = self._start(number)
+        for day in self._days[first : number + 1]:
+            if day.is_first:
+                self._filter = self._empty(day)
+            assert self._filter is not None  # noqa: S101 - the first day of a reference made one
+            self._filter.take_day(day.epochs, self._progress)
+            if on_day is not None:
+                on_day(day, self._filter)
+        self._next = number + 1
+        assert self._filter is not None  # noqa: S101
+        return self._filter
+
+    def _empty(self, day: LevelDay) -> LevelFilter:
+        return LevelFilter(self._reader.reference(day.period.version), self._blocks, self._area)
+
+    def _start(self, number: int) -> int:
+        """Return the day to begin with, on the way to another one, and restore the state before it."""
+        for first in range(number, -1, -1):
+            if self._days[first].is_first or (first == self._next and self._filter is not None):
+                return first
+            before = self._days[first - 1].period
+            arrays = read_state(self._series, before) if has_state(self._series, before) else None
+            if arrays is not None:
+                self._filter = self._empty(self._days[first])
+                self._filter.restore(arrays)
+                return first
+        return 0
 
 
-def _spread(cells: Ints) -> Ints:
-    """Return a sample of cells, spread evenly."""
-    return cells[np.linspace(0, len(cells) - 1, min(len(cells), SAMPLE_CELLS)).astype(np.int64)]
+def update_levels(series: Series, progress: Progress) -> int:
+    """Bring the files of levels up to date with the epochs; return the number of files written.
+
+    A day is written when a later one has begun, a month likewise. A late or changed epoch changes the days
+    after it, which are written again from the newest state before it. `progress` is called after each epoch
+    read. Raises StoreError if an epoch is damaged or a file cannot be written.
+    """
+    days = level_days(series)
+    closed = [day for day in days if day.period.name < days[-1].period.name]
+    passage = _Passage(series, closed, None, progress)
+    kept = _with_kept_state([day.period for day in closed])
+    written = 0
+
+    def keep_state(day: LevelDay, level_filter: LevelFilter) -> None:
+        if day.period in kept and not has_state(series, day.period):
+            write_state(series, day.period, level_filter.to_arrays())
+
+    for number, day in enumerate(closed):
+        if not is_current(series, day.period):
+            _write_day(series, day.period, passage.reach(number, keep_state))
+            written += 1
+    months = _closed_months([day.period for day in days])
+    for month, parts, before in months:
+        if not is_current(series, month):
+            _write_month(series, month, parts, before)
+            written += 1
+            progress()
+    delete_other_files(series, [*(day.period for day in closed), *(month for month, _, _ in months)])
+    delete_states(series, kept)
+    return written
 
 
-def _to_dataset(series: Series, cells: Bools, days: list[tuple[float, dict[str, Floats]]]) -> xr.Dataset:
+def _write_day(series: Series, period: LevelPeriod, level_filter: LevelFilter) -> None:
+    write_levels(series, period, lambda rows: encoded(level_filter.rasters(rows)))
+
+
+def _with_kept_state(periods: list[LevelPeriod]) -> list[LevelPeriod]:
+    """Return the days whose states are kept: the newest, and the last of each month."""
+    month_ends = [list(group)[-1] for _, group in groupby(periods, lambda period: period.name[:6])]
+    return [period for period in periods if period in month_ends or period in periods[-RECENT_DAYS:]]
+
+
+def _closed_months(
+    periods: list[LevelPeriod],
+) -> list[tuple[LevelPeriod, list[LevelPeriod], LevelPeriod | None]]:
+    """Return the months that are over, the days of each that have its reference, and the day before them."""
+    months = []
+    newest = periods[-1].name[:6] if periods else ""
+    for name, group in groupby(periods, lambda period: period.name[:6]):
+        if name == newest:
+            continue
+        days = list(group)
+        days = [day for day in days if day.version == days[-1].version]
+        position = periods.index(days[0])
+        before = periods[position - 1] if position else None
+        if before is not None and before.version != days[-1].version:
+            before = None
+        keys = "\n".join([before.key if before else "", *(day.key for day in days)])
+        month = replace(
+            days[-1],
+            name=name,
+            key=hashlib.sha256(keys.encode()).hexdigest(),
+            start_s=days[0].start_s,
+            epoch_count=sum(day.epoch_count for day in days),
+        )
+        months.append((month, days, before))
+    return months
+
+
+def _write_month(
+    series: Series, month: LevelPeriod, days: list[LevelPeriod], before: LevelPeriod | None
+) -> None:
+    """Write a month: the level at its end, and the mean rate since the end of the month before.
+
+    Without one, the rate is that since its first day. Source: equations.md, 6.12.
+    """
+    start, end = before or days[0], days[-1]
+    first, last = (
+        {name: level_raster(level_path(series, day), name) for name in LEVEL_NAMES} for day in (start, end)
+    )
+    coverage = [level_raster(level_path(series, day), "coverage") for day in days]
+    reference = EpochReader(series).reference(month.version)
+    elapsed_d = (end.time_s - start.time_s) / DAY_S
+
+    def get_rows(rows: slice) -> dict[str, Floats32]:
+        begin, rasters = (
+            {name: np.asarray(raster[rows]) for name, raster in source.items()} for source in (first, last)
+        )
+        reference_m2 = np.asarray(reference.random_variance_m2[rows])
+        observed = sum(
+            np.nan_to_num(np.asarray(part[rows])) * day.epoch_count
+            for part, day in zip(coverage, days, strict=True)
+        )
+        if elapsed_d > 0:
+            random, systematic = (f"level_{kind}_uncertainty" for kind in ("random", "systematic"))
+            own_m2 = (np.maximum(part[random] ** 2 - reference_m2, 0) for part in (begin, rasters))
+            rasters["rate"] = (rasters["level"] - begin["level"]) / elapsed_d
+            rasters["rate_random_uncertainty"] = np.sqrt(sum(own_m2)) / elapsed_d
+            rasters["rate_systematic_uncertainty"] = (
+                np.hypot(begin[systematic], rasters[systematic]) / elapsed_d
+            )
+        never = np.isnan(rasters["level"])
+        rasters["coverage"] = np.where(never, np.nan, observed / month.epoch_count)
+        return encoded(rasters)
+
+    write_levels(series, month, get_rows)
+
+
+def filter_levels(series: Series, cells: Bools, progress: Progress, *, monthly: bool = False) -> xr.Dataset:
+    """Return level and rate of the cells (ny, nx) of an area at the end of each day, or of each stored month.
+
+    Stored days are read; others are filtered from the epochs, with the same result. `progress` is called
+    after each epoch read. Raises StoreError if there is no usable epoch with a reference, or no stored month.
+    """
+    days = level_days(series)
+    if not days:
+        raise StoreError(f"{series.folder}: no usable epoch with a reference yet: no levels")
+    window = bounding_box(cells, 0)
+    if monthly:
+        months = [month for month, _, _ in _closed_months([day.period for day in days])]
+        months = [month for month in months if is_current(series, month)]
+        if not months:
+            raise StoreError(f"{series.folder}: no month of levels is stored: see products.levels")
+        return _to_dataset(
+            series, cells, months, (_read_window(level_path(series, month), window) for month in months)
+        )
+    passage = _Passage(series, days, cells, progress)
+
+    def rasters_of_days() -> Iterator[dict[str, Floats32]]:
+        for number, day in enumerate(days):
+            if is_current(series, day.period):
+                yield _read_window(level_path(series, day.period), window)
+                continue
+            rasters = encoded(passage.reach(number).rasters(window[0]))
+            yield {name: decoded(values[:, window[1]]) for name, values in rasters.items()}
+
+    return _to_dataset(series, cells, [day.period for day in days], rasters_of_days())
+
+
+def _read_window(path: Path, window: tuple[slice, slice]) -> dict[str, Floats32]:
+    return {name: np.asarray(level_raster(path, name)[window]) for name in LEVEL_NAMES}
+
+
+def _to_dataset(
+    series: Series, cells: Bools, periods: list[LevelPeriod], rasters: Iterator[dict[str, Floats32]]
+) -> xr.Dataset:
     rows, columns = bounds = bounding_box(cells, 0)
     inside = cells[bounds]
-    time = np.array([round(time_s * 1000) for time_s, _ in days], "M8[ms]").astype("M8[ns]")
-    coordinates = {"time": time, "y": series.grid.y_m[rows], "x": series.grid.x_m[columns]}
-    dataset = xr.Dataset(coords=coordinates)
-    attributes = LEVEL_VARIABLES | {"filled": ("1", "1 where the last epoch did not see the cell")}
-    for name, (units, long_name) in attributes.items():
-        rasters = np.full((len(days), *inside.shape), np.nan, np.float32)
-        for raster, (_, values) in zip(rasters, days, strict=True):
-            raster[inside] = values[name]
-        dataset[name] = ("time", "y", "x"), rasters, {"units": units, "long_name": long_name}
+    time = np.array([round(period.time_s * 1000) for period in periods], "M8[ms]").astype("M8[ns]")
+    dataset = xr.Dataset(coords={"time": time, "y": series.grid.y_m[rows], "x": series.grid.x_m[columns]})
+    stacked = {name: np.full((len(periods), *inside.shape), np.nan, np.float32) for name in LEVEL_NAMES}
+    for number, values in enumerate(rasters):
+        for name, raster in stacked.items():
+            raster[number][inside] = values[name][inside]
+    for spec in LEVEL_VARIABLES:
+        kept = ("long_name", "units", "comment")
+        attrs = {key: value for key, value in attributes(spec, series).items() if key in kept}
+        dataset[spec.name] = ("time", "y", "x"), stacked[spec.name], attrs
     return dataset

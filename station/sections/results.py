@@ -217,6 +217,7 @@ class ProductsSection(Section):
     quicklook_width_px: Annotated[int, Field(ge=400, le=4000)] = 1200
     change_limit_m: Positive | None = None
     cf_uncertainty: bool = False
+    levels: bool = False
 
 
 class MirrorSection(Section):

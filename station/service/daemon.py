@@ -50,7 +50,7 @@ class ScanProcessor(Protocol):
     def publish_compacted(self) -> None: ...  # noqa: D102
     def close(self) -> None: ...  # noqa: D102
     def run_maintenance(self) -> None: ...  # noqa: D102
-    def update_mirror(self) -> None: ...  # noqa: D102
+    def proceed_with_renewals(self) -> None: ...  # noqa: D102
 
 
 @dataclass(frozen=True)
@@ -189,7 +189,7 @@ class Daemon:
             return 0.0
         if state.first is None:
             self._housekeeping(worker)
-            worker.update_mirror()
+            worker.proceed_with_renewals()
             self._report_idle()
             return min(self._timing.period_s, state.next_s)
         self._systemd.status(f"measuring {state.first.name}, {state.queued - 1} more waiting")

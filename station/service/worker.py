@@ -31,15 +31,18 @@ from station.processing.store_tasks import (
     Checksums,
     compact_epochs,
     delete_expired,
+    renew_levels,
     update_series,
+    update_stored_levels,
 )
 from station.processing.usable_inputs import with_usable_inputs
 from station.processing.workers.worker_process import Progress
 from station.service.background_compaction import BackgroundCompaction
 from station.service.host import Host
-from station.service.mirror import BackgroundMirror, record_mirror_fault
+from station.service.mirror import update_mirror
 from station.service.publishing import publish
 from station.service.reference_builder import ReferenceBuilder
+from station.service.renewal import Renewal
 from station.service.retention import apply_retention, expired_scans
 from station.service.store_repair import StoreRepair, require_same_map
 
@@ -89,8 +92,14 @@ class Worker:
         self.store = StoreRepair(site, journal, self.run, self._host.clock)
         self._reference = ReferenceBuilder(site, journal, self.run, self.store, self._processed)
         self._compaction = BackgroundCompaction(site, on_compacted, self._host)
-        self._mirror = BackgroundMirror(site, self._host)
-        self._mirror_is_due, self._mirror_fault = site.mirror is not None, ""
+        self._renewals = [
+            Renewal(site, name, task, self._host)
+            for name, task, is_wanted in (
+                ("mirror", update_mirror, site.mirror is not None),
+                ("levels", renew_levels, site.products.levels),
+            )
+            if is_wanted
+        ]
 
     def process(self, scan: ScanFile, *, ahead: bool = False) -> bool:
         """Measure and store a scan, record it in journal and log; return True if it is stored.
@@ -133,8 +142,7 @@ class Worker:
             return self._set_aside(scan, result.reason, result.sha256, result.log_sha256)
         if isinstance(result, Duplicate):
             return self._record_duplicate(scan, result)
-        uncompacted = self.store.with_repair(update_series)
-        self._mirror_is_due = self._site.mirror is not None
+        uncompacted = self._update_series()
         record_result(self._journal, scan.name, result, ahead=ahead)
         _log_result(scan.name, result)
         self.publish(scan.name, result)
@@ -188,29 +196,35 @@ class Worker:
             self._record_compacted(checksums)
 
     def close(self) -> None:
-        """Stop background compaction and the renewal of the mirror."""
+        """Stop what runs in the background."""
         self._compaction.close()
-        self._mirror.close()
+        for renewal in self._renewals:
+            renewal.close()
 
-    def update_mirror(self) -> None:
-        """Renew the mirror in the background if the series has changed; a fault is only logged, once."""
-        fault = self._mirror.result()
-        if fault is not None and fault != self._mirror_fault:
-            if fault:
-                log.warning("%s", logfmt(mirror="failed", reason=fault))
-            else:
-                log.info("%s", logfmt(mirror="renewed"))
-            self._mirror_fault = fault
-        if fault is not None:
-            record_mirror_fault(self._site.station.data, fault)
-        if self._mirror_is_due and self._series.path.is_file() and self._mirror.start():
-            self._mirror_is_due = False
+    def proceed_with_renewals(self) -> None:
+        """Renew in the background what follows the series: the mirror, the files of levels."""
+        for renewal in self._renewals:
+            renewal.proceed()
+
+    def finish_levels(self, *, verify: bool) -> None:
+        """Bring the files of levels up to date without a running service, if there are to be any.
+
+        `verify` also replaces those that are damaged. Raises StoreError if an epoch is damaged.
+        """
+        if self._site.products.levels and self._series.path.is_file():
+            self.run(update_stored_levels, verify)
+
+    def _update_series(self) -> int:
+        """Update the series and what is derived from it; return the number of epochs to compact."""
+        uncompacted = self.store.with_repair(update_series)
+        for renewal in self._renewals:
+            renewal.require()
+        return uncompacted
 
     def _record_compacted(self, checksums: Checksums) -> None:
         if checksums:
             self._journal.add_checksums(checksums)
-            self.store.with_repair(update_series)
-            self._mirror_is_due = self._site.mirror is not None
+            self._update_series()
         self._write_digest()
 
     def _write_digest(self) -> None:
@@ -228,8 +242,7 @@ class Worker:
         """
         now_s = self._host.clock.now_s()
         if holds_epochs(self._series):
-            self.store.with_repair(update_series)
-            self._mirror_is_due = self._site.mirror is not None  # a fault may have gone
+            self._update_series()
         self._journal.drop_checksums(self.store.with_repair(delete_expired, now_s))
         affected = self.store.with_repair(late_inputs, self._journal.rows(State.STORED))
         finder = ScanFinder(self._site)

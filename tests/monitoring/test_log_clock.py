@@ -85,6 +85,7 @@ def test_status_lists_the_offset_among_the_faults(problem_of, tmp_path, monkeypa
         adjusts=True,
         weather=None,
         mirror=None,
+        products=SimpleNamespace(levels=False),
         input_faults=(),
     )
     assert any("clock of the logger" in fault for fault in status.status(site)["faults"])

@@ -1,7 +1,6 @@
-"""The mirror: renewed with new epochs, in the background; its faults are reported and stop nothing."""
+"""The mirror: its files follow the epochs, and a fault of one stops no other."""
 
 import json
-import time
 
 import pytest
 from support.epochs import make_epoch
@@ -11,11 +10,8 @@ from station.archive.series.virtual import build_series
 from station.config import read_site
 from station.errors import ConfigError
 from station.inbox.journal import Journal
-from station.monitoring.status import queue_status
 from station.processing.site_files import series_for
-from station.service.host import Host
-from station.service.mirror import BackgroundMirror, update_mirror
-from station.service.worker import Worker
+from station.service.mirror import update_mirror
 
 MIRROR = """
 [mirror]
@@ -78,71 +74,6 @@ def test_a_folder_that_cannot_be_written_is_a_fault_and_no_error(site):
     assert fault.count("File exists") == 3
 
 
-class Mirror:
-    """Finishes at once with the faults that it is given."""
-
-    def __init__(self, *faults):
-        self.faults, self.started = list(faults), 0
-
-    def start(self):
-        self.started += 1
-        return True
-
-    def result(self):
-        return self.faults.pop(0) if self.faults else None
-
-    def close(self):
-        pass
-
-
-def test_the_service_tells_a_fault_once_and_shows_it_until_it_is_gone(site, caplog):
-    caplog.set_level("INFO")
-    with Journal(site.station.data / "journal.sqlite") as journal:
-        worker = Worker(site, journal)
-        worker._mirror.close()
-        worker._mirror = mirror = Mirror("disk full", "disk full")
-        worker.update_mirror()
-        worker.update_mirror()
-        assert mirror.started == 1  # nothing was stored since
-        assert caplog.text.count("mirror=failed") == 1
-        assert "the mirror is not up to date: disk full" in queue_status(site)["faults"]
-        mirror.faults = [""]
-        worker.update_mirror()
-        assert "mirror=renewed" in caplog.text
-        assert not [fault for fault in queue_status(site)["faults"] if "mirror" in fault]
-        worker.close()
-
-
-def test_without_a_mirror_nothing_is_started(write_site):
-    plain = read_site(write_site())
-    with Journal(plain.station.data / "journal.sqlite") as journal:
-        worker = Worker(plain, journal)
-        store(plain, 1)
-        worker.update_mirror()
-        assert worker._mirror.result() is None
-        assert worker._mirror.start()  # none was running
-        worker.close()
-
-
 def test_a_mirror_in_the_inbox_is_refused(write_site):
     with pytest.raises(ConfigError, match=r"mirror\.folder: .* must not be in the inbox"):
         read_site(write_site(more=MIRROR.replace("served", "inbox/served")))
-
-
-@pytest.mark.integration
-def test_the_mirror_is_renewed_in_a_process_of_its_own(site):
-    mirror = BackgroundMirror(replace_memory(site), Host())
-    assert mirror.start()
-    assert not mirror.start()  # while it runs
-    deadline_s = time.monotonic() + 60
-    while (fault := mirror.result()) is None:
-        assert time.monotonic() < deadline_s
-        time.sleep(0.05)
-    assert fault == ""
-    assert (site.path.parent / "served" / "test_20251121.json").exists()
-    mirror.close()
-
-
-def replace_memory(site):
-    """Return the site with the memory that a small task needs."""
-    return site.model_copy(update={"service": site.service.model_copy(update={"memory_gb": 2.0})})

@@ -46,7 +46,7 @@ class FakeWorker:
     def close(self):
         pass
 
-    def update_mirror(self):
+    def proceed_with_renewals(self):
         pass
 
     def run_maintenance(self):

@@ -14,7 +14,7 @@ from station.archive.checksums import fingerprint, matches_fingerprint, read_che
 
 def is_intact(path: Path) -> bool:
     """Return True if a derived file is as it was written."""
-    expected = read_checked_json(_fingerprints_path(path))
+    expected = read_checked_json(fingerprints_path(path))
     return bool(expected) and any(matches_fingerprint(path, known) for known in expected)
 
 
@@ -23,9 +23,10 @@ def write_fingerprints(path: Path, tmp_path: Path) -> None:
     known = [fingerprint(tmp_path)]
     with suppress(OSError):
         known.append(fingerprint(path))
-    with atomic_write(_fingerprints_path(path)) as tmp_json:
+    with atomic_write(fingerprints_path(path)) as tmp_json:
         tmp_json.write_text(to_checked_json(known), encoding="ascii")
 
 
-def _fingerprints_path(path: Path) -> Path:
+def fingerprints_path(path: Path) -> Path:
+    """Return the file of the fingerprints of a derived file."""
     return path.with_name(f".{path.stem}.json")

@@ -19,15 +19,18 @@ STEP_SIGMAS = 4.5  # an innovation beyond is an outlier, and a step once the nex
 CONFIRMED_SIGMAS = 3.0  # the largest difference of two scans after a step
 MAX_CORRELATION = 0.999  # below 1 after rounding to half precision
 MAX_UNSEEN_MIN = 65_535
+MAX_SHARE = 2.0  # of the daily wave of the class, in a cell
 
 CELL_DTYPE = np.dtype(  # 20 bytes per cell
     [
         ("level_m", "f4"),
         ("rate_m_d", "f4"),
-        ("level_variance_m2", "f4"),
-        ("rate_variance_m2_d2", "f4"),
+        ("level_sigma_m", "f2"),
+        ("rate_sigma_m_d", "f2"),
         ("correlation", "f2"),  # of the errors of level and rate
         ("unseen_min", "u2"),  # since the last scan in which the cell was seen
+        ("random_sigma_m", "f2"),  # of the cell in that scan
+        ("systematic_sigma_m", "f2"),
     ]
 )
 
@@ -55,6 +58,17 @@ class ProcessNoise:
     rate_m2_d3: Floats
 
 
+@dataclass(frozen=True)
+class Motion:
+    """What the class of cells did since the last scan [m]; numbers, or arrays (n,) of cells."""
+
+    anomaly_m: Floats | float = 0.0  # in excess of its mean rate: the daily wave
+    surge_m: Floats | float = 0.0  # all at once, such as snowfall
+    mean_rate_m_d: Floats | float = 0.0  # over the last day
+    faster_m_d: Floats | float = 0.0  # change of the mean rate
+    common_error_m: Floats | float = 0.0  # of the scan, in all cells of the class
+
+
 def first_estimate(change_m: Floats, variance_m2: Floats) -> LevelRate:
     """Return level and rate after the first observation of a cell."""
     zero = np.zeros_like(change_m)
@@ -72,6 +86,23 @@ def predict(state: LevelRate, days: float, noise: ProcessNoise) -> LevelRate:
         + days * (noise.level_m2_d + wander * days / 3),
         state.covariance_m2_d + days * (state.rate_m2_d2 + wander / 2),
         state.rate_m2_d2 + wander,
+    )
+
+
+def shifted(state: LevelRate, motion: Motion) -> LevelRate:
+    """Return the state after what the class did: the cell has as much of its daily wave as of its mean rate.
+
+    Where the class moves more slowly than the rate of the cell is uncertain, the cell moves as the class.
+    Source: equations.md, 6.12.
+    """
+    squared = motion.mean_rate_m_d**2 + state.rate_m2_d2
+    with np.errstate(invalid="ignore"):
+        share = (motion.mean_rate_m_d * state.rate_m_d + state.rate_m2_d2) / squared
+    share = np.clip(share, 0.0, MAX_SHARE)
+    return replace(
+        state,
+        level_m=state.level_m + share * motion.anomaly_m + motion.surge_m,
+        rate_m_d=state.rate_m_d + share * motion.faster_m_d,
     )
 
 
@@ -97,7 +128,8 @@ class CellFilter:
     """Level and rate of cells (n,), of which a scan observes some.
 
     `cells` is the state, 20 bytes per cell, with NaN levels where a cell was never seen. `outlier_m` is the
-    last observation of the cells where it contradicted the level, else NaN: only few cells have one.
+    last observation of the cells where it contradicted the level, else NaN: only few cells have one. Both are
+    changed in place.
     """
 
     def __init__(self, cells: NDArray[np.void], outlier_m: NDArray[np.float32]) -> None:
@@ -112,27 +144,45 @@ class CellFilter:
 
     def estimates(self) -> LevelRate:
         """Return level and rate of the cells (n,)."""
-        level_m2, rate_m2_d2 = (
-            self.cells[name].astype(np.float64) for name in ("level_variance_m2", "rate_variance_m2_d2")
+        level_m, rate_m_d, level_sigma_m, rate_sigma_m_d = (
+            self.cells[name].astype(np.float64)
+            for name in ("level_m", "rate_m_d", "level_sigma_m", "rate_sigma_m_d")
         )
-        return LevelRate(
-            self.cells["level_m"].astype(np.float64),
-            self.cells["rate_m_d"].astype(np.float64),
-            level_m2,
-            self.cells["correlation"] * np.sqrt(level_m2 * rate_m2_d2),
-            rate_m2_d2,
-        )
+        covariance_m2_d = self.cells["correlation"] * level_sigma_m * rate_sigma_m_d
+        return LevelRate(level_m, rate_m_d, level_sigma_m**2, covariance_m2_d, rate_sigma_m_d**2)
 
-    def advance(self, days: float, noise: ProcessNoise, change_m: Floats, variance_m2: Floats) -> Bools:
+    @property
+    def unseen_d(self) -> Floats:
+        """Time since each cell (n,) was last seen [d]."""
+        return np.asarray(self.cells["unseen_min"] / 1440)
+
+    def last_variances(self) -> tuple[Floats, Floats]:
+        """Return random and systematic variance (n,) of the last observation of each cell [m²]."""
+        random_m, systematic_m = (
+            self.cells[name].astype(np.float64) for name in ("random_sigma_m", "systematic_sigma_m")
+        )
+        return random_m**2, systematic_m**2
+
+    def advance(
+        self,
+        days: float,
+        noise: ProcessNoise,
+        motion: Motion,
+        change_m: Floats,
+        random_m2: Floats,
+        systematic_m2: Floats,
+    ) -> Bools:
         """Take the next scan, some days after the last one, and return the cells where a step is confirmed.
 
-        Change and its variance (n,) are NaN where the scan has none. An observation beyond `STEP_SIGMAS` is
+        Change and its variances (n,) are NaN where the scan has none. An observation beyond `STEP_SIGMAS` is
         left out. If the next one contradicts the level too and agrees with it, the level becomes the mean of
         both and forgets what was before. Raises ValueError if the scan is not later than the last one.
         """
         if days < 0:
             raise ValueError(f"a scan {-days:g} d before the last one: scans must be in order of time")
-        state = predict(self.estimates(), days, noise)
+        state = shifted(predict(self.estimates(), days, noise), motion)
+        change_m = change_m - motion.common_error_m
+        variance_m2 = random_m2 + systematic_m2
         observed = np.isfinite(change_m) & np.isfinite(variance_m2)
         is_first = observed & np.isnan(state.level_m)
         innovation_m = change_m - state.level_m
@@ -153,8 +203,10 @@ class CellFilter:
         self._store(state, choices)
         unseen_min = self.cells["unseen_min"] + days * 1440
         self.cells["unseen_min"] = np.where(observed, 0, np.minimum(np.rint(unseen_min), MAX_UNSEEN_MIN))
+        for name, last_m2 in (("random_sigma_m", random_m2), ("systematic_sigma_m", systematic_m2)):
+            self.cells[name] = np.where(observed, np.sqrt(last_m2), self.cells[name])
         outlier_m = np.where(is_outlier & ~is_step, change_m, np.nan)
-        self.outlier_m = np.where(observed, outlier_m, self.outlier_m).astype(np.float32)
+        np.copyto(self.outlier_m, outlier_m, where=observed, casting="same_kind")
         return np.asarray(is_step)
 
     def _store(self, state: LevelRate, choices: tuple[tuple[Bools, LevelRate], ...]) -> None:
@@ -166,11 +218,11 @@ class CellFilter:
                 np.copyto(values, getattr(choice, name), where=mask)
             return values
 
-        level_m2, rate_m2_d2 = chosen("level_m2"), chosen("rate_m2_d2")
+        level_sigma_m, rate_sigma_m_d = np.sqrt(chosen("level_m2")), np.sqrt(chosen("rate_m2_d2"))
         with np.errstate(invalid="ignore", divide="ignore"):
-            correlation = chosen("covariance_m2_d") / np.sqrt(level_m2 * rate_m2_d2)
+            correlation = chosen("covariance_m2_d") / (level_sigma_m * rate_sigma_m_d)
         self.cells["level_m"] = chosen("level_m")
         self.cells["rate_m_d"] = chosen("rate_m_d")
-        self.cells["level_variance_m2"] = level_m2
-        self.cells["rate_variance_m2_d2"] = rate_m2_d2
+        self.cells["level_sigma_m"] = level_sigma_m
+        self.cells["rate_sigma_m_d"] = rate_sigma_m_d
         self.cells["correlation"] = np.clip(np.nan_to_num(correlation), -MAX_CORRELATION, MAX_CORRELATION)

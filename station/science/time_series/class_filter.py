@@ -2,89 +2,39 @@
 
 A class is cells of like ground and like noise. A fixed sample of its cells is filtered with each candidate of
 the process noise; the likeliest so far is used for the next scan, so that a series gives the same result live
-and reprocessed.
+and reprocessed. What the class does as a whole is its course.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from collections.abc import Mapping
+from dataclasses import replace
 from itertools import product
 
 import numpy as np
 
 from station.quantities import Bools, Floats
-from station.science.gridding.reference_surface import REFRACTION_CORRELATION_S
 from station.science.time_series.cell_filter import (
     STEP_SIGMAS,
     LevelRate,
+    Motion,
     ProcessNoise,
     first_estimate,
     predict,
+    shifted,
     update,
 )
+from station.science.time_series.class_course import ClassCourse
+from station.science.time_series.error_shares import ErrorShares
 
 LEVEL_NOISES_M2_D = (1e-9, 1e-7, 1e-6, 1e-5, 1e-4, 3e-4, 1e-3)
 STABLE_RATE_NOISES_M2_D3 = (1e-9, 1e-7, 1e-6, 1e-5)
-MOVING_RATE_NOISES_M2_D3 = (1e-4, 3e-4, 1e-3)  # quiet ice may melt or settle by 1 cm/d more within a day
+MOVING_RATE_NOISES_M2_D3 = (1e-6, 1e-5, 1e-4, 3e-4, 1e-3)  # relative to the class
 MEMORY_D = 10.0  # after which the likelihood of a scan has lost 63 % of its weight
-SAMPLE_CELLS = 100  # per class
+SAMPLE_CELLS = 300  # per class
 MEDIAN_CHI2 = 0.4549  # of the square of a standard normal variable
 MOVED_EXCESS = 2.0  # times the expected median of 100 squares of innovations: four sigma
 SYSTEMATIC_SIGMAS = 3.0  # what the error that a scan's cells share may be, before the ground has moved
-CORRELATION_D = REFRACTION_CORRELATION_S / 86_400
-
-
-@dataclass(frozen=True)
-class ErrorShares:
-    """Covariance matrices (2, 2) of level and rate [m, m/d] of a cell that every scan observes.
-
-    `systematic` and `cross` (2,), its covariance with the present error, are for a systematic error of 1 m.
-    """
-
-    total: Floats
-    random: Floats
-    process: Floats
-    systematic: Floats
-    cross: Floats
-
-    @classmethod
-    def first(cls, random_m2: float, systematic_m2: float) -> ErrorShares:
-        """Return the matrices after the first scan."""
-        first = first_estimate(np.zeros(1), np.full(1, random_m2 + systematic_m2))
-        unit = np.diag([1.0, 0.0])
-        rate = np.diag([0.0, first.rate_m2_d2[0]])
-        total = np.diag([first.level_m2[0], first.rate_m2_d2[0]])
-        return cls(total, unit * random_m2, rate, unit, np.array([1.0, 0.0]))
-
-    def moved(self, days: float, noise: ProcessNoise) -> ErrorShares:
-        """Return the matrices some days later, without an observation."""
-        step = np.array([[1.0, days], [0.0, 1.0]])
-        level, rate = float(noise.level_m2_d), float(noise.rate_m2_d3)
-        wander = np.array([[level * days + rate * days**3 / 3, rate * days**2 / 2], [0, rate * days]])
-        wander[1, 0] = wander[0, 1]
-        return ErrorShares(
-            step @ self.total @ step.T + wander,
-            step @ self.random @ step.T,
-            step @ self.process @ step.T + wander,
-            step @ self.systematic @ step.T,
-            step @ self.cross * np.exp(-days / CORRELATION_D),
-        )
-
-    def updated(self, random_m2: float, systematic_m2: float) -> ErrorShares:
-        """Return the matrices after an observation.
-
-        Source: equations.md, 6.12.
-        """
-        gain = self.total[:, :1] / (self.total[0, 0] + random_m2 + systematic_m2)
-        kept = np.eye(2) - gain @ np.array([[1.0, 0.0]])
-        shared = kept @ self.cross[:, None] @ gain.T
-        return ErrorShares(
-            kept @ self.total,
-            kept @ self.random @ kept.T + gain @ gain.T * random_m2,
-            kept @ self.process @ kept.T,
-            kept @ self.systematic @ kept.T + shared + shared.T + gain @ gain.T,
-            kept @ self.cross + gain[:, 0],
-        )
 
 
 class ClassFilter:
@@ -101,7 +51,24 @@ class ClassFilter:
         self._states = LevelRate(empty, empty, empty, empty, empty)
         self._likelihood = np.zeros(self._shape[0])
         self._best = LEVEL_NOISES_M2_D.index(1e-5) * len(rate_noises)
+        self.course = ClassCourse(stable=stable)
         self.shares: ErrorShares | None = None  # None before the first scan with a cell of the sample
+
+    def to_arrays(self) -> dict[str, Floats]:
+        """Return everything that the next scan is filtered with, by name."""
+        return {
+            "states": np.stack(list(vars(self._states).values())),
+            "likelihood": self._likelihood,
+            "best": np.array([self._best], np.float64),
+            "shares": ErrorShares.to_array(self.shares),
+        } | self.course.to_arrays()
+
+    def restore(self, arrays: Mapping[str, Floats]) -> None:
+        """Continue from what `to_arrays` returned."""
+        self._states = LevelRate(*arrays["states"])
+        self._likelihood, self._best = arrays["likelihood"], int(arrays["best"][0])
+        self.shares = ErrorShares.from_array(arrays["shares"])
+        self.course.restore(arrays)
 
     @property
     def learned(self) -> ProcessNoise:
@@ -110,17 +77,18 @@ class ClassFilter:
 
     def advance(
         self, days: float, change_m: Floats, random_m2: Floats, systematic_m2: Floats
-    ) -> ProcessNoise:
-        """Take the next scan of the sample (n,), NaN where it has none, and return the noise up to it.
+    ) -> tuple[ProcessNoise, Motion]:
+        """Take the next scan of the sample (n,), NaN where it has none; return noise and motion up to it.
 
-        It is what was learned before, and more if the whole class has moved further: snowfall. What the scan
-        tells about the noise applies from the next one on.
+        The noise is what was learned before, and more if the cells have scattered further: drifting snow.
+        What the scan tells about it applies from the next one on.
         """
-        noise = self.learned
-        variance_m2 = random_m2 + systematic_m2
-        observed = np.isfinite(change_m) & np.isfinite(variance_m2)
+        noise, before_m = self.learned, self._states.level_m[self._best]
+        observed = np.isfinite(change_m) & np.isfinite(random_m2 + systematic_m2)
+        motion = self._motion(days, observed, change_m, random_m2, systematic_m2)
+        change_m, variance_m2 = change_m - motion.common_error_m, random_m2 + systematic_m2
         noises = ProcessNoise(*self._candidates[:, :, None])
-        states = predict(self._states, days, noises)
+        states = shifted(predict(self._states, days, noises), motion)
         known = observed & np.isfinite(states.level_m[0])
         innovation_m = (change_m - states.level_m)[:, known]
         expected_m2 = (states.level_m2 + variance_m2)[:, known]
@@ -134,8 +102,23 @@ class ClassFilter:
             else:
                 self._learn(days, innovation_m, expected_m2)
         self._states = _updated(states, observed, np.where(observed, change_m, 0.0), variance_m2)
+        moved_m = self._states.level_m[self._best] - before_m
+        self.course.follow(moved_m[np.isfinite(moved_m)])
         self._move_shares(days, noise, random_m2[observed], systematic_m2[observed])
-        return noise
+        return noise, motion
+
+    def _motion(
+        self, days: float, observed: Bools, change_m: Floats, random_m2: Floats, systematic_m2: Floats
+    ) -> Motion:
+        """Return what the class did, from the cells that were known before; all of them in the first scan."""
+        level_m = self._states.level_m[self._best]
+        is_first = self.course.shares is None
+        chosen = observed if is_first else observed & np.isfinite(level_m)
+        moved_m = np.zeros(np.count_nonzero(chosen)) if is_first else (change_m - level_m)[chosen]
+        variances_m2 = (
+            float(np.median(values[chosen])) if chosen.any() else 0.0 for values in (random_m2, systematic_m2)
+        )
+        return self.course.advance(days, moved_m, *variances_m2)
 
     def _learn(self, days: float, innovation_m: Floats, expected_m2: Floats) -> None:
         loss = np.minimum(innovation_m**2 / expected_m2, STEP_SIGMAS**2) + np.log(expected_m2)

@@ -8,7 +8,7 @@ import numpy as np
 
 from station.quantities import Floats
 from station.science.time_series.cell_filter import LevelRate
-from station.science.time_series.class_filter import ErrorShares
+from station.science.time_series.class_filter import ClassFilter
 
 TINY_M2 = 1e-12  # against division by zero
 
@@ -28,7 +28,7 @@ class FilterErrors:
 
 
 def filter_errors(
-    state: LevelRate, unseen_d: Floats, random_m2: Floats, systematic_m2: Floats, shares: ErrorShares
+    state: LevelRate, unseen_d: Floats, random_m2: Floats, systematic_m2: Floats, ground: ClassFilter
 ) -> FilterErrors:
     """Return the errors of the estimates of cells (n,) of a class, last seen some days ago.
 
@@ -38,6 +38,10 @@ def filter_errors(
 
     Source: equations.md, 6.12.
     """
+    shares = ground.shares
+    if shares is None:  # no cell of the class was seen yet
+        unknown = np.full_like(unseen_d, np.nan)
+        return FilterErrors(unknown, unknown, unknown, unknown)
     random, systematic = (_moved(matrix, unseen_d) for matrix in (shares.random, shares.systematic))
     single = random_m2 / np.maximum(random_m2 + systematic_m2, TINY_M2)
     is_seen = unseen_d == 0
@@ -62,6 +66,8 @@ def filter_errors(
         )
         shared_part = np.where(is_seen, share(shares.systematic, first_shared), systematic[index])
         parts += [random_part, process_part + shared_part * systematic_m2]
+    for index, course in zip((1, 3), ground.course.variances(systematic_m2), strict=True):
+        parts[index] = parts[index] + course
     return FilterErrors(*parts)
 
 

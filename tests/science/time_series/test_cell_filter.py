@@ -7,6 +7,7 @@ from station.science.time_series.cell_filter import (
     CELL_DTYPE,
     INITIAL_RATE_M_D,
     CellFilter,
+    Motion,
     ProcessNoise,
     first_estimate,
     predict,
@@ -67,7 +68,8 @@ def advance_all(cells, series_m, sigma_m=0.03):
     """Take hourly scans (t, n) and return the levels after each (t, n)."""
     levels = []
     for index, change_m in enumerate(series_m):
-        cells.advance(HOUR_D if index else 0.0, NOISE, change_m, np.full(len(change_m), sigma_m**2))
+        random_m2 = np.full(len(change_m), sigma_m**2)
+        cells.advance(HOUR_D if index else 0.0, NOISE, Motion(), change_m, random_m2, 0 * random_m2)
         levels.append(cells.estimates().level_m)
     return np.array(levels)
 
@@ -128,4 +130,4 @@ def test_error_grows_in_a_gap_as_the_change_of_the_surface_does():
 
 def test_scans_out_of_order_are_an_error():
     with pytest.raises(ValueError, match="in order of time"):
-        CellFilter.empty(1).advance(-0.1, NOISE, np.zeros(1), np.ones(1))
+        CellFilter.empty(1).advance(-0.1, NOISE, Motion(), np.zeros(1), np.ones(1), np.zeros(1))

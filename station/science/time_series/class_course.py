@@ -1,0 +1,164 @@
+"""The course of a class of cells: how its ground moves from scan to scan, such as melt by day only.
+
+It is known far better than the motion of a cell, so it is followed within the hour, and the cells are
+filtered relative to it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from itertools import product
+
+import numpy as np
+
+from station.quantities import Floats
+from station.science.time_series.cell_filter import (
+    STEP_SIGMAS,
+    LevelRate,
+    Motion,
+    ProcessNoise,
+    first_estimate,
+    predict,
+    update,
+)
+from station.science.time_series.error_shares import ErrorShares
+
+LEVEL_NOISES_M2_D = (1e-9, 1e-6, 1e-5, 1e-4)
+STABLE_RATE_NOISES_M2_D3 = (1e-9, 1e-7)
+MOVING_RATE_NOISES_M2_D3 = (1e-6, 1e-5, 1e-4, 1e-3, 1e-2, 1e-1)  # the sun may let melt begin within hours
+MEMORY_D = 10.0  # after which the likelihood of a scan has lost 63 % of its weight
+LEAST_CELLS = 20  # of a class, for its course
+LEAST_SCANS, LEAST_SPAN_D = 6, 0.25  # within a day, for a daily wave
+MEDIAN_VARIANCE = np.pi / 2  # of the median over that of the mean, for normal errors
+
+
+class ClassCourse:
+    """Filter of the level of a class, from the median change of its cells since the last scan."""
+
+    def __init__(self, *, stable: bool) -> None:
+        self._has_wave = not stable
+        rate_noises = STABLE_RATE_NOISES_M2_D3 if stable else MOVING_RATE_NOISES_M2_D3
+        self._candidates = np.array(list(product(LEVEL_NOISES_M2_D, rate_noises))).T
+        count = self._candidates.shape[1]
+        self._states = first_estimate(np.zeros(count), np.zeros(count))
+        self._likelihood = np.zeros(count)
+        self._best = LEVEL_NOISES_M2_D.index(1e-5) * len(rate_noises) + len(rate_noises) // 2
+        self._day = np.zeros((2, 1))  # times [d] before now, and levels [m], of the last day and before it
+        self._rate_m_d = 0.0
+        self._ahead_m = 0.0  # of the levels of its cells, most of which have followed it
+        self.shares: ErrorShares | None = None
+
+    def to_arrays(self) -> dict[str, Floats]:
+        """Return everything that the next scan is filtered with, by name."""
+        return {
+            "course_states": np.stack(list(vars(self._states).values())),
+            "course_likelihood": self._likelihood,
+            "course_best": np.array([self._best, self._rate_m_d, self._ahead_m]),
+            "course_day": self._day,
+            "course_shares": ErrorShares.to_array(self.shares),
+        }
+
+    def restore(self, arrays: Mapping[str, Floats]) -> None:
+        """Continue from what `to_arrays` returned."""
+        self._states = LevelRate(*arrays["course_states"])
+        self._likelihood = arrays["course_likelihood"]
+        best, self._rate_m_d, self._ahead_m = arrays["course_best"].tolist()
+        self._best = int(best)
+        self._day = arrays["course_day"]
+        self.shares = ErrorShares.from_array(arrays["course_shares"])
+
+    def advance(self, days: float, moved_m: Floats, random_m2: float, systematic_m2: float) -> Motion:
+        """Take the changes (n,) of cells since the last scan, some days ago, and return what the class did.
+
+        The variances are those of a cell in this scan. With too few cells the class goes on as before.
+        """
+        noises = ProcessNoise(*self._candidates)
+        states = predict(self._states, days, noises)
+        noise = ProcessNoise(*self._candidates[:, self._best])
+        shares = None if self.shares is None else self.shares.moved(days, noise)
+        surge_m = common_error_m = 0.0
+        if len(moved_m) >= LEAST_CELLS:
+            median_m2 = MEDIAN_VARIANCE * random_m2 / len(moved_m)
+            variance_m2 = np.full(len(self._likelihood), median_m2 + systematic_m2)
+            observed_m = np.full_like(variance_m2, np.median(moved_m) - self._ahead_m)
+            innovation_m, expected_m2 = observed_m - states.level_m, states.level_m2 + variance_m2
+            is_first = shares is None
+            if is_first or innovation_m[self._best] ** 2 > STEP_SIGMAS**2 * expected_m2[self._best]:
+                surge_m = 0.0 if is_first else float(innovation_m[self._best])
+                states = replace(
+                    states, level_m=observed_m, level_m2=variance_m2, covariance_m2_d=0 * variance_m2
+                )
+                shares = ErrorShares.first(median_m2, systematic_m2)
+            else:
+                loss = np.minimum(innovation_m**2 / expected_m2, STEP_SIGMAS**2) + np.log(expected_m2)
+                self._likelihood = self._likelihood * np.exp(-days / MEMORY_D) - loss / 2
+                states = update(states, observed_m, variance_m2)
+                common_error_m = float(observed_m[0] - states.level_m[self._best])
+                assert shares is not None  # noqa: S101 - not the first scan
+                shares = shares.updated(median_m2, systematic_m2)
+        went_m = float(states.level_m[self._best])
+        wave_m, mean_rate_m_d = self._remember(days, went_m, surge_m)
+        before_m_d, rate_m_d = self._rate_m_d, mean_rate_m_d
+        motion = Motion(
+            anomaly_m=wave_m,
+            surge_m=surge_m,
+            mean_rate_m_d=rate_m_d,
+            faster_m_d=rate_m_d - before_m_d if before_m_d and rate_m_d else 0.0,
+            common_error_m=common_error_m,
+        )
+        self._ahead_m += went_m
+        # the next scan is compared with the best candidate
+        self._states = replace(states, level_m=states.level_m - went_m)
+        self._best, self._rate_m_d, self.shares = int(np.argmax(self._likelihood)), rate_m_d, shares
+        return motion
+
+    def follow(self, moved_m: Floats) -> None:
+        """Note how the levels of the cells (n,) moved with the scan that was taken last [m]."""
+        if len(moved_m):
+            self._ahead_m -= float(np.median(moved_m))
+
+    def _remember(self, days: float, went_m: float, surge_m: float) -> tuple[float, float]:
+        """Return the daily wave since the last scan [m], and the mean rate of the last day [m/d].
+
+        The wave is the level less its mean over the last day; on the first day, less the line to its start.
+        Both are 0 at the beginning, with few scans in a day, and of stable ground.
+        """
+        before_m = self._mean_of_day()
+        age_d, level_m = self._day
+        level_m = np.append(level_m + surge_m, level_m[-1] + went_m)
+        age_d = np.append(age_d + days, 0.0)
+        first = max(int(np.searchsorted(-age_d, -1.0, side="right")) - 1, 0)  # the last one before the day
+        self._day = age_d, level_m = np.stack([age_d[first:], level_m[first:]])
+        wave_m = went_m - (self._mean_of_day() - before_m)  # a surge moves both
+        span_d = min(float(age_d[0]), 1.0)
+        if not self._has_wave or len(age_d) < LEAST_SCANS or span_d < LEAST_SPAN_D:
+            return 0.0, 0.0
+        rate_m_d = float(level_m[-1] - np.interp(-span_d, -age_d, level_m)) / span_d
+        return wave_m if age_d[0] >= 1 else went_m - surge_m - rate_m_d * days, rate_m_d
+
+    def _mean_of_day(self) -> float:
+        """Return the mean level of the last day [m], or of the time since the first scan."""
+        age_d, level_m = self._day
+        span_d = min(float(age_d[0]), 1.0)
+        if span_d <= 0:
+            return float(level_m[-1])
+        inside = age_d < span_d
+        time_d = np.concatenate([[-span_d], -age_d[inside]])
+        levels_m = np.concatenate([[np.interp(-span_d, -age_d, level_m)], level_m[inside]])
+        return float(np.trapezoid(levels_m, time_d)) / span_d
+
+    def variances(self, systematic_m2: Floats) -> tuple[Floats, Floats]:
+        """Return the variances of level [m²] and mean rate [m²/d²] of the class at cells (n,) of it.
+
+        `systematic_m2` is that of a scan at these cells.
+        """
+        if self.shares is None:
+            return np.zeros_like(systematic_m2), np.zeros_like(systematic_m2)
+        level_m2, rate_m2_d2 = (
+            self.shares.process[index, index]
+            + self.shares.random[index, index]
+            + self.shares.systematic[index, index] * systematic_m2
+            for index in (0, 1)
+        )
+        return level_m2, 2 * level_m2 if self._has_wave else rate_m2_d2  # of the difference of two days
