@@ -19,7 +19,6 @@ from station.archive.netcdf_layout import Series
 from station.archive.series.index import SeriesIndex
 from station.products.epoch_table import AreaSeries, EpochTable, read_area_series, read_epoch_table
 from station.products.gallery import (
-    KEEP_ALL_FOR,
     Gallery,
     MeasuredEpoch,
     Style,
@@ -30,7 +29,7 @@ from station.products.gallery import (
 )
 from station.products.maps import ASSETS, map_box
 from station.products.overview import Overview
-from station.products.viewer.block_curves import CurveEpoch, update_curves
+from station.products.viewer.block_curves import CurveEpoch, curve_tiers, update_curves
 from station.quantities import Floats
 from station.science.geometry.robust_statistics import NORMAL_95
 from station.science.gridding.significance import SIGNIFICANT_SIGMAS
@@ -89,7 +88,7 @@ def write_page(
         style = Style(context.name or series.station_id, width_px, limit_m)
         measured = _measured_epochs(series, table, context.overviews)
         gallery = update_gallery(series, folder, measured, style, progress)
-        curves = _update_curves(series, folder, measured, table, progress)
+        curves = _update_curves(series, folder, table, progress)
     for name, parts in STATIC.items():
         replace_if_changed(folder / name, b"".join((ASSETS / part).read_bytes() for part in parts))
     data = {
@@ -146,25 +145,23 @@ def _measured_epochs(
 def _update_curves(
     series: Series,
     folder: Path,
-    measured: list[MeasuredEpoch],
     table: EpochTable,
     progress: Callable[[], None],
 ) -> dict[str, object] | None:
     """Update the curves of blocks to the epochs of the newest reference; None if there is none."""
-    retained = [measured[index] for index in retention_indices(_start_s(measured))] if measured else []
-    epochs = [
-        CurveEpoch(item.epoch, item.start.timestamp(), table.verdict[item.position] != "unusable")
-        for item in retained
-        if item.version == retained[-1].version
-    ]
-    if not epochs:
+    versions = table.texts["reference_version"]
+    newest = [position for position, version in enumerate(versions) if version and version == versions[-1]]
+    if not newest:
         return None
-    recent_from_s = epochs[-1].start_s - KEEP_ALL_FOR.total_seconds()
-    return update_curves(series, folder, epochs, recent_from_s, progress)
-
-
-def _start_s(measured: list[MeasuredEpoch]) -> Floats:
-    return np.array([item.start.timestamp() for item in measured])
+    index, start_s = SeriesIndex(series), table.start_s[newest]
+    tiers = {
+        name: [
+            CurveEpoch(index[position], float(table.start_s[position]), table.verdict[position] != "unusable")
+            for position in (newest[item] for item in items)
+        ]
+        for name, items in curve_tiers(start_s, retention_indices(start_s)).items()
+    }
+    return update_curves(series, folder, tiers, progress)
 
 
 def _frames(series: Series, folder: Path, gallery: Gallery, width_px: int) -> dict[str, Any]:

@@ -35,32 +35,39 @@ const stationCurves = (() => {
 
     const exists = Uint8Array.from(atob(about.tiles), (c) => c.charCodeAt(0));  // a bit for each tile
 
-    async function tile(row, column) {
-      const name = `${row}_${column}`, index = row * about.columns + column;
-      const isInside = row >= 0 && column >= 0 && column < about.columns;
-      if (!isInside || !(exists[index >> 3] & (128 >> (index & 7)))) return { place: null, tiers: [] };
-      const [place, older, recent] = await Promise.all(["places", "older", "recent"].map(
-        async (tier) => tier in about.versions ? stationTiles.load(`${tier}/${name}`, about.versions[tier]) : null));
-      return { place: place && parsePlace(place), tiers: [older, recent].filter(Boolean).map(parseCurve) };
+    const size = about.tile_blocks, TIERS = ["older", "recent", "latest"].filter((tier) => tier in about.versions);
+    const tileOf = (tier, row, column) => [Math.floor(row / size[tier]), Math.floor(column / size[tier])];
+    const localOf = (tier, row, column) => row % size[tier] * size[tier] + column % size[tier];
+
+    function isKnown(row, column) {
+      const [tileRow, tileColumn] = tileOf("places", row, column), index = tileRow * about.columns + tileColumn;
+      return row >= 0 && column >= 0 && tileColumn < about.columns && (exists[index >> 3] & (128 >> (index & 7))) !== 0;
+    }
+
+    async function load(tier, name) {
+      const tile = await stationTiles.load(`${tier}/${name}`, about.versions[tier]);
+      return tile && (tier === "places" ? parsePlace(tile) : parseCurve(tile));
     }
 
     // The blocks (row, column, weight) of tiles, with their values over time; those never observed are left out.
     async function read(blocks) {
-      const tiles = new Map();
-      for (const [row, column] of blocks) {
-        const key = [Math.floor(row / about.tile), Math.floor(column / about.tile)];
-        if (!tiles.has(String(key))) tiles.set(String(key), tile(...key));
-      }
-      await Promise.all(tiles.values());
+      const tiles = new Map(), inside = blocks.filter(([row, column]) => isKnown(row, column));
+      const get = (tier, row, column) => {
+        const name = tileOf(tier, row, column).join("_"), key = `${tier}/${name}`;
+        if (!tiles.has(key)) tiles.set(key, load(tier, name));
+        return tiles.get(key);
+      };
+      for (const [row, column] of inside) for (const tier of ["places", ...TIERS]) get(tier, row, column);
       const found = [];
-      for (const [row, column, weight] of blocks) {
-        const { place, tiers } = await tiles.get(String([Math.floor(row / about.tile), Math.floor(column / about.tile)]));
-        const local = row % about.tile * about.tile + column % about.tile;
-        const index = place ? place.local.indexOf(local) : -1;
+      for (const [row, column, weight] of inside) {
+        const place = await get("places", row, column);
+        const index = place ? place.local.indexOf(localOf("places", row, column)) : -1;
         if (index < 0) continue;
         const values = new Map();
-        for (const tier of tiers) {
-          const at = tier.local.indexOf(local);
+        for (const name of TIERS) {
+          const tier = await get(name, row, column);
+          if (!tier) continue;
+          const at = tier.local.indexOf(localOf(name, row, column));
           tier.time_s.forEach((time_s, t) => {
             const i = t * tier.blocks + at;
             if (at < 0 || !tier.usable[t]) return;

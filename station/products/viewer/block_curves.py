@@ -1,9 +1,9 @@
-"""Curves of the page: change of each block of about 10 m over time with its sigma, in tiles of 5 × 5 blocks.
+"""Curves of the page: change of each block of about 10 m over time with its sigma, in tiles.
 
-Three tiers of tiles: `recent` (rewritten with each scan) and `older` (once a day) have the values, `places`
-what no scan changes. Times are thinned as the maps are. The systematic errors of an area are propagated in
-the browser: from the Jacobian of its blocks, the mean covariance of the retained epochs in `systematic`, and
-how the sigma of an epoch differs from it. Source: equations.md, 6.2.
+Three tiers of tiles have the values: `latest` is rewritten with each scan, `recent` with every eighth,
+`older` once a day. `places` has what no scan changes. Times are thinned as the maps are. The systematic
+errors of an area are propagated in the browser: from the Jacobian of its blocks, the mean covariance of the
+retained epochs in `systematic`, and how the sigma of an epoch differs from it. Source: equations.md, 6.2.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ import hashlib
 import json
 import os
 import zipfile
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -25,20 +25,28 @@ from scipy import sparse
 from station.archive.derived.boxes import BOXES, read_entry
 from station.archive.epochs import EpochRef
 from station.archive.netcdf_layout import Series
-from station.errors import StoreError
-from station.products.viewer.tiles import Array, TileFolder, byte_planes, tile_script, zigzag_differences
-from station.quantities import Floats, Ints, SharedParameters
+from station.products.viewer.tiles import (
+    Array,
+    TileFolder,
+    byte_planes,
+    replace_file,
+    tile_script,
+    zigzag_differences,
+)
+from station.quantities import Bools, Floats, Ints, SharedParameters
 from station.queries.block_sums import Sums
-from station.queries.blocks import BlockQueries, SurfaceBlocks
+from station.queries.blocks import DAY_S, BlockQueries, SurfaceBlocks
 from station.queries.epoch_cells import CHANGE, RANDOM
 from station.science.analysis.calibration import SparseJacobian
 from station.science.uncertainty.jacobian import HeightJacobian
 
-TILE_BLOCKS = 5  # along each side of a tile
-QUANTUM_M = 0.0005  # of the change
+TILE_BLOCKS = {"latest": 10, "recent": 5, "older": 5, "places": 5}  # along each side of a tile
+LATEST = 8  # epochs before they go to the recent tier
+RECENT_DAYS = 2  # before the last one, of which all epochs are in the recent tier
+QUANTUM_M = 0.001  # of the change
 SIGMA_MIN_M, SIGMA_STEP = 1e-5, 0.02  # code of a sigma: 1 + ln(sigma / minimum) / step
 MAX_COVERAGE = 255  # code of a block that was observed completely, unless it has fewer cells
-MAX_RECENT, MAX_OLDER = 130, 120  # epochs of a curve
+MAX_RECENT, MAX_OLDER = 132, 110  # epochs of a curve
 MAX_READ = 24  # epochs read at once; a store older than the page is read over several calls
 MAX_BASE = 24  # epochs whose covariance is averaged
 MAX_CHANGE = 2**21  # code of a change of 1 km; a difference of two has 3 bytes
@@ -63,46 +71,67 @@ def sigma_code(sigma_m: Floats) -> Ints:
     return np.clip(np.round(np.nan_to_num(code, neginf=0)), 0, 65535).astype(np.int64)
 
 
+def curve_tiers(start_s: Floats, retained: Sequence[int]) -> dict[str, list[int]]:
+    """Return the epochs of each tier, as indices of their times (n,) [s], ascending.
+
+    All epochs of the last days, and before them those `retained`.
+    """
+    day = start_s // DAY_S
+    last, before = (
+        np.flatnonzero(day == day[-1]),
+        np.flatnonzero((day >= day[-1] - RECENT_DAYS) & (day < day[-1])),
+    )
+    full = len(last) // LATEST * LATEST
+    older = [index for index in retained if day[index] < day[-1] - RECENT_DAYS]
+    return {
+        "older": older[-MAX_OLDER:],
+        "recent": _thin([*before.tolist(), *last[:full].tolist()], MAX_RECENT),
+        "latest": last[full:].tolist(),
+    }
+
+
+def _thin(indices: list[int], count: int) -> list[int]:
+    """Return every nth of some indices, the newest included; at most `count`."""
+    step = max(1, -(-len(indices) // count))
+    return indices[::-step][::-1]
+
+
 def update_curves(
     series: Series,
     folder: Path,
-    epochs: Sequence[CurveEpoch],
-    recent_from_s: float,
+    tiers: Mapping[str, Sequence[CurveEpoch]],
     progress: Callable[[], None],
 ) -> dict[str, object]:
-    """Update the tiles in `folder` to the epochs, which have one reference, and return their description.
+    """Update the tiles in `folder` to the epochs of each tier, and return their description.
 
-    Epochs from `recent_from_s` on are in the recent tier. Raises StoreError if something cannot be read or
-    written.
+    All epochs have one reference. Raises StoreError if something cannot be read or written.
     """
-    recent = _thin([epoch for epoch in epochs if epoch.start_s >= recent_from_s], MAX_RECENT)
-    older = _thin([epoch for epoch in epochs if epoch.start_s < recent_from_s], MAX_OLDER)
+    epochs = [epoch for tier in tiers.values() for epoch in tier]
     queries = BlockQueries(series)
     tiles = _Tiles(series, folder, queries, epochs[-1].ref)
-    known = tiles.read([*older, *recent], progress)
-    older, recent = ([epoch for epoch in tier if epoch.ref.epoch_file in known] for tier in (older, recent))
-    key = tiles.key(older, len(older) + len(recent))
-    recent_key = hashlib.sha256(
-        "".join([key, *(epoch.ref.epoch_file for epoch in recent)]).encode()
-    ).hexdigest()
-    on_disk = tiles.read_keys()
-    if on_disk[:1] != [key]:
-        tiles.write_places(_mean_shared(queries, [*older, *recent]))
-        tiles.write_curves("older", older, known)
-        os.sync()  # before the key that says that they are there
+    known = tiles.read(epochs, progress)
+    wanted = {
+        name: [epoch for epoch in tier if epoch.ref.epoch_file in known] for name, tier in tiers.items()
+    }
+    on_disk, keys = tiles.read_keys(), dict[str, str]()
+    # The geometry and the mean covariance change with the older epochs, and as a short series grows.
+    names = [epoch.ref.epoch_file for epoch in wanted["older"]]
+    keys["places"] = tiles.key([*names, str(len(known).bit_length())])
+    if on_disk.get("places") != keys["places"]:
+        tiles.write_places(_mean_shared(queries, [epoch for tier in wanted.values() for epoch in tier]))
         progress()
-    if on_disk != [key, recent_key]:
-        tiles.write_curves("recent", recent, known)
-        tiles.write_keys([key, recent_key])
-        progress()
-    versions = {"places": key[:8], "recent": recent_key[:8]} | ({"older": key[:8]} if older else {})
-    return tiles.description() | {"versions": versions}
-
-
-def _thin(epochs: list[CurveEpoch], count: int) -> list[CurveEpoch]:
-    """Return every nth of the epochs, the newest included; at most `count`."""
-    step = max(1, -(-len(epochs) // count))
-    return epochs[::-step][::-1]
+    for name, tier in wanted.items():
+        keys[name] = tiles.key([epoch.ref.epoch_file for epoch in tier])
+        if on_disk.get(name) != keys[name]:
+            tiles.write_curves(name, tier, known)
+            progress()
+    if on_disk.get("places") != keys["places"]:
+        os.sync()  # before the keys that say that the tiles are there
+    if on_disk != keys:
+        tiles.write_keys(keys)
+    return tiles.description() | {
+        "versions": {name: key[:8] for name, key in keys.items() if name == "places" or wanted[name]}
+    }
 
 
 def _mean_shared(queries: BlockQueries, epochs: list[CurveEpoch]) -> SharedParameters | None:
@@ -123,6 +152,28 @@ def _mean_shared(queries: BlockQueries, epochs: list[CurveEpoch]) -> SharedParam
     )
 
 
+class _Grouping:
+    """Blocks (n,) of a grid of blocks, grouped in square tiles."""
+
+    def __init__(self, known: Bools, size: int) -> None:
+        row, column = np.nonzero(known)
+        self.columns = -(-known.shape[1] // size)
+        self.rows = -(-known.shape[0] // size)
+        tile = row // size * self.columns + column // size
+        self.order = np.argsort(tile, kind="stable")
+        self.local = (row % size * size + column % size)[self.order].astype(np.uint8)
+        numbers, first = np.unique(tile[self.order], return_index=True)
+        # Number, first and end of each tile in the order.
+        self.tiles = list(
+            zip(numbers.tolist(), first.tolist(), [*first[1:].tolist(), len(tile)], strict=True)
+        )
+
+    def name(self, number: int) -> str:
+        """Return the name of a tile: its row and column."""
+        row, column = divmod(number, self.columns)
+        return f"{row}_{column}"
+
+
 class _Tiles:
     """The tiles of one version of the reference."""
 
@@ -132,15 +183,7 @@ class _Tiles:
         self._version = blocks.cells.reference.version
         self._newest_blocks = blocks
         self.surface: SurfaceBlocks = queries.surface(newest, blocks.rock > 0.5)
-        row, column = np.nonzero(self.surface.known)
-        self._columns = -(-self.surface.known.shape[1] // TILE_BLOCKS)
-        tile = row // TILE_BLOCKS * self._columns + column // TILE_BLOCKS
-        self._order = np.argsort(tile, kind="stable")
-        self._local = (row % TILE_BLOCKS * TILE_BLOCKS + column % TILE_BLOCKS)[self._order].astype(np.uint8)
-        numbers, first = np.unique(tile[self._order], return_index=True)
-        self._tiles = list(
-            zip(numbers.tolist(), first.tolist(), [*first[1:].tolist(), len(tile)], strict=True)
-        )
+        self._groupings = {size: _Grouping(self.surface.known, size) for size in set(TILE_BLOCKS.values())}
         self._cache = folder / ".curves" / self._version
         self._max_coverage = min(queries.cells**2, MAX_COVERAGE)
 
@@ -151,26 +194,23 @@ class _Tiles:
         size = self._queries.blocks_per_box
         return np.asarray(row // size * -(-self.surface.known.shape[1] // size) + column // size)
 
-    def key(self, older: list[CurveEpoch], count: int) -> str:
-        """Return a text that changes when the tiers that are not rewritten with each scan must be."""
-        state = [FORMAT, self._version, [epoch.ref.epoch_file for epoch in older], count.bit_length()]
-        return hashlib.sha256(json.dumps(state).encode()).hexdigest()
+    def key(self, names: list[str]) -> str:
+        """Return a text that changes with what a tier is made of."""
+        return hashlib.sha256(json.dumps([FORMAT, self._version, *names]).encode()).hexdigest()
 
-    def read_keys(self) -> list[str]:
-        """Return the keys of the tiers on disk: of those rarely written, and of the recent one."""
+    def read_keys(self) -> dict[str, str]:
+        """Return the keys of the tiers on disk; none if they are missing or damaged."""
         try:
-            return (self._folder / ".curves" / "keys").read_text().split()
-        except (OSError, UnicodeDecodeError):
-            return []
+            keys = json.loads((self._folder / ".curves" / "keys.json").read_text())
+        except (OSError, ValueError):
+            return {}
+        return keys if isinstance(keys, dict) else {}
 
-    def write_keys(self, keys: list[str]) -> None:
+    def write_keys(self, keys: dict[str, str]) -> None:
         """Write the keys of the tiers on disk."""
-        try:
-            (self._folder / ".curves" / "keys").write_text("\n".join(keys))
-        except OSError as error:
-            raise StoreError(f"{self._folder}: cannot be written: {error}") from error
+        replace_file(self._folder / ".curves" / "keys.json", json.dumps(keys).encode())
 
-    def read(self, epochs: list[CurveEpoch], progress: Callable[[], None]) -> dict[str, Sums]:
+    def read(self, epochs: Sequence[CurveEpoch], progress: Callable[[], None]) -> dict[str, Sums]:
         """Return the codes of epochs by file name, newest first; at most MAX_READ that are not cached."""
         known: dict[str, Sums] = {}
         read_count = 0
@@ -191,7 +231,7 @@ class _Tiles:
         return known
 
     def _codes(self, epoch: CurveEpoch) -> Sums:
-        """Return the values of an epoch as integers, in the order of the tiles."""
+        """Return the values of an epoch as integers, those of blocks (n,) row by row."""
         is_newest = epoch.ref == self._newest
         blocks = self._newest_blocks if is_newest else self._queries.read(epoch.ref)
         systematic_m2 = np.zeros(blocks.count.shape)
@@ -205,9 +245,7 @@ class _Tiles:
             "coverage": np.ceil(blocks.count / full * self._max_coverage),
         }
         codes = {
-            name: np.clip(raster, -MAX_CHANGE, MAX_CHANGE)[self.surface.known][self._order].astype(
-                DTYPES[name]
-            )
+            name: np.clip(raster, -MAX_CHANGE, MAX_CHANGE)[self.surface.known].astype(DTYPES[name])
             for name, raster in values.items()
         }
         boxes = read_entry(self._series, BOXES, epoch.start_s)
@@ -217,14 +255,14 @@ class _Tiles:
             codes["boxes"] = sigma_code(sigma_m).astype(np.uint16)
         return codes
 
-    def write_curves(self, tier: str, epochs: list[CurveEpoch], known: dict[str, Sums]) -> None:
+    def write_curves(self, tier: str, epochs: Sequence[CurveEpoch], known: dict[str, Sums]) -> None:
         """Write the tiles of a tier."""
-        folder = TileFolder(self._folder / tier)
+        folder, grouping = TileFolder(self._folder / tier), self._groupings[TILE_BLOCKS[tier]]
         if epochs:
             codes = [known[epoch.ref.epoch_file] for epoch in epochs]
             planes = np.concatenate(
                 [
-                    byte_planes(zigzag_differences(_filled(codes, name)), size)
+                    byte_planes(zigzag_differences(_filled(codes, name)[:, grouping.order]), size)
                     for name, size in CODE_BYTES.items()
                 ]
             )
@@ -233,25 +271,24 @@ class _Tiles:
                 byte_planes(np.diff(start_s, prepend=0), 4).tobytes(),
                 np.array([epoch.is_usable for epoch in epochs], np.uint8).tobytes(),
             ]
-            boxes = self._box_of_tiles(codes)
-            for position, (number, first, end) in enumerate(self._tiles):
-                part = planes[:, :, first:end]
-                row, column = divmod(number, self._columns)
+            boxes = self._box_of_tiles(codes, grouping)
+            for position, (number, first, end) in enumerate(grouping.tiles):
                 box = byte_planes(boxes[:, position], 2).tobytes()
-                data = b"".join([self._local[first:end].tobytes(), *heads, box, part.tobytes()])
-                folder.write(f"{row}_{column}", {"times": len(epochs), "blocks": end - first}, data)
+                values = planes[:, :, first:end].tobytes()
+                data = b"".join([grouping.local[first:end].tobytes(), *heads, box, values])
+                folder.write(grouping.name(number), {"times": len(epochs), "blocks": end - first}, data)
         folder.delete_others()
 
-    def _box_of_tiles(self, codes: list[Sums]) -> Ints:
+    def _box_of_tiles(self, codes: list[Sums], grouping: _Grouping) -> Ints:
         """Return the code (t, tiles) of the systematic sigma of the box in the middle of each tile."""
-        middle = np.array([(first + end) // 2 for _, first, end in self._tiles])
-        box = self._box[self._order][middle]
+        middle = np.array([(first + end) // 2 for _, first, end in grouping.tiles])
+        box = self._box[grouping.order][middle]
         rows = [epoch["boxes"].ravel() if "boxes" in epoch else None for epoch in codes]
         return np.array([np.zeros(len(box), int) if row is None else row[box] for row in rows], np.int64)
 
     def write_places(self, base: SharedParameters | None) -> None:
         """Write what no scan changes: heights, geometry and Jacobian of blocks, and the mean covariance."""
-        surface, order = self.surface, self._order
+        surface, grouping = self.surface, self._groupings[TILE_BLOCKS["places"]]
         jacobian = surface.jacobian if base is not None else None
         reference_m2 = surface.random_m2 / np.maximum(self._queries.cells**2, 1)
         rows = [
@@ -260,18 +297,17 @@ class _Tiles:
             np.degrees(np.arccos(surface.observation.cos_incidence)),
             np.sqrt(reference_m2),
         ]
-        box_m = np.zeros(len(order))
+        box_m = np.zeros(len(grouping.order))
         if jacobian is not None and base is not None:
             rows += [*jacobian.pose, jacobian.sight_tilt, jacobian.refraction, jacobian.cross_tilt]
             rows += [jacobian.knot_position]
             box_m = self._box_sigma(jacobian, base)
         rows.append(box_m)
-        values = np.array(rows, np.float64)[:, order].astype("<f4")
+        values = np.array(rows, np.float64)[:, grouping.order].astype("<f4")
         folder = TileFolder(self._folder / "places")
-        for number, first, end in self._tiles:
-            data = self._local[first:end].tobytes() + values[:, first:end].tobytes()
-            row, column = divmod(number, self._columns)
-            folder.write(f"{row}_{column}", {"blocks": end - first, "values": len(values)}, data)
+        for number, first, end in grouping.tiles:
+            data = grouping.local[first:end].tobytes() + values[:, first:end].tobytes()
+            folder.write(grouping.name(number), {"blocks": end - first, "values": len(values)}, data)
         folder.delete_others()
         _write_systematic(self._folder / "systematic.js", jacobian, base)
 
@@ -288,15 +324,16 @@ class _Tiles:
         """Return what a browser must know to read the tiles."""
         grid, position_m = self._series.grid, self._newest_blocks.cells.scanner[:3]
         is_known = bool(np.isfinite(position_m).all())
-        has_tile = np.zeros(-(-self.surface.known.shape[0] // TILE_BLOCKS) * self._columns, bool)
-        has_tile[[number for number, _, _ in self._tiles]] = True
+        grouping = self._groupings[TILE_BLOCKS["places"]]
+        has_tile = np.zeros(grouping.rows * grouping.columns, bool)
+        has_tile[[number for number, _, _ in grouping.tiles]] = True
         return {
             "west_m": grid.west_m,
             "north_m": grid.north_m,
             "block_m": self._queries.cells * grid.cell_m,
-            "tile": TILE_BLOCKS,
+            "tile_blocks": TILE_BLOCKS,
             "tiles": base64.b64encode(np.packbits(has_tile).tobytes()).decode(),
-            "columns": self._columns,
+            "columns": grouping.columns,
             "quantum_m": QUANTUM_M,
             "sigma_min_m": SIGMA_MIN_M,
             "sigma_step": SIGMA_STEP,
@@ -327,12 +364,7 @@ def _write_systematic(path: Path, jacobian: HeightJacobian | None, base: SharedP
             "refraction_knots": params.refraction_knots,
         }
         data = np.concatenate([lower, base.line_tilt_variance]).astype("<f4").tobytes()
-    tmp_path = path.with_name(f".{path.name}.part")
-    try:
-        tmp_path.write_bytes(tile_script("systematic", head, data))
-        tmp_path.replace(path)
-    except OSError as error:
-        raise StoreError(f"{path}: cannot be written: {error}") from error
+    replace_file(path, tile_script("systematic", head, data))
 
 
 def _load(path: Path, count: int) -> Sums | None:

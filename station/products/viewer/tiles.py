@@ -46,16 +46,8 @@ class TileFolder:
     def write(self, name: str, head: Mapping[str, object], data: bytes) -> None:
         """Write the tile of a name; raise StoreError if that fails."""
         script = tile_script(f"{self.name}/{name}", head, data)
-        path, tmp_path = self._folder / f"{name}.js", self._folder / f".{name}.part"
-        try:
-            descriptor = os.open(tmp_path, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o666)
-            try:
-                os.write(descriptor, script)
-            finally:
-                os.close(descriptor)
-            tmp_path.replace(path)
-        except OSError as error:
-            raise StoreError(f"{path}: cannot be written: {error}") from error
+        path = self._folder / f"{name}.js"
+        replace_file(path, script)
         self._written.add(path.name)
 
     def delete_others(self) -> None:
@@ -75,3 +67,17 @@ def zigzag_differences(codes: Array) -> Array:
     """Return the first of integers (t, ...) and the differences that follow, as non-negative numbers."""
     steps: Array = np.diff(codes.astype(np.int32), axis=0, prepend=np.zeros((1, *codes.shape[1:]), np.int32))
     return np.asarray(np.left_shift(steps, 1) ^ np.right_shift(steps, 31))
+
+
+def replace_file(path: Path, content: bytes) -> None:
+    """Replace a file atomically, without a sync; raise StoreError if that fails."""
+    tmp_path = f"{path.parent}/.{path.name}.part"
+    try:
+        descriptor = os.open(tmp_path, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o666)
+        try:
+            os.write(descriptor, content)
+        finally:
+            os.close(descriptor)
+        os.replace(tmp_path, path)  # noqa: PTH105 - thousands of tiles
+    except OSError as error:
+        raise StoreError(f"{path}: cannot be written: {error}") from error

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from station.archive.series.index import SeriesIndex
-from station.products.viewer.block_curves import CurveEpoch, sigma_code, update_curves
+from station.products.viewer.block_curves import CurveEpoch, curve_tiers, sigma_code, update_curves
 from station.queries.aggregates import Aggregates
 
 
@@ -17,6 +17,15 @@ from station.queries.aggregates import Aggregates
 def curve_epochs(series):
     index = SeriesIndex(series)
     return [CurveEpoch(index[i], float(index.start_s[i]), i != 3) for i in range(len(index))]
+
+
+def tiers(epochs, *, older=0, recent=0):
+    """The first epochs as older and recent ones, the others as the latest."""
+    return {
+        "older": epochs[:older],
+        "recent": epochs[older : older + recent],
+        "latest": epochs[older + recent :],
+    }
 
 
 def read_tile(path):
@@ -44,7 +53,7 @@ def decode(path):
 
 
 def test_a_tile_has_the_changes_and_sigmas_of_the_store(series, curve_epochs, tmp_path):
-    about = update_curves(series, tmp_path, curve_epochs, 0.0, lambda: None)
+    about = update_curves(series, tmp_path, tiers(curve_epochs, recent=6), lambda: None)
     aggregates, grid = Aggregates(series), series.grid
     local, time_s, usable, values = decode(tmp_path / "recent" / "1_2.js")  # cells are blocks of 10 m here
     np.testing.assert_array_equal(time_s, [round(epoch.start_s) for epoch in curve_epochs])
@@ -59,47 +68,61 @@ def test_a_tile_has_the_changes_and_sigmas_of_the_store(series, curve_epochs, tm
             assert (values["coverage"][time, place] > 0) == np.isfinite(stored.mean_m)
             if np.isfinite(stored.mean_m):
                 compared += 1
-                assert values["change"][time, place] * 0.0005 == pytest.approx(stored.mean_m, abs=0.00026)
+                assert values["change"][time, place] * 0.001 == pytest.approx(stored.mean_m, abs=0.00051)
                 sigma_m = 1e-5 * np.exp((values["random"][time, place] - 1) * 0.02)
                 assert sigma_m == pytest.approx(stored.mean_sigma_m, rel=0.011)
     assert compared > 100
 
 
-def test_old_and_recent_epochs_are_in_their_tiers(series, curve_epochs, tmp_path):
-    boundary_s = curve_epochs[4].start_s
-    about = update_curves(series, tmp_path, curve_epochs, boundary_s, lambda: None)
-    assert set(about["versions"]) == {"places", "older", "recent"}
-    _, older_s, _, _ = decode(tmp_path / "older" / "1_2.js")
-    _, recent_s, _, _ = decode(tmp_path / "recent" / "1_2.js")
-    np.testing.assert_array_equal(older_s, [round(epoch.start_s) for epoch in curve_epochs[:4]])
-    np.testing.assert_array_equal(recent_s, [round(epoch.start_s) for epoch in curve_epochs[4:]])
+def test_epochs_are_in_their_tiers(series, curve_epochs, tmp_path):
+    about = update_curves(series, tmp_path, tiers(curve_epochs, older=1, recent=3), lambda: None)
+    assert set(about["versions"]) == {"places", "older", "recent", "latest"}
+    times_s = [round(epoch.start_s) for epoch in curve_epochs]
+    for name, expected_s in {
+        "older/1_2": times_s[:1], "recent/1_2": times_s[1:4], "latest/0_1": times_s[4:],
+    }.items():  # fmt: skip
+        np.testing.assert_array_equal(decode(tmp_path / f"{name}.js")[1], expected_s)
 
 
-def inodes(folder):
-    return {path.name: path.stat().st_ino for path in folder.iterdir()}
+def test_tiers_have_all_of_three_days_and_then_what_is_retained():
+    start_s = np.arange(24 * 100 + 11) * 3600.0  # hourly from midnight; the last day has 11
+    kept = [24 * day + 23 for day in range(100)]
+    expected = {
+        "older": kept[:98],
+        "recent": list(range(24 * 98, 24 * 100 + 8)),
+        "latest": [24 * 100 + 8, 24 * 100 + 9, 24 * 100 + 10],
+    }
+    assert curve_tiers(start_s, kept) == expected
+    dense = curve_tiers(np.arange(144 * 3) * 600.0, [])
+    assert dense["recent"][-1] == 144 * 3 - 1
+    assert 100 < len(dense["recent"]) <= 132
 
 
-def test_a_new_epoch_rewrites_the_recent_tier_only(series, curve_epochs, tmp_path):
-    boundary_s = curve_epochs[2].start_s
-    update_curves(series, tmp_path, curve_epochs[:5], boundary_s, lambda: None)
-    before = {tier: inodes(tmp_path / tier) for tier in ("places", "older", "recent")}
-    update_curves(series, tmp_path, curve_epochs[:5], boundary_s, lambda: None)
-    assert {tier: inodes(tmp_path / tier) for tier in before} == before
-    update_curves(series, tmp_path, curve_epochs, boundary_s, lambda: None)
-    assert inodes(tmp_path / "older") == before["older"]
-    assert inodes(tmp_path / "places") == before["places"]
-    assert decode(tmp_path / "recent" / "1_2.js")[1][-1] == round(curve_epochs[-1].start_s)
-    assert inodes(tmp_path / "recent").keys() == before["recent"].keys()  # no temporary file remains
+def written(folder):
+    return {path.name: (path.stat().st_ino, path.stat().st_mtime_ns) for path in folder.iterdir()}
+
+
+def test_a_new_epoch_rewrites_the_latest_tier_only(series, curve_epochs, tmp_path):
+    update_curves(series, tmp_path, tiers(curve_epochs[:5], older=2, recent=2), lambda: None)
+    before = {tier: written(tmp_path / tier) for tier in ("places", "older", "recent", "latest")}
+    update_curves(series, tmp_path, tiers(curve_epochs[:5], older=2, recent=2), lambda: None)
+    assert {tier: written(tmp_path / tier) for tier in before} == before
+    update_curves(series, tmp_path, tiers(curve_epochs, older=2, recent=2), lambda: None)
+    for tier in ("places", "older", "recent"):
+        assert written(tmp_path / tier) == before[tier]
+    latest = written(tmp_path / "latest")
+    assert latest.keys() == before["latest"].keys()  # no temporary file remains
+    assert all(latest[name] != before["latest"][name] for name in latest)
 
 
 def test_a_damaged_cache_is_read_from_the_store_again(series, curve_epochs, tmp_path):
-    update_curves(series, tmp_path, curve_epochs[:5], 0.0, lambda: None)
+    update_curves(series, tmp_path, tiers(curve_epochs[:5]), lambda: None)
     for path in (tmp_path / ".curves").rglob("*.npz"):
         path.write_bytes(path.read_bytes()[:100])
-    update_curves(series, tmp_path, curve_epochs, 0.0, lambda: None)
+    update_curves(series, tmp_path, tiers(curve_epochs), lambda: None)
     fresh = tmp_path / "fresh"
-    update_curves(series, fresh, curve_epochs, 0.0, lambda: None)
-    assert (tmp_path / "recent" / "1_2.js").read_bytes() == (fresh / "recent" / "1_2.js").read_bytes()
+    update_curves(series, fresh, tiers(curve_epochs), lambda: None)
+    assert (tmp_path / "latest" / "0_1.js").read_bytes() == (fresh / "latest" / "0_1.js").read_bytes()
 
 
 def test_codes_of_sigmas_are_within_one_percent():
@@ -115,18 +138,24 @@ def test_a_tap_of_250_epochs_is_within_30_kb(noise_m):
     from station.products.viewer.tiles import byte_planes, tile_script, zigzag_differences
 
     rng, size = np.random.default_rng(1), 0
-    for count in (block_curves.MAX_RECENT, block_curves.MAX_OLDER):
-        shape = count, block_curves.TILE_BLOCKS**2
+    counts = {
+        "recent": block_curves.MAX_RECENT,
+        "older": block_curves.MAX_OLDER,
+        "latest": block_curves.LATEST,
+    }
+    assert sum(counts.values()) == 250
+    for tier, count in counts.items():
+        shape = count, block_curves.TILE_BLOCKS[tier] ** 2
         cells = rng.poisson(60, shape)
         codes = {
-            "change": np.round(rng.normal(-0.002 * np.arange(count)[:, None], noise_m, shape) / 0.0005),
+            "change": np.round(rng.normal(-0.002 * np.arange(count)[:, None], noise_m, shape) / 0.001),
             "random": sigma_code(noise_m * np.sqrt(60 / cells) * rng.normal(1, 0.02, shape)),
             "systematic": sigma_code(0.02 * rng.normal(1, 0.1, (count, 1)) * np.ones(shape)),
             "coverage": np.minimum(cells, 100),
         }
         planes = [
-            byte_planes(zigzag_differences(codes[name]), size)
-            for name, size in block_curves.CODE_BYTES.items()
+            byte_planes(zigzag_differences(codes[name]), width)
+            for name, width in block_curves.CODE_BYTES.items()
         ]
         heads = rng.integers(0, 256, (count, 3)).astype(np.uint8).tobytes() + bytes(4 * count)
         size += len(tile_script("recent/10_10", {}, heads + np.concatenate(planes).tobytes()))
