@@ -8,11 +8,13 @@ import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 
-from station.archive.series.index import series_in
+from station.archive.series.index import SeriesIndex, series_in
 from station.operations.batch import process_scans
 from station.products.page import PageContext, write_page
+from station.queries.aggregates import Aggregates
 from station.simulation.station import simulate, small
 
 pytestmark = pytest.mark.slow
@@ -227,4 +229,63 @@ def test_empty_page_raises_no_error(tab, tmp_path, folder):
     tab.open((tmp_path / "page" / "index.html").as_uri())
     assert tab.run("document.getElementById('lamp').className") == "lamp stale"
     assert "the disk is full" in tab.run("document.body.textContent")
+    assert tab.errors() == []
+
+
+SUMS = """(async () => {{
+    const reader = stationCurves.reader(STATION.curves);
+    return {{ area: await reader.area({corners}), difference: await reader.difference({first}, {second}) }};
+}})()"""
+
+
+def test_areas_and_differences_have_the_sigma_of_the_store(tab, folder):
+    series = series_in(folder.parent)
+    grid, aggregates, index = series.grid, Aggregates(series), SeriesIndex(series)
+    rows, columns = np.nonzero(np.isfinite(aggregates.reference().elevation_m))
+    tab.open(folder.as_uri() + "/index.html")
+    rng, ratios = np.random.default_rng(3), []
+    for size in (1, 3, 8, 20):
+        place, other = rng.integers(len(rows), size=2)
+        top, left = max(rows[place] - size // 2, 0), max(columns[place] - size // 2, 0)
+        west_m, north_m = (
+            grid.west_m + (left + 0.001) * grid.cell_m,
+            grid.north_m - (top + 0.001) * grid.cell_m,
+        )
+        side_m = (size - 0.002) * grid.cell_m
+        corners = [[west_m + e * side_m, north_m - s * side_m] for e, s in ((0, 0), (1, 0), (1, 1), (0, 1))]
+        first, second = ([grid.x_m[columns[k]], grid.y_m[rows[k]]] for k in (place, other))
+        answer = tab.run(
+            SUMS.format(corners=json.dumps(corners), first=json.dumps(first), second=json.dumps(second))
+        )
+        mask, weights = np.zeros(grid.shape, bool), np.zeros(grid.shape)
+        mask[top : top + size, left : left + size] = True
+        weights[rows[place], columns[place]], weights[rows[other], columns[other]] = -1.0, 1.0
+        for kind, cells in (("area", mask), ("difference", weights)):
+            points = answer[kind]["curve"] if kind == "area" else answer[kind]
+            for point in points or ():
+                if point["change"] is None:
+                    continue
+                epoch = index[int(np.argmin(np.abs(index.start_s - point["time_s"])))]
+                ratios.append(point["sigma"] / aggregates.variance(cells, epoch) ** 0.5)
+                if kind == "area":
+                    assert point["change"] == pytest.approx(
+                        np.nanmean(aggregates.read_cells(epoch, mask).change_m), abs=0.0006
+                    )
+    assert len(ratios) > 15
+    assert 0.9 < min(ratios) <= max(ratios) < 1.1
+    assert tab.errors() == []
+
+
+def test_a_link_leads_to_the_curve_of_a_place(tab, address, folder):
+    series = series_in(folder.parent)
+    grid = series.grid
+    rows, columns = np.nonzero(np.isfinite(Aggregates(series).reference().elevation_m))
+    place = len(rows) // 2
+    tab.open(f"{address}#at={grid.x_m[columns[place]]},{grid.y_m[rows[place]]}")
+    tab.await_("document.querySelectorAll('#asked canvas, #asked-values').length >= 1")
+    assert "95 %" in tab.run("document.getElementById('asked').textContent")
+    tab.run("document.getElementById('map-canvas').focus()")
+    press(tab, "Escape", 27)
+    assert tab.run("document.getElementById('asked').hidden")
+    assert tab.run("location.hash") == ""
     assert tab.errors() == []

@@ -53,7 +53,7 @@
   const figure = image.closest("figure");
   figure.prepend(tools, hint, frame);
   image.parentElement.hidden = true;  // the picture itself is drawn on the canvas
-  figure.after(panel);
+  byId("slider-row").after(panel);
 
   // ---- what is drawn
 
