@@ -188,7 +188,7 @@ def test_page_is_accessible_and_fits_a_phone(tab, folder):
     assert tab.run("[...document.querySelectorAll('table')].every((t) => t.caption && t.tHead)")
     assert tab.run("[...document.querySelectorAll('h1,h2,h3')].length") > 5
     focused = set()
-    for _ in range(12):
+    for _ in range(24):
         press(tab, "Tab", 9)
         focused.add(tab.run("document.activeElement.id || document.activeElement.tagName"))
     assert {"slider", "earlier"} <= focused

@@ -59,7 +59,7 @@ function stationMap(canvas, extent, redraw) {
     draw();
   }
 
-  // ---- pointers: one pans or draws a box, two zoom; a tap and a double tap are told to `on`
+  // ---- pointers: one pans or draws a box, two zoom; a tap and a double tap call `on`
 
   const on = { tap: () => {}, box: () => {}, hover: () => {}, finish: () => {}, drawsBox: () => false };
   const pointers = new Map();
