@@ -69,6 +69,7 @@ class MapImage:
 
     start: datetime
     file: str
+    version: str  # of the reference
 
 
 @dataclass(frozen=True)
@@ -119,7 +120,7 @@ def update_gallery(
             _draw(overview, maps_folder, caption, style.width_px, limit_m, name, is_last=is_last)
             drawn_count += 1
             progress()
-        images.append(MapImage(epoch.start, f"maps/{name}"))
+        images.append(MapImage(epoch.start, f"maps/{name}", item.version))
     images.reverse()
     _, sigma, points = _file_names(Path(images[-1].file).name, is_last=True)
     _delete_old(maps_folder, {Path(item.file).name for item in images} | {sigma, points})

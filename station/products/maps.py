@@ -18,7 +18,7 @@ from station.products.colours import (
     shared_palette,
     sigma_scale,
 )
-from station.products.overview import Overview
+from station.products.overview import BaseMap, Overview
 from station.quantities import Bools
 
 ASSETS = Path(__file__).parent / "assets"
@@ -157,6 +157,25 @@ def _overlay(overview: Overview, observed: Bools, scale: ColourScale, values: np
     return painted
 
 
+def map_box(base: BaseMap, width_px: int) -> tuple[float, float, float, float]:
+    """Return where the map is in its image: left, top, width and height as shares of the image's size."""
+    _, _, (left, top, right, bottom), height_px = _layout(base.grid.ny, base.grid.nx, width_px)
+    width = right - left
+    return left / width_px, top / height_px, width / width_px, (bottom - top) / height_px
+
+
+def _layout(ny: int, nx: int, width_px: int) -> tuple[int, int, tuple[int, int, int, int], int]:
+    """Return margin, inner width, box of the map, and height of an image [pixels]."""
+    unit = width_px / 1200
+    margin, header_height, footer_height = round(24 * unit), round(92 * unit), round(104 * unit)
+    inner = width_px - 2 * margin
+    stretch = min(inner / nx, MAX_ASPECT * inner / ny)
+    width, height = max(1, round(nx * stretch)), max(1, round(ny * stretch))
+    left = (width_px - width) // 2
+    box = left, header_height, left + width, header_height + height
+    return margin, inner, box, header_height + height + footer_height
+
+
 def _compose(
     painted: Pixels,
     overview: Overview,
@@ -168,18 +187,14 @@ def _compose(
 ) -> Image.Image:
     """Return the whole image: the map with title, colour bar, legend, scale and north arrow."""
     unit = width_px / 1200
-    margin, header_height, footer_height = round(24 * unit), round(92 * unit), round(104 * unit)
-    inner = width_px - 2 * margin
     ny, nx = painted.shape[:2]
-    stretch = min(inner / nx, MAX_ASPECT * inner / ny)
-    size = max(1, round(nx * stretch)), max(1, round(ny * stretch))
-    resampling = Image.Resampling.NEAREST if stretch >= 1 else Image.Resampling.BOX
+    margin, inner, box, height_px = _layout(ny, nx, width_px)
+    corner, size = box[:2], (box[2] - box[0], box[3] - box[1])
+    resampling = Image.Resampling.NEAREST if size[0] >= nx else Image.Resampling.BOX
     map_image = Image.fromarray(painted).resize(size, resampling)
-    picture = Image.new("RGB", (width_px, header_height + size[1] + footer_height), PAPER)
-    corner = (width_px - size[0]) // 2, header_height
+    picture = Image.new("RGB", (width_px, height_px), PAPER)
     picture.paste(map_image, corner)
     draw = ImageDraw.Draw(picture)
-    box = (*corner, corner[0] + size[0], corner[1] + size[1])
     draw.rectangle((box[0] - 1, box[1] - 1, box[2], box[3]), outline=(205, 207, 210))
     _draw_header(draw, caption, subtitle, width_px, margin, unit)
     _draw_colour_bar(draw, scale, (margin, box[3] + round(16 * unit)), round(inner * 0.56), unit)

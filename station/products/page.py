@@ -22,12 +22,14 @@ from station.products.gallery import (
     Gallery,
     MeasuredEpoch,
     Style,
+    cached_base_map,
     replace_if_changed,
     retention_indices,
     update_gallery,
 )
-from station.products.maps import ASSETS
+from station.products.maps import ASSETS, map_box
 from station.products.overview import Overview
+from station.products.viewer.block_curves import CurveEpoch, curve_tiers, update_curves
 from station.quantities import Floats
 from station.science.geometry.robust_statistics import NORMAL_95
 from station.science.gridding.significance import SIGNIFICANT_SIGMAS
@@ -35,9 +37,11 @@ from station.science.gridding.significance import SIGNIFICANT_SIGMAS
 STATIC = {  # the parts of each file; a single style sheet is a single round trip
     "page.css": ("uplot.css", "page.css"),
     "page.js": ("page.js",),
+    "explore.js": ("tiles.js", "covariance.js", "curves.js", "map.js", "explore.js"),
     "uplot.js": ("uplot.js",),
     "icon.svg": ("icon.svg",),
 }
+TEXT: dict[str, str] = json.loads((ASSETS / "text.en.json").read_text(encoding="utf-8"))
 MAX_CURVE_POINTS = 250  # of a curve; of a longer series every nth, the newest included
 MAX_AREAS = 8  # with a curve, so that the page stays small
 TABLE_ROWS = 24
@@ -79,19 +83,25 @@ def write_page(
     areas = all_areas[:MAX_AREAS]
     if table is not None:
         areas = [_mask_unusable(area, table) for area in areas]
-    gallery = Gallery([], None, None, None, (0, 0))
+    gallery, curves = Gallery([], None, None, None, (0, 0)), None
     if table is not None:
         style = Style(context.name or series.station_id, width_px, limit_m)
-        gallery = update_gallery(
-            series, folder, _measured_epochs(series, table, context.overviews), style, progress
-        )
+        measured = _measured_epochs(series, table, context.overviews)
+        gallery = update_gallery(series, folder, measured, style, progress)
+        curves = _update_curves(series, folder, table, progress)
     for name, parts in STATIC.items():
         replace_if_changed(folder / name, b"".join((ASSETS / part).read_bytes() for part in parts))
     data = {
         "written_s": context.written_s,
         "expected_every_s": context.expected_every_s,
         "station": series.station_id,
-        "maps": [{"time_s": image.start.timestamp(), "file": image.file} for image in gallery.change],
+        "text": TEXT,
+        "maps": [
+            {"time_s": image.start.timestamp(), "file": image.file, "version": image.version}
+            for image in gallery.change
+        ],
+        "frames": _frames(series, folder, gallery, width_px),
+        "curves": curves,
         "area_time_s": _json_numbers(areas[0].start_s[_decimate(len(areas[0].start_s))], 0) if areas else [],
         "areas": [_area_curve(area) for area in areas],
         "health": _health_curves(table, context) if table is not None else None,
@@ -130,6 +140,40 @@ def _measured_epochs(
         )
         for position in (with_reference[index] for index in sorted(retained))
     ]
+
+
+def _update_curves(
+    series: Series,
+    folder: Path,
+    table: EpochTable,
+    progress: Callable[[], None],
+) -> dict[str, object] | None:
+    """Update the curves of blocks to the epochs of the newest reference; None if there is none."""
+    versions = table.texts["reference_version"]
+    newest = [position for position, version in enumerate(versions) if version and version == versions[-1]]
+    if not newest:
+        return None
+    index, start_s = SeriesIndex(series), table.start_s[newest]
+    tiers = {
+        name: [
+            CurveEpoch(index[position], float(table.start_s[position]), table.verdict[position] != "unusable")
+            for position in (newest[item] for item in items)
+        ]
+        for name, items in curve_tiers(start_s, retention_indices(start_s)).items()
+    }
+    return update_curves(series, folder, tiers, progress)
+
+
+def _frames(series: Series, folder: Path, gallery: Gallery, width_px: int) -> dict[str, Any]:
+    """Return where the map is in its images, and its extent [m], by version of the reference."""
+    frames = {}
+    for version in sorted({image.version for image in gallery.change}):
+        base = cached_base_map(series, folder, version, width_px)
+        grid = base.grid
+        extent = {"west": grid.west_m, "east": grid.west_m + grid.nx * grid.cell_m, "north": grid.north_m}
+        extent["south"] = grid.north_m - grid.ny * grid.cell_m
+        frames[version] = {"box": [round(share, 6) for share in map_box(base, width_px)], "extent": extent}
+    return frames
 
 
 def _decimate(count: int) -> slice:

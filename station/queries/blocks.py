@@ -30,6 +30,7 @@ from station.quantities import Bools, Floats, Ints, Reference, SharedParameters
 from station.queries.block_sums import Sums, cells_per_block, drop_epoch_sums, epoch_sums, reference_sums
 from station.queries.epoch_cells import CHANGE, RANDOM, EpochCells, EpochReader
 from station.science.analysis.calibration import SparseJacobian
+from station.science.geometry.observation import Observation
 from station.science.geometry.terrain import GRADIENT_CELLS, smooth_gradient
 from station.science.uncertainty.common_mode import cross_covariance
 from station.science.uncertainty.jacobian import HeightJacobian, height_jacobian
@@ -64,8 +65,24 @@ class Blocks:
     @property
     def shared(self) -> SharedParameters | None:
         """Shared parameters relative to the reference."""
-        own, reference = self.cells.shared, self.cells.reference.shared
-        return own if own is None or self.cells.adjusted else difference_to_reference(own, reference)
+        return relative_parameters(self.cells)
+
+
+def relative_parameters(cells: EpochCells) -> SharedParameters | None:
+    """Return the shared parameters of an epoch relative to its reference; None if it has none."""
+    own = cells.shared
+    return own if own is None or cells.adjusted else difference_to_reference(own, cells.reference.shared)
+
+
+@dataclass(frozen=True)
+class SurfaceBlocks:
+    """Blocks (n,) in which the reference surface is known."""
+
+    known: Bools  # (by, bx)
+    points: tuple[Floats, Floats, Floats]  # centre, and mean height [m]
+    observation: Observation
+    random_m2: Floats  # mean random variance of a cell of the reference
+    jacobian: HeightJacobian | None  # of heights by the shared parameters; None without any
 
 
 class BlockQueries:
@@ -156,6 +173,10 @@ class BlockQueries:
             epoch_cells,
         )
 
+    def shared(self, epoch: EpochRef) -> SharedParameters | None:
+        """Return the shared parameters of an epoch relative to the reference; None if it has none."""
+        return relative_parameters(self._reader.read_shared(epoch))
+
     def reference_blocks(self, version: str) -> Sums:
         """Return the sums of a version of the reference over its blocks."""
         return self._reference_sums(self._reader.reference(version))
@@ -165,21 +186,50 @@ class BlockQueries:
             self._surfaces[reference.version] = reference_sums(self._series, reference)
         return self._surfaces[reference.version]
 
-    def _jacobian(
-        self, epoch_cells: EpochCells, sums: Sums, surface: Sums, observed: Bools
-    ) -> HeightJacobian:
-        """Return the Jacobian of the mean surfaces of the observed blocks."""
+    def surface(self, epoch: EpochRef, rock: Bools) -> SurfaceBlocks:
+        """Return the blocks of the reference surface of an epoch, as its scanner sees them.
+
+        `rock` (by, bx) marks blocks that are bare ground.
+        """
+        epoch_cells = self._reader.read_shared(epoch)
+        sums = self._reference_sums(epoch_cells.reference)
+        known, block_m, grid = sums["known"] > 0, self.cells * self._series.grid.cell_m, self._series.grid
+        row, column = np.nonzero(known)
+        count = sums["known"][known]
+        points = (
+            np.asarray(grid.west_m + (column + 0.5) * block_m, np.float64),
+            np.asarray(grid.north_m - (row + 0.5) * block_m, np.float64),
+            sums["surface_m"][known] / count,
+        )
+        east, north = self._gradient(sums, known)
+        east_m, north_m, height_m, *_ = epoch_cells.scanner
+        observation = Observation.from_points(points, (east_m, north_m, height_m), east, north)
+        jacobian = None
+        if epoch_cells.shared is not None:
+            params, _ = self._reader.parameter_layout_of(epoch_cells.scanner)
+            jacobian = height_jacobian(params, observation.offset_m, east, north, rock=rock[known])
+        return SurfaceBlocks(known, points, observation, sums["random_m2"][known] / count, jacobian)
+
+    def _gradient(self, surface: Sums, blocks: Bools) -> tuple[Floats, Floats]:
+        """Return the eastward and northward gradient (n,) [1] of the mean surface in some blocks."""
         with np.errstate(invalid="ignore"):
             surface_m = surface["surface_m"] / surface["known"]
         block_m = self.cells * self._series.grid.cell_m
         gradient = smooth_gradient(surface_m, block_m, max(GRADIENT_CELLS / self.cells, MIN_GRADIENT_BLOCKS))
-        east, north = (np.nan_to_num(component[observed].astype(np.float64)) for component in gradient)
+        east, north = (np.nan_to_num(component[blocks].astype(np.float64)) for component in gradient)
+        return east, north
+
+    def _jacobian(
+        self, epoch_cells: EpochCells, sums: Sums, surface: Sums, observed: Bools
+    ) -> HeightJacobian:
+        """Return the Jacobian of the mean surfaces of the observed blocks."""
+        east, north = self._gradient(surface, observed)
         params, position_m = self._reader.parameter_layout_of(epoch_cells.scanner)
         count = sums["count"][observed]
         offset_m = (
             sums["x_m"][observed] / count - position_m[0],
             sums["y_m"][observed] / count - position_m[1],
-            surface_m[observed] - position_m[2],
+            surface["surface_m"][observed] / surface["known"][observed] - position_m[2],
         )
         rock = sums["rock"][observed] > count / 2
         return height_jacobian(params, offset_m, east, north, rock=rock)

@@ -8,11 +8,13 @@ import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 
-from station.archive.series.index import series_in
+from station.archive.series.index import SeriesIndex, series_in
 from station.operations.batch import process_scans
 from station.products.page import PageContext, write_page
+from station.queries.aggregates import Aggregates
 from station.simulation.station import simulate, small
 
 pytestmark = pytest.mark.slow
@@ -186,7 +188,7 @@ def test_page_is_accessible_and_fits_a_phone(tab, folder):
     assert tab.run("[...document.querySelectorAll('table')].every((t) => t.caption && t.tHead)")
     assert tab.run("[...document.querySelectorAll('h1,h2,h3')].length") > 5
     focused = set()
-    for _ in range(12):
+    for _ in range(24):
         press(tab, "Tab", 9)
         focused.add(tab.run("document.activeElement.id || document.activeElement.tagName"))
     assert {"slider", "earlier"} <= focused
@@ -227,4 +229,51 @@ def test_empty_page_raises_no_error(tab, tmp_path, folder):
     tab.open((tmp_path / "page" / "index.html").as_uri())
     assert tab.run("document.getElementById('lamp').className") == "lamp stale"
     assert "the disk is full" in tab.run("document.body.textContent")
+    assert tab.errors() == []
+
+
+def test_areas_have_the_mean_and_sigma_of_the_store(tab, folder):
+    series = series_in(folder.parent)
+    grid, aggregates, index = series.grid, Aggregates(series), SeriesIndex(series)
+    rows, columns = np.nonzero(np.isfinite(aggregates.reference().elevation_m))
+    tab.open(folder.as_uri() + "/index.html")
+    cells = round(tab.run("STATION.curves.block_m") / grid.cell_m)
+    rng, ratios = np.random.default_rng(3), []
+    for size in (3, 8):  # blocks; a single one near the scanner is up to 14 % on the safe side
+        place = rng.integers(len(rows))
+        top, left = (int(k[place]) // cells * cells for k in (rows, columns))
+        side = size * cells
+        west_m, north_m = (
+            grid.west_m + (left + 0.001) * grid.cell_m,
+            grid.north_m - (top + 0.001) * grid.cell_m,
+        )
+        side_m = (side - 0.002) * grid.cell_m
+        corners = [[west_m + e * side_m, north_m - s * side_m] for e, s in ((0, 0), (1, 0), (1, 1), (0, 1))]
+        answer = tab.run(f"stationCurves.reader(STATION.curves).area({json.dumps(corners)})")
+        mask = np.zeros(grid.shape, bool)
+        mask[top : top + side, left : left + side] = True
+        for point in answer["curve"]:
+            if point["change"] is None:
+                continue
+            epoch = index[int(np.argmin(np.abs(index.start_s - point["time_s"])))]
+            ratios.append(point["sigma"] / aggregates.variance(mask, epoch) ** 0.5)
+            stored_m = np.nanmean(aggregates.read_cells(epoch, mask).change_m)
+            assert point["change"] == pytest.approx(stored_m, abs=0.0011)
+    assert len(ratios) >= 4
+    assert 0.9 < min(ratios) <= max(ratios) < 1.1
+    assert tab.errors() == []
+
+
+def test_a_link_leads_to_the_curve_of_a_place(tab, address, folder):
+    series = series_in(folder.parent)
+    grid = series.grid
+    rows, columns = np.nonzero(np.isfinite(Aggregates(series).reference().elevation_m))
+    place = len(rows) // 2
+    tab.open(f"{address}#at={grid.x_m[columns[place]]},{grid.y_m[rows[place]]}")
+    tab.await_("document.querySelectorAll('#asked canvas, #asked-values').length >= 1")
+    assert "95 %" in tab.run("document.getElementById('asked').textContent")
+    tab.run("document.getElementById('map-canvas').focus()")
+    press(tab, "Escape", 27)
+    assert tab.run("document.getElementById('asked').hidden")
+    assert tab.run("location.hash") == ""
     assert tab.errors() == []

@@ -238,3 +238,16 @@ def _read(file: netCDF4.Dataset, block_file: BlockFile, index: int) -> Rasters:
     """Return the stored rasters of an entry."""
     file.set_auto_mask(False)
     return {spec.name: np.asarray(file[spec.name][index]) for spec in block_file.variables}
+
+
+def read_entry(series: Series, name: str, start_s: float) -> dict[str, Array] | None:
+    """Return the rasters of the entry that begins at a time, NaN where missing; None if there is none."""
+    path = series.folder / name
+    if not path.is_file():
+        return None
+    with read_errors(path), netCDF4.Dataset(path) as file:
+        found = np.flatnonzero(np.asarray(file["time_bnds"][:, 0]) == start_s)
+        if not len(found):
+            return None
+        names = [spec.name for spec in BOX_VARIABLES]
+        return {key: np.ma.filled(file[key][int(found[0])].astype(np.float64), np.nan) for key in names}

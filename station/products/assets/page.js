@@ -58,12 +58,14 @@
 
   // ---- the slider
 
+  let showTime = () => {};
   const maps = data.maps, slider = byId("slider"), image = byId("map-image");
   if (image && maps.length) {
     const rest = byId("map-caption").textContent.replace(/^[^.]*\. /, "");
     const show = (index) => {
       const map = maps[index], when = `${utc(map.time_s)} UTC`;
       slider.value = index;
+      document.dispatchEvent(new CustomEvent("station:shown", { detail: index }));
       slider.setAttribute("aria-valuetext", when);
       byId("slider-time").textContent = when;
       byId("earlier").disabled = index === 0;
@@ -83,13 +85,15 @@
     byId("later").addEventListener("click", () => show(Number(slider.value) + 1));
     show(maps.length - 1);
     byId("slider-row").hidden = maps.length < 2;
+    showTime = (time_s) => show(Math.max(maps.findLastIndex((map) => map.time_s <= time_s + 59), 0));
   }
 
   // ---- the curves; tables contain the same values for readers who cannot see them
 
   const charts = [], pendingPlots = [];
   const cssColour = (name) => getComputedStyle(document.documentElement).getPropertyValue(name).trim();
-  const formatNumber = (value, digits) => value == null ? "–" : value.toFixed(digits).replace("-", "−");
+  const formatNumber = (value, digits) => value == null || !isFinite(value) ? "–"
+    : value.toFixed(digits).replace(/^-(?=0*\.?0*$)/, "").replace("-", "−");
 
   const cell = (row, tag, text) => row.appendChild(document.createElement(tag)).textContent = text;
 
@@ -187,7 +191,9 @@
   }
 
   function draw() {
-    for (const [chart] of charts.splice(0)) chart.destroy();
+    charts.splice(0).forEach(([chart, plotBox]) => {
+      if (plotBox.closest(".curves")) chart.destroy(); else charts.push([chart, plotBox]);
+    });
     const areas = byId("area-curves"), health = byId("health-curves");
     if (areas) areas.replaceChildren();
     health.replaceChildren();
@@ -196,6 +202,10 @@
         { values: area.mean_m, half: area.sigma_m.map((s) => s == null ? null : 1.959964 * s), digits: 3 }]);
     }
     if (data.health) drawHealth(health, data.health);
+    flush();
+  }
+
+  function flush() {
     for (const create of pendingPlots.splice(0)) create();  // once all have their position and width
   }
 
@@ -218,6 +228,7 @@
   }
   addEventListener("DOMContentLoaded", draw);  // once the last script is loaded; status light and map do not wait for it
   matchMedia("(prefers-color-scheme: dark)").addEventListener("change", draw);
+  window.stationPage = { curve, flush, formatNumber, utc, showTime: (time_s) => showTime(time_s) };
   let width = innerWidth;
   addEventListener("resize", () => {
     if (innerWidth === width) return;

@@ -1,0 +1,195 @@
+// Curves of places and areas from the tiles of blocks, with their sigma.
+const stationCurves = (() => {
+  const SMALL = 3;  // blocks along a side, up to which the sigma of each block sets the scale; else that of its box
+  const MAX_BLOCKS = 1600;
+  const HEIGHT = 0, RANGE = 1, INCIDENCE = 2, JACOBIAN = 4, JACOBIAN_ROWS = 14;
+
+  function reader(about) {
+    const sigma = (code) => code ? about.sigma_min_m * Math.exp((code - 1) * about.sigma_step) : 0;
+    let model;  // of the systematic errors, once needed
+
+    function parseCurve({ head, bytes }) {
+      const { times, blocks } = head, cells = times * blocks;
+      let start = 0;
+      const take = (count, size) => {
+        const values = stationTiles.fromPlanes(bytes, start, count, size);
+        start += count * size;
+        return values;
+      };
+      const local = bytes.subarray(0, blocks);
+      start = blocks;
+      const steps_s = take(times, 4);
+      const time_s = Array.from(steps_s, ((sum) => (step) => sum += step >>> 0)(0));
+      const usable = bytes.subarray(start, start += times);
+      const box = take(times, 2);
+      const [change, random, systematic, coverage] = [3, 2, 2, 1].map(
+        (size) => stationTiles.accumulate(take(cells, size), blocks));
+      return { blocks, local, time_s, usable, box, change, random, systematic, coverage };
+    }
+
+    function parsePlace({ head, bytes }) {
+      const { blocks, values } = head, local = bytes.subarray(0, blocks);
+      const floats = new Float32Array(bytes.slice(blocks).buffer);
+      return { local, column: (k, i) => floats[k * blocks + i], values };
+    }
+
+    const exists = Uint8Array.from(atob(about.tiles), (c) => c.charCodeAt(0));  // a bit for each tile
+
+    const size = about.tile_blocks, TIERS = ["older", "recent", "latest"].filter((tier) => tier in about.versions);
+    const tileOf = (tier, row, column) => [Math.floor(row / size[tier]), Math.floor(column / size[tier])];
+    const localOf = (tier, row, column) => row % size[tier] * size[tier] + column % size[tier];
+
+    function isKnown(row, column) {
+      const [tileRow, tileColumn] = tileOf("places", row, column), index = tileRow * about.columns + tileColumn;
+      return row >= 0 && column >= 0 && tileColumn < about.columns && (exists[index >> 3] & (128 >> (index & 7))) !== 0;
+    }
+
+    async function load(tier, name) {
+      const tile = await stationTiles.load(`${tier}/${name}`, about.versions[tier]);
+      return tile && (tier === "places" ? parsePlace(tile) : parseCurve(tile));
+    }
+
+    // The blocks (row, column, weight) of tiles, with their values over time; those never observed are left out.
+    async function read(blocks) {
+      const tiles = new Map(), inside = blocks.filter(([row, column]) => isKnown(row, column));
+      const get = (tier, row, column) => {
+        const name = tileOf(tier, row, column).join("_"), key = `${tier}/${name}`;
+        if (!tiles.has(key)) tiles.set(key, load(tier, name));
+        return tiles.get(key);
+      };
+      for (const [row, column] of inside) for (const tier of ["places", ...TIERS]) get(tier, row, column);
+      const found = [];
+      for (const [row, column, weight] of inside) {
+        const place = await get("places", row, column);
+        const index = place ? place.local.indexOf(localOf("places", row, column)) : -1;
+        if (index < 0) continue;
+        const values = new Map();
+        for (const name of TIERS) {
+          const tier = await get(name, row, column);
+          if (!tier) continue;
+          const at = tier.local.indexOf(localOf(name, row, column));
+          tier.time_s.forEach((time_s, t) => {
+            const i = t * tier.blocks + at;
+            if (at < 0 || !tier.usable[t]) return;
+            values.set(time_s, tier.coverage[i] ? {
+              change: tier.change[i] * about.quantum_m,
+              random: sigma(tier.random[i]), systematic: sigma(tier.systematic[i]),
+              coverage: tier.coverage[i] / about.full, box: sigma(tier.box[t]),
+            } : null);
+          });
+        }
+        const jacobian = place.values > JACOBIAN + 1
+          ? Array.from({ length: JACOBIAN_ROWS }, (_, k) => place.column(JACOBIAN + k, index)) : null;
+        found.push({
+          row, column, weight, values, jacobian, height_m: place.column(HEIGHT, index), range_m: place.column(RANGE, index),
+          incidence_deg: place.column(INCIDENCE, index), box_m: place.column(place.values - 1, index),
+        });
+      }
+      return found;
+    }
+
+    async function prepare(blocks) {
+      if (model === undefined) {
+        const script = await stationTiles.load("systematic", about.versions.places);
+        model = script && stationCovariance.parse(script);
+      }
+      for (const block of blocks) {
+        block.own_m = model && block.jacobian ? Math.sqrt(stationCovariance.variance(model, [block.jacobian], [1])) : 0;
+      }
+    }
+
+    // The weighted sum of blocks at each time: weights add up to 1, or to 0 for a difference of two places.
+    function sums(blocks, small, isDifference) {
+      const times = [...new Set(blocks.flatMap((block) => [...block.values.keys()]))].sort((a, b) => a - b);
+      return times.map((time_s) => {
+        const seen = blocks.filter((block) => block.values.get(time_s)), at = seen.map((block) => block.values.get(time_s));
+        if (!seen.length || (isDifference && seen.length < blocks.length)) return { time_s, change: null };
+        const raw = seen.map((block, i) => block.weight * (isDifference ? 1 : at[i].coverage));
+        const total = isDifference ? 1 : raw.reduce((a, b) => a + b, 0), weights = raw.map((w) => w / total);
+        const dot = (f) => weights.reduce((sum, w, i) => sum + f(w, at[i], i), 0);
+        const random2 = dot((w, v) => w * w * v.random ** 2);
+        let systematic2;
+        if (seen.length === 1) {
+          systematic2 = (weights[0] * at[0].systematic) ** 2;
+        } else if (model && seen.every((block) => block.own_m)) {
+          const scaled = seen.map((block, i) => weights[i] *
+            (small || !at[i].box || !block.box_m ? at[i].systematic / block.own_m : at[i].box / block.box_m));
+          systematic2 = stationCovariance.variance(model, seen.map((block) => block.jacobian), scaled);
+        } else {
+          systematic2 = dot((w, v) => Math.abs(w) * v.systematic) ** 2;
+        }
+        const inside = blocks.reduce((sum, block) => sum + Math.abs(block.weight), 0);
+        return {
+          time_s, change: dot((w, v) => w * v.change), random: Math.sqrt(random2), systematic: Math.sqrt(systematic2),
+          sigma: Math.sqrt(random2 + systematic2), observed: isDifference ? 1 : total / inside,
+        };
+      });
+    }
+
+    const blockOf = ([east, north]) =>
+      [Math.floor((about.north_m - north) / about.block_m), Math.floor((east - about.west_m) / about.block_m)];
+
+    async function place(position) {
+      const [block] = await read([[...blockOf(position), 1]]);
+      return block ? { ...block, curve: sums([block], true, false) } : null;
+    }
+
+    async function difference(position, other) {
+      const blocks = await read([[...blockOf(position), -1], [...blockOf(other), 1]]);
+      if (blocks.length < 2) return null;
+      await prepare(blocks);
+      return sums(blocks, true, true);
+    }
+
+    // Blocks whose share of their area inside the polygon is at least that of one of 16 points.
+    function blocksInside(polygon) {
+      const [rows, columns] = [0, 1].map((k) => polygon.map((point) => blockOf(point)[k]));
+      const blocks = [];
+      const span = Math.max(Math.max(...rows) - Math.min(...rows), Math.max(...columns) - Math.min(...columns)) + 1;
+      if (span > 400) return { blocks: null, span };
+      for (let row = Math.max(0, Math.min(...rows)); row <= Math.max(...rows); row++) {
+        for (let column = Math.max(0, Math.min(...columns)); column <= Math.max(...columns); column++) {
+          let inside = 0;
+          for (let k = 0; k < 16; k++) {
+            const east = about.west_m + (column + (k % 4 + 0.5) / 4) * about.block_m;
+            const north = about.north_m - (row + (Math.floor(k / 4) + 0.5) / 4) * about.block_m;
+            inside += contains(polygon, east, north);
+          }
+          if (inside) blocks.push([row, column, inside / 16]);
+        }
+      }
+      return { blocks: blocks.length > MAX_BLOCKS ? null : blocks, span };
+    }
+
+    async function area(polygon) {
+      const { blocks: chosen, span } = blocksInside(polygon);
+      if (!chosen) return { tooLarge: true };
+      const blocks = await read(chosen), size_m2 = areaOf(polygon);
+      if (!blocks.length) return { curve: [], size_m2 };
+      await prepare(blocks);
+      const weight = chosen.reduce((sum, block) => sum + block[2], 0);
+      const known = blocks.reduce((sum, block) => sum + block.weight, 0);
+      const curve = sums(blocks, span <= SMALL, false);
+      for (const point of curve) if (point.observed) point.observed *= known / weight;
+      return { curve, size_m2, blocks: blocks.length };
+    }
+
+    return { place, difference, area, maxArea_m2: MAX_BLOCKS * about.block_m ** 2 };
+  }
+
+  function contains(polygon, east, north) {
+    let inside = false;
+    polygon.forEach(([e, n], i) => {
+      const [f, m] = polygon[(i + 1) % polygon.length];
+      if (n > north !== m > north && east < e + (f - e) * (north - n) / (m - n)) inside = !inside;
+    });
+    return inside;
+  }
+
+  const areaOf = (polygon) => Math.abs(polygon.reduce((sum, [e, n], i) => {
+    const [f, m] = polygon[(i + 1) % polygon.length], [e0, n0] = polygon[0];
+    return sum + (e - e0) * (m - n0) - (f - e0) * (n - n0);
+  }, 0)) / 2;
+
+  return { reader, contains, areaOf };
+})();

@@ -1,0 +1,316 @@
+"use strict";
+// The map to pan, zoom and ask. Without this script the picture of the map remains.
+(() => {
+  const data = window.STATION, text = data.text, byId = (id) => document.getElementById(id);
+  const image = byId("map-image");
+  if (!image || !data.curves || !("DecompressionStream" in window)) return;
+  const page = window.stationPage, about = data.curves, reader = stationCurves.reader(about);
+  const fill = (template, values) => template.replace(/\{(\w+)\}/g, (_, key) => values[key]);
+  const number = page.formatNumber, HALF_95 = 1.959964, SNAP_PX = 14;
+  const colour = (name) => getComputedStyle(document.documentElement).getPropertyValue(name).trim();
+
+  // ---- elements
+
+  const make = (tag, properties = {}, ...children) => {
+    const element = Object.assign(document.createElement(tag), properties);
+    element.append(...children);
+    return element;
+  };
+  const canvas = make("canvas", { tabIndex: 0, id: "map-canvas" });
+  canvas.setAttribute("role", "application");
+  canvas.setAttribute("aria-label", text.map_label);
+  const hover = make("output", { id: "map-hover" }), bar = make("div", { id: "map-scale" });
+  const hint = make("p", { id: "map-hint" }), panel = make("div", { id: "asked", hidden: true });
+  panel.setAttribute("aria-live", "polite");
+  const tools = make("div", { id: "map-tools" });
+  tools.setAttribute("role", "toolbar");
+  const frame = make("div", { id: "map-frame" }, canvas, hover, bar);
+  let tool = "place";
+  const buttons = ["place", "compare", "box", "polygon"].map((name) => {
+    const button = make("button", { type: "button", textContent: text[`tool_${name}`] });
+    button.addEventListener("click", () => choose(name));
+    button.dataset.tool = name;
+    return button;
+  });
+  const command = (label, title, act) => {
+    const button = make("button", { type: "button", textContent: label, title });
+    button.setAttribute("aria-label", title);
+    button.addEventListener("click", act);
+    return button;
+  };
+  const field = make("input", { name: "position", placeholder: text.go_label, size: 22, autocomplete: "off" });
+  field.setAttribute("aria-label", text.go_label);
+  const form = make("form", {}, field, make("button", { textContent: text.go }));
+  form.addEventListener("submit", (event) => {
+    event.preventDefault();
+    const numbers = (field.value.replace(/[\u202f\u00a0]/g, "").match(/-?\d+(\.\d+)?/g) || []).map(Number);
+    field.setCustomValidity(numbers.length === 2 ? "" : text.go_wrong);
+    if (field.reportValidity()) { map.centre(numbers); tap(numbers); }
+  });
+  field.addEventListener("input", () => field.setCustomValidity(""));
+  tools.append(...buttons, command("+", text.zoom_in, () => map.zoom(1.5)), command("−", text.zoom_out, () => map.zoom(1 / 1.5)),
+    command("⤢", text.whole_map, () => map.home()), form);
+  const figure = image.closest("figure");
+  figure.prepend(tools, hint, frame);
+  image.parentElement.hidden = true;  // the picture itself is drawn on the canvas
+  byId("slider-row").after(panel);
+
+  // ---- what is drawn
+
+  const extent = data.frames[data.maps.at(-1).version].extent;
+  let places = [], polygon = [], closed = false, shown = data.maps.length - 1;
+
+  const map = stationMap(canvas, extent, (context, now) => {
+    context.fillStyle = colour("--card");
+    context.fillRect(0, 0, now.width, now.height);
+    drawPicture(context, now);
+    if (polygon.length) drawShape(context, now, polygon, closed);
+    if (map.box()) {
+      const [a, b] = map.box();
+      drawShape(context, now, [a, [b[0], a[1]], b, [a[0], b[1]]], true);
+    }
+    if (about.scanner_m) drawScanner(context, now, about.scanner_m);
+    places.forEach((place, i) => drawPlace(context, now, place, "AB"[i]));
+    drawScale(now);
+  });
+
+  function drawPicture(context, now) {
+    const frameOf = data.frames[data.maps[shown].version];
+    if (!frameOf || !image.complete || !image.naturalWidth) return;
+    const [left, top, width, height] = frameOf.box, e = frameOf.extent;
+    const [x0, y0] = now.toPixel([e.west, e.north]), [x1, y1] = now.toPixel([e.east, e.south]);
+    context.imageSmoothingEnabled = x1 - x0 < width * image.naturalWidth;
+    context.drawImage(image, left * image.naturalWidth, top * image.naturalHeight, width * image.naturalWidth,
+      height * image.naturalHeight, x0, y0, x1 - x0, y1 - y0);
+  }
+
+  function drawShape(context, now, corners, isClosed) {
+    context.beginPath();
+    corners.forEach((corner, i) => context[i ? "lineTo" : "moveTo"](...now.toPixel(corner)));
+    if (isClosed) context.closePath();
+    stroke(context, "#000", 2.5);
+    if (!isClosed) for (const corner of corners) {
+      const [x, y] = now.toPixel(corner);
+      context.fillRect(x - 3, y - 3, 6, 6);
+    }
+  }
+
+  function stroke(context, ink, width) {  // dark on white: seen on any ground
+    context.strokeStyle = "#fff";
+    context.lineWidth = width + 3;
+    context.stroke();
+    context.strokeStyle = context.fillStyle = ink;
+    context.lineWidth = width;
+    context.stroke();
+  }
+
+  function drawPlace(context, now, place, name) {
+    const [x, y] = now.toPixel(place), size = Math.max(about.block_m / now.view.scale / 2, 4);
+    if (about.scanner_m) {  // the line of sight
+      context.setLineDash([6, 5]);
+      context.beginPath();
+      context.moveTo(...now.toPixel(about.scanner_m));
+      context.lineTo(x, y);
+      stroke(context, "#444", 1);
+      context.setLineDash([]);
+    }
+    context.beginPath();
+    context.rect(x - size, y - size, 2 * size, 2 * size);
+    stroke(context, "#000", 2);
+    label(context, name, x + size + 5, y - size - 3);
+  }
+
+  function drawScanner(context, now, position) {
+    const [x, y] = now.toPixel(position);
+    context.beginPath();
+    context.moveTo(x, y - 8);
+    context.lineTo(x + 7, y + 5);
+    context.lineTo(x - 7, y + 5);
+    context.closePath();
+    stroke(context, "#000", 2);
+    context.fill();
+  }
+
+  function label(context, words, x, y) {
+    context.font = "600 14px system-ui, sans-serif";
+    context.lineWidth = 4;
+    context.strokeStyle = "#fff";
+    context.fillStyle = "#000";
+    context.strokeText(words, x, y);
+    context.fillText(words, x, y);
+  }
+
+  function drawScale(now) {
+    const target_m = 110 * now.view.scale, decade = 10 ** Math.floor(Math.log10(target_m));
+    const length_m = [5, 2, 1].map((k) => k * decade).find((m) => m <= target_m) || decade;
+    bar.style.width = `${length_m / now.view.scale}px`;
+    bar.textContent = length_m >= 1000 ? `${length_m / 1000} km` : `${length_m} m`;
+  }
+
+  const grouped = (value, digits = 0) => number(value, digits).replace(/\B(?=(\d{3})+(?!\d))/g, "\u202f");
+  map.on.hover = (position) => {
+    hover.textContent = position ? `${grouped(position[0])} E, ${grouped(position[1])} N` : "";
+  };
+
+  // ---- tools
+
+  function choose(name) {
+    tool = name;
+    for (const button of buttons) button.setAttribute("aria-pressed", String(button.dataset.tool === name));
+    hint.textContent = text[`hint_${name}`];
+    if (name !== "polygon" && !closed) polygon = [];
+    map.draw();
+  }
+
+  map.on.drawsBox = () => tool === "box";
+  map.on.box = (corners) => askArea(corners);
+  map.on.tap = (position, event) => tap(position, event);
+  map.on.finish = (event) => {
+    if (tool === "polygon" && !closed && event && polygon.length > 2) askArea(polygon);
+    else if (!event) { places = []; polygon = []; closed = false; panel.hidden = true; link(); map.draw(); }
+  };
+
+  function tap(position) {
+    if (tool === "polygon") {
+      if (closed) { polygon = []; closed = false; places = []; }
+      const near = polygon.length > 2 && Math.hypot(...position.map((x, k) => x - polygon[0][k])) < SNAP_PX * map.view.scale;
+      if (near) { askArea(polygon); return; }
+      polygon.push(position);
+      map.draw();
+      return;
+    }
+    if (tool === "compare" && places.length) askDifference(places[0], position);
+    else askPlace(position);
+  }
+
+  // ---- answers; an answer that a newer question has overtaken is dropped
+
+  let question = 0;
+  async function ask(promise, show) {
+    const mine = ++question;
+    panel.hidden = false;
+    panel.replaceChildren(make("p", { textContent: text.loading }));
+    map.draw();
+    link();
+    const answer = await promise;
+    if (mine === question) show(answer);
+  }
+
+  function askPlace(position) {
+    places = [position];
+    polygon = [];
+    ask(reader.place(position), (answer) => {
+      if (!answer) { tell(text.not_observed); return; }
+      const heading = fill(text.title_place, { size: about.block_m, east: grouped(position[0]), north: grouped(position[1]) });
+      show(heading, text.curve_change, answer.curve, (at) => [
+        [text.change, withHalf(at.change, at.sigma, 3, "m")],
+        [text.random, `${number(at.random, 4)} m`], [text.systematic, `${number(at.systematic, 4)} m`],
+        [text.height, `${number(answer.height_m, 1)} m`], [text.range, `${grouped(answer.range_m)} m`],
+        [text.incidence, `${number(answer.incidence_deg, 0)}°`],
+      ]);
+    });
+  }
+
+  function askDifference(first, second) {
+    places = [first, second];
+    polygon = [];
+    ask(reader.difference(first, second), (curve) => {
+      if (!curve) { tell(text.not_observed); return; }
+      const distance = grouped(Math.hypot(first[0] - second[0], first[1] - second[1]));
+      show(fill(text.title_difference, { east: grouped(second[0]), north: grouped(second[1]), distance }),
+        text.curve_difference, curve, (at) => [
+          [text.difference, withHalf(at.change, at.sigma, 3, "m")],
+          [text.random, `${number(at.random, 4)} m`], [text.systematic, `${number(at.systematic, 4)} m`]]);
+    });
+  }
+
+  function askArea(corners) {
+    polygon = corners;
+    closed = true;
+    places = [];
+    ask(reader.area(corners), (answer) => {
+      if (answer.tooLarge) { tell(fill(text.too_large, { area: number(reader.maxArea_m2 / 1e6, 2) })); return; }
+      if (!answer.curve.length) { tell(text.not_observed); return; }
+      show(fill(text.title_area, { area: grouped(answer.size_m2) }), text.curve_mean, answer.curve, (at) => [
+        [text.mean, withHalf(at.change, at.sigma, 3, "m")],
+        [text.volume, withHalf(at.change * answer.size_m2, at.sigma * answer.size_m2, 0, "m³")],
+        [text.random, `${number(at.random, 4)} m`], [text.systematic, `${number(at.systematic, 4)} m`],
+        [text.observed, `${number(100 * at.observed, 0)} %`]]);
+    });
+  }
+
+  const withHalf = (value, sigma, digits, unit) => `${grouped(value, digits)} ± ${grouped(HALF_95 * sigma, digits)} ${unit}`;
+  const tell = (words) => panel.replaceChildren(make("p", { textContent: words }));
+
+  let current = null;
+  function show(heading, title, curve, rows) {
+    current = { curve, rows };
+    const list = make("dl", { id: "asked-values" });
+    panel.replaceChildren(make("h3", { textContent: heading }), list);
+    const time_s = curve.map((point) => point.time_s);
+    page.curve(panel, title, time_s, [{ values: curve.map((p) => p.change), half: curve.map((p) => p.change == null ? null : HALF_95 * p.sigma), digits: 3 }]);
+    page.flush();
+    const close = make("button", { type: "button", textContent: text.close });
+    close.addEventListener("click", () => map.on.finish(null));
+    const csv = make("a", { textContent: text.csv, download: "curve.csv", href: csvOf(curve) });
+    panel.append(make("p", { textContent: text.interval, className: "note" }),
+      make("p", {}, make("a", { href: location.hash, textContent: text.share, className: "share" }), " ", csv, " ", close));
+    showValues();
+  }
+
+  function csvOf(curve) {
+    const lines = curve.filter((p) => p.change != null).map((p) =>
+      [new Date(p.time_s * 1000).toISOString(), ...[p.change, p.sigma, p.random, p.systematic].map((v) => v.toFixed(5))].join(","));
+    const head = "start_utc,change_m,sigma_m,sigma_random_m,sigma_systematic_m";
+    return `data:text/csv,${encodeURIComponent([head, ...lines, ""].join("\n"))}`;
+  }
+
+  // The values at the time of the shown map, or at the last one before it that has any.
+  function showValues() {
+    const list = byId("asked-values");
+    if (!list || !current) return;
+    const until_s = data.maps[shown].time_s + 1, known = current.curve.filter((p) => p.change != null);
+    const at = known.filter((p) => p.time_s <= until_s).at(-1) || known[0];
+    list.replaceChildren();
+    if (!at) { list.append(make("p", { textContent: text.not_observed })); return; }
+    for (const [name, value] of current.rows(at)) list.append(make("div", {}, make("dt", { textContent: name }), make("dd", { textContent: value })));
+    list.append(make("div", {}, make("dt", { textContent: "UTC" }), make("dd", { textContent: page.utc(at.time_s) })));
+  }
+
+  // ---- links
+
+  const point = (position) => position.map((x) => x.toFixed(1)).join(",");
+  function link() {
+    const parts = [];
+    if (polygon.length && closed) parts.push(`area=${polygon.map(point).join(";")}`);
+    if (places.length) parts.push(`at=${point(places[0])}`);
+    if (places.length > 1) parts.push(`minus=${point(places[1])}`);
+    if (shown < data.maps.length - 1) parts.push(`time=${new Date(data.maps[shown].time_s * 1000).toISOString().slice(0, 16)}Z`);
+    history.replaceState(null, "", parts.length ? `#${parts.join("&")}` : location.pathname + location.search);
+    const share = panel.querySelector(".share");
+    if (share) share.href = location.hash;
+  }
+
+  function follow() {
+    const hash = new URLSearchParams(decodeURIComponent(location.hash.slice(1)));
+    const read = (words) => words.split(",").map(Number);
+    const isPoint = (p) => p.length === 2 && p.every(Number.isFinite);
+    if (hash.get("time")) page.showTime(Date.parse(hash.get("time")) / 1000);
+    const area = hash.get("area")?.split(";").map(read), at = hash.get("at") && read(hash.get("at"));
+    const other = hash.get("minus") && read(hash.get("minus"));
+    if (area && area.length > 2 && area.every(isPoint)) askArea(area);
+    else if (at && isPoint(at) && other && isPoint(other)) askDifference(at, other);
+    else if (at && isPoint(at)) askPlace(at);
+  }
+
+  document.addEventListener("station:shown", (event) => {
+    shown = event.detail;
+    map.draw();
+    showValues();
+    if (current) link();
+  });
+  image.addEventListener("load", map.draw);
+  addEventListener("hashchange", follow);
+  choose("place");
+  follow();
+})();

@@ -1,0 +1,387 @@
+"""Curves of the page: change of each block of about 10 m over time with its sigma, in tiles.
+
+Three tiers of tiles have the values: `latest` is rewritten with each scan, `recent` with every eighth,
+`older` once a day. `places` has what no scan changes. Times are thinned as the maps are. The systematic
+errors of an area are propagated in the browser: from the Jacobian of its blocks, the mean covariance of the
+retained epochs in `systematic`, and how the sigma of an epoch differs from it. Source: equations.md, 6.2.
+"""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+import json
+import os
+import zipfile
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+from scipy import sparse
+
+from station.archive.derived.boxes import BOXES, read_entry
+from station.archive.epochs import EpochRef
+from station.archive.netcdf_layout import Series
+from station.products.viewer.tiles import (
+    Array,
+    TileFolder,
+    byte_planes,
+    replace_file,
+    tile_script,
+    zigzag_differences,
+)
+from station.quantities import Bools, Floats, Ints, SharedParameters
+from station.queries.block_sums import Sums
+from station.queries.blocks import DAY_S, BlockQueries, SurfaceBlocks
+from station.queries.epoch_cells import CHANGE, RANDOM
+from station.science.analysis.calibration import SparseJacobian
+from station.science.uncertainty.jacobian import HeightJacobian
+
+TILE_BLOCKS = {"latest": 10, "recent": 5, "older": 5, "places": 5}  # along each side of a tile
+LATEST = 8  # epochs before they go to the recent tier
+RECENT_DAYS = 2  # before the last one, of which all epochs are in the recent tier
+QUANTUM_M = 0.001  # of the change
+SIGMA_MIN_M, SIGMA_STEP = 1e-5, 0.02  # code of a sigma: 1 + ln(sigma / minimum) / step
+MAX_COVERAGE = 255  # code of a block that was observed completely, unless it has fewer cells
+MAX_RECENT, MAX_OLDER = 132, 110  # epochs of a curve
+MAX_READ = 24  # epochs read at once; a store older than the page is read over several calls
+MAX_BASE = 24  # epochs whose covariance is averaged
+MAX_CHANGE = 2**21  # code of a change of 1 km; a difference of two has 3 bytes
+CODE_BYTES = {"change": 3, "random": 2, "systematic": 2, "coverage": 1}  # of a value, by name
+DTYPES = {"change": np.int32, "random": np.uint16, "systematic": np.uint16, "coverage": np.uint8}
+FORMAT = 1
+
+
+@dataclass(frozen=True)
+class CurveEpoch:
+    """An epoch of the curves."""
+
+    ref: EpochRef
+    start_s: float
+    is_usable: bool
+
+
+def sigma_code(sigma_m: Floats) -> Ints:
+    """Return codes of sigmas [m], to 1 %; 0 for no error."""
+    with np.errstate(divide="ignore"):
+        code = 1 + np.log(np.maximum(sigma_m, 0) / SIGMA_MIN_M) / SIGMA_STEP
+    return np.clip(np.round(np.nan_to_num(code, neginf=0)), 0, 65535).astype(np.int64)
+
+
+def curve_tiers(start_s: Floats, retained: Sequence[int]) -> dict[str, list[int]]:
+    """Return the epochs of each tier, as indices of their times (n,) [s], ascending.
+
+    All epochs of the last days, and before them those `retained`.
+    """
+    day = start_s // DAY_S
+    last, before = (
+        np.flatnonzero(day == day[-1]),
+        np.flatnonzero((day >= day[-1] - RECENT_DAYS) & (day < day[-1])),
+    )
+    full = len(last) // LATEST * LATEST
+    older = [index for index in retained if day[index] < day[-1] - RECENT_DAYS]
+    return {
+        "older": older[-MAX_OLDER:],
+        "recent": _thin([*before.tolist(), *last[:full].tolist()], MAX_RECENT),
+        "latest": last[full:].tolist(),
+    }
+
+
+def _thin(indices: list[int], count: int) -> list[int]:
+    """Return every nth of some indices, the newest included; at most `count`."""
+    step = max(1, -(-len(indices) // count))
+    return indices[::-step][::-1]
+
+
+def update_curves(
+    series: Series,
+    folder: Path,
+    tiers: Mapping[str, Sequence[CurveEpoch]],
+    progress: Callable[[], None],
+) -> dict[str, object]:
+    """Update the tiles in `folder` to the epochs of each tier, and return their description.
+
+    All epochs have one reference. Raises StoreError if something cannot be read or written.
+    """
+    epochs = [epoch for tier in tiers.values() for epoch in tier]
+    queries = BlockQueries(series)
+    tiles = _Tiles(series, folder, queries, epochs[-1].ref)
+    known = tiles.read(epochs, progress)
+    wanted = {
+        name: [epoch for epoch in tier if epoch.ref.epoch_file in known] for name, tier in tiers.items()
+    }
+    on_disk, keys = tiles.read_keys(), dict[str, str]()
+    # The geometry and the mean covariance change with the older epochs, and as a short series grows.
+    names = [epoch.ref.epoch_file for epoch in wanted["older"]]
+    keys["places"] = tiles.key([*names, str(len(known).bit_length())])
+    if on_disk.get("places") != keys["places"]:
+        tiles.write_places(_mean_shared(queries, [epoch for tier in wanted.values() for epoch in tier]))
+        progress()
+    for name, tier in wanted.items():
+        keys[name] = tiles.key([epoch.ref.epoch_file for epoch in tier])
+        if on_disk.get(name) != keys[name]:
+            tiles.write_curves(name, tier, known)
+            progress()
+    if on_disk.get("places") != keys["places"]:
+        os.sync()  # before the keys that say that the tiles are there
+    if on_disk != keys:
+        tiles.write_keys(keys)
+    return tiles.description() | {
+        "versions": {name: key[:8] for name, key in keys.items() if name == "places" or wanted[name]}
+    }
+
+
+def _mean_shared(queries: BlockQueries, epochs: list[CurveEpoch]) -> SharedParameters | None:
+    """Return the shared parameters with the mean covariance of epochs spread over those given."""
+    chosen = np.unique(np.linspace(0, len(epochs) - 1, min(len(epochs), MAX_BASE)).astype(int))
+    known = [
+        shared
+        for shared in (queries.shared(epochs[index].ref) for index in chosen.tolist())
+        if shared is not None
+    ]
+    known = [shared for shared in known if shared.names == known[-1].names]
+    if not known:
+        return None
+    return replace(
+        known[-1],
+        covariance=np.mean([shared.covariance for shared in known], axis=0),
+        line_tilt_variance=np.mean([shared.line_tilt_variance for shared in known], axis=0),
+    )
+
+
+class _Grouping:
+    """Blocks (n,) of a grid of blocks, grouped in square tiles."""
+
+    def __init__(self, known: Bools, size: int) -> None:
+        row, column = np.nonzero(known)
+        self.columns = -(-known.shape[1] // size)
+        self.rows = -(-known.shape[0] // size)
+        tile = row // size * self.columns + column // size
+        self.order = np.argsort(tile, kind="stable")
+        self.local = (row % size * size + column % size)[self.order].astype(np.uint8)
+        numbers, first = np.unique(tile[self.order], return_index=True)
+        # Number, first and end of each tile in the order.
+        self.tiles = list(
+            zip(numbers.tolist(), first.tolist(), [*first[1:].tolist(), len(tile)], strict=True)
+        )
+
+    def name(self, number: int) -> str:
+        """Return the name of a tile: its row and column."""
+        row, column = divmod(number, self.columns)
+        return f"{row}_{column}"
+
+
+class _Tiles:
+    """The tiles of one version of the reference."""
+
+    def __init__(self, series: Series, folder: Path, queries: BlockQueries, newest: EpochRef) -> None:
+        self._series, self._folder, self._queries, self._newest = series, folder, queries, newest
+        blocks = queries.read(newest)
+        self._version = blocks.cells.reference.version
+        self._newest_blocks = blocks
+        self.surface: SurfaceBlocks = queries.surface(newest, blocks.rock > 0.5)
+        self._groupings = {size: _Grouping(self.surface.known, size) for size in set(TILE_BLOCKS.values())}
+        self._cache = folder / ".curves" / self._version
+        self._max_coverage = min(queries.cells**2, MAX_COVERAGE)
+
+    @cached_property
+    def _box(self) -> Array:
+        """Return the box of 100 m (n,) of each block, as an index into the flattened boxes."""
+        row, column = np.nonzero(self.surface.known)
+        size = self._queries.blocks_per_box
+        return np.asarray(row // size * -(-self.surface.known.shape[1] // size) + column // size)
+
+    def key(self, names: list[str]) -> str:
+        """Return a text that changes with what a tier is made of."""
+        return hashlib.sha256(json.dumps([FORMAT, self._version, *names]).encode()).hexdigest()
+
+    def read_keys(self) -> dict[str, str]:
+        """Return the keys of the tiers on disk; none if they are missing or damaged."""
+        try:
+            keys = json.loads((self._folder / ".curves" / "keys.json").read_text())
+        except (OSError, ValueError):
+            return {}
+        return keys if isinstance(keys, dict) else {}
+
+    def write_keys(self, keys: dict[str, str]) -> None:
+        """Write the keys of the tiers on disk."""
+        replace_file(self._folder / ".curves" / "keys.json", json.dumps(keys).encode())
+
+    def read(self, epochs: Sequence[CurveEpoch], progress: Callable[[], None]) -> dict[str, Sums]:
+        """Return the codes of epochs by file name, newest first; at most MAX_READ that are not cached."""
+        known: dict[str, Sums] = {}
+        read_count = 0
+        for epoch in reversed(epochs):
+            name = epoch.ref.epoch_file
+            codes = _load(self._cache / f"{name}.npz", int(np.count_nonzero(self.surface.known)))
+            if codes is None:
+                if read_count == MAX_READ:
+                    continue
+                read_count += 1
+                codes = self._codes(epoch)
+                _save(self._cache / f"{name}.npz", codes)
+                progress()
+            known[name] = codes
+        for path in (self._folder / ".curves").glob("*/*.npz"):
+            if path.parent != self._cache or path.name.removesuffix(".npz") not in known:
+                path.unlink(missing_ok=True)
+        return known
+
+    def _codes(self, epoch: CurveEpoch) -> Sums:
+        """Return the values of an epoch as integers, those of blocks (n,) row by row."""
+        is_newest = epoch.ref == self._newest
+        blocks = self._newest_blocks if is_newest else self._queries.read(epoch.ref)
+        systematic_m2 = np.zeros(blocks.count.shape)
+        if blocks.jacobian is not None and blocks.shared is not None:
+            systematic_m2[blocks.observed] = blocks.jacobian.variance(blocks.shared)
+        full = self._queries.cells**2
+        values = {
+            "change": np.round(blocks.change_m / QUANTUM_M),
+            "random": sigma_code(np.sqrt(blocks.random_m2)),
+            "systematic": sigma_code(np.sqrt(systematic_m2)),
+            "coverage": np.ceil(blocks.count / full * self._max_coverage),
+        }
+        codes = {
+            name: np.clip(raster, -MAX_CHANGE, MAX_CHANGE)[self.surface.known].astype(DTYPES[name])
+            for name, raster in values.items()
+        }
+        boxes = read_entry(self._series, BOXES, epoch.start_s)
+        if boxes is not None:
+            systematic_m2 = boxes[f"{CHANGE}_uncertainty"] ** 2 - boxes[RANDOM] ** 2
+            sigma_m = np.sqrt(np.maximum(np.nan_to_num(systematic_m2), 0))
+            codes["boxes"] = sigma_code(sigma_m).astype(np.uint16)
+        return codes
+
+    def write_curves(self, tier: str, epochs: Sequence[CurveEpoch], known: dict[str, Sums]) -> None:
+        """Write the tiles of a tier."""
+        folder, grouping = TileFolder(self._folder / tier), self._groupings[TILE_BLOCKS[tier]]
+        if epochs:
+            codes = [known[epoch.ref.epoch_file] for epoch in epochs]
+            planes = np.concatenate(
+                [
+                    byte_planes(zigzag_differences(_filled(codes, name)[:, grouping.order]), size)
+                    for name, size in CODE_BYTES.items()
+                ]
+            )
+            start_s = np.array([round(epoch.start_s) for epoch in epochs], np.int64)
+            heads = [
+                byte_planes(np.diff(start_s, prepend=0), 4).tobytes(),
+                np.array([epoch.is_usable for epoch in epochs], np.uint8).tobytes(),
+            ]
+            boxes = self._box_of_tiles(codes, grouping)
+            for position, (number, first, end) in enumerate(grouping.tiles):
+                box = byte_planes(boxes[:, position], 2).tobytes()
+                values = planes[:, :, first:end].tobytes()
+                data = b"".join([grouping.local[first:end].tobytes(), *heads, box, values])
+                folder.write(grouping.name(number), {"times": len(epochs), "blocks": end - first}, data)
+        folder.delete_others()
+
+    def _box_of_tiles(self, codes: list[Sums], grouping: _Grouping) -> Ints:
+        """Return the code (t, tiles) of the systematic sigma of the box in the middle of each tile."""
+        middle = np.array([(first + end) // 2 for _, first, end in grouping.tiles])
+        box = self._box[grouping.order][middle]
+        rows = [epoch["boxes"].ravel() if "boxes" in epoch else None for epoch in codes]
+        return np.array([np.zeros(len(box), int) if row is None else row[box] for row in rows], np.int64)
+
+    def write_places(self, base: SharedParameters | None) -> None:
+        """Write what no scan changes: heights, geometry and Jacobian of blocks, and the mean covariance."""
+        surface, grouping = self.surface, self._groupings[TILE_BLOCKS["places"]]
+        jacobian = surface.jacobian if base is not None else None
+        reference_m2 = surface.random_m2 / np.maximum(self._queries.cells**2, 1)
+        rows = [
+            surface.points[2],
+            surface.observation.range_m,
+            np.degrees(np.arccos(surface.observation.cos_incidence)),
+            np.sqrt(reference_m2),
+        ]
+        box_m = np.zeros(len(grouping.order))
+        if jacobian is not None and base is not None:
+            rows += [*jacobian.pose, jacobian.sight_tilt, jacobian.refraction, jacobian.cross_tilt]
+            rows += [jacobian.knot_position]
+            box_m = self._box_sigma(jacobian, base)
+        rows.append(box_m)
+        values = np.array(rows, np.float64)[:, grouping.order].astype("<f4")
+        folder = TileFolder(self._folder / "places")
+        for number, first, end in grouping.tiles:
+            data = grouping.local[first:end].tobytes() + values[:, first:end].tobytes()
+            folder.write(grouping.name(number), {"blocks": end - first, "values": len(values)}, data)
+        folder.delete_others()
+        _write_systematic(self._folder / "systematic.js", jacobian, base)
+
+    def _box_sigma(self, jacobian: HeightJacobian, base: SharedParameters) -> Floats:
+        """Return the systematic sigma (n,) of the box of each block for the mean covariance [m]."""
+        box, index = np.unique(self._box, return_inverse=True)
+        count = np.bincount(index)
+        entries = 1 / count[index], (index, np.arange(len(index)))
+        weights = sparse.csr_array(entries, shape=(len(box), len(index)))
+        variance_m2 = SparseJacobian(jacobian).sums(weights).variance(np.zeros(len(index)), base)
+        return np.asarray(np.sqrt(variance_m2)[index])
+
+    def description(self) -> dict[str, object]:
+        """Return what a browser must know to read the tiles."""
+        grid, position_m = self._series.grid, self._newest_blocks.cells.scanner[:3]
+        is_known = bool(np.isfinite(position_m).all())
+        grouping = self._groupings[TILE_BLOCKS["places"]]
+        has_tile = np.zeros(grouping.rows * grouping.columns, bool)
+        has_tile[[number for number, _, _ in grouping.tiles]] = True
+        return {
+            "west_m": grid.west_m,
+            "north_m": grid.north_m,
+            "block_m": self._queries.cells * grid.cell_m,
+            "tile_blocks": TILE_BLOCKS,
+            "tiles": base64.b64encode(np.packbits(has_tile).tobytes()).decode(),
+            "columns": grouping.columns,
+            "quantum_m": QUANTUM_M,
+            "sigma_min_m": SIGMA_MIN_M,
+            "sigma_step": SIGMA_STEP,
+            "full": self._max_coverage,
+            "scanner_m": [round(value, 3) for value in position_m] if is_known else None,
+        }
+
+
+def _filled(codes: list[Sums], name: str) -> Array:
+    """Return the codes (t, n) of a quantity; where a block was not observed, those of the epoch before."""
+    values = np.array([epoch[name] for epoch in codes], np.int32)
+    if name != "coverage":
+        for previous, row, epoch in zip(values, values[1:], codes[1:], strict=False):
+            np.copyto(row, previous, where=epoch["coverage"] == 0)
+    return values
+
+
+def _write_systematic(path: Path, jacobian: HeightJacobian | None, base: SharedParameters | None) -> None:
+    """Write the mean covariance of the shared parameters, scaled to units of their sigma."""
+    head, data = {"parameters": 0}, b""
+    if jacobian is not None and base is not None:
+        params = jacobian.params
+        lower = base.covariance[np.tril_indices(len(base.names))]
+        head = {
+            "parameters": len(base.names),
+            "intervals": params.knot_intervals,
+            "tilt_knots": params.sight_tilt_knots,
+            "refraction_knots": params.refraction_knots,
+        }
+        data = np.concatenate([lower, base.line_tilt_variance]).astype("<f4").tobytes()
+    replace_file(path, tile_script("systematic", head, data))
+
+
+def _load(path: Path, count: int) -> Sums | None:
+    """Return cached codes; None if there are none, or if they are damaged."""
+    try:
+        with path.open("rb") as opened, np.load(opened) as file:
+            codes = {name: file[name] for name in file.files}
+    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile):
+        return None
+    return codes if all(len(codes.get(name, ())) == count for name in CODE_BYTES) else None
+
+
+def _save(path: Path, codes: Sums) -> None:
+    """Cache codes; skipped without an error if that fails."""
+    tmp_path = path.with_name(f".{path.name}.part")
+    with suppress(OSError):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with tmp_path.open("wb") as file:
+            np.savez(file, **codes)  # type: ignore[arg-type]
+        tmp_path.replace(path)
