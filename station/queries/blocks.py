@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 from scipy import sparse
 
+from station.archive.computed_rasters import CHANGE, RANDOM, TOTAL
 from station.archive.derived.boxes import (
     BOX_M,
     Entries,
@@ -28,7 +29,7 @@ from station.archive.netcdf_layout import Series
 from station.archive.series.index import SeriesIndex, references_and_usable
 from station.quantities import Bools, Floats, Ints, Reference, SharedParameters
 from station.queries.block_sums import Sums, cells_per_block, drop_epoch_sums, epoch_sums, reference_sums
-from station.queries.epoch_cells import CHANGE, RANDOM, EpochCells, EpochReader
+from station.queries.epoch_cells import EpochCells, EpochReader
 from station.science.analysis.calibration import SparseJacobian
 from station.science.geometry.terrain import GRADIENT_CELLS, smooth_gradient
 from station.science.uncertainty.common_mode import cross_covariance
@@ -94,7 +95,7 @@ class BlockQueries:
             )
         rasters = {
             CHANGE: weights @ blocks.change_m[blocks.observed],
-            f"{CHANGE}_uncertainty": np.sqrt(variance_m2),
+            TOTAL: np.sqrt(variance_m2),
             RANDOM: np.sqrt(random_m2),
             "coverage": total / (self.cells * size) ** 2,
         }
@@ -128,7 +129,7 @@ class BlockQueries:
             missing &= ~first
         rasters = {
             CHANGE: change_m / count,
-            f"{CHANGE}_uncertainty": np.sqrt(random_m2 + shared_m2),
+            TOTAL: np.sqrt(random_m2 + shared_m2),
             RANDOM: np.sqrt(random_m2),
             "coverage": cells / count / self.cells**2,
         }

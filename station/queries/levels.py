@@ -8,16 +8,16 @@ from dataclasses import dataclass
 import numpy as np
 import xarray as xr
 
+from station.archive.computed_rasters import CHANGE, RANDOM, TOTAL, open_raster
 from station.archive.epochs import EpochRef
 from station.archive.netcdf_layout import Series
-from station.archive.raster_io import LazyRaster
 from station.archive.schema import FILL
 from station.archive.series.index import SeriesIndex, references_and_usable
 from station.errors import StoreError
 from station.quantities import Bools, Floats, Floats32, Ints, Reference
 from station.queries.aggregates import Aggregates
 from station.queries.common_errors import common_error_share
-from station.queries.epoch_cells import CHANGE, RANDOM, bounding_box
+from station.queries.epoch_cells import bounding_box
 from station.science.time_series.cell_filter import CellFilter, ProcessNoise
 from station.science.time_series.class_filter import SAMPLE_CELLS, ClassFilter
 from station.science.time_series.filter_errors import filter_errors
@@ -135,8 +135,7 @@ class _AreaFilter:
                 np.copyto(kept[block], variance_m2, where=seen, casting="same_kind")
 
     def _read(self, epoch: EpochRef) -> _Observations:
-        names = CHANGE, RANDOM, f"{CHANGE}_uncertainty"
-        rasters = [LazyRaster(epoch.path, name, index=epoch.index) for name in names]
+        rasters = [open_raster(epoch.path, name, epoch.index) for name in (CHANGE, RANDOM, TOTAL)]
         row, column = np.divmod(self._read_cells, self._nx)
         values = np.empty((len(rasters), len(row)), np.float32)
         for top in range(0, rasters[0].shape[0], BAND_ROWS):
