@@ -142,6 +142,7 @@ VARIABLES: tuple[Variable, ...] = (
         None,
         3,
         "area: standard_deviation",
+        "of cells with three points or more: that of two is uncertain by three quarters",
     ),
     Variable("point_count", RASTER, "i4", "number of laser points in the cell", "1", None, None, "area: sum"),
     Variable(

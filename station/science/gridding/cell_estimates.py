@@ -273,7 +273,7 @@ class _MeasurementBuilder:
         ):
             cells[name] = values
             cells[name][few] = np.nan
-        cells["spread_m"] = sums.standard_deviation()
+        cells["spread_m"] = np.where(sums.count < FEW_POINTS, np.nan, sums.standard_deviation())
         _as_opaque_items(self.cells)[cell_index] = _as_opaque_items(cells)
         change_m = np.rint(estimates.change_m / quantum_m) * quantum_m
         self.change_m[cell_index] = np.where(enough, change_m, np.nan)
