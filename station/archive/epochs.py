@@ -14,7 +14,15 @@ import netCDF4
 import numpy as np
 
 from station.archive.atomic_files import atomic_write
-from station.archive.computed_rasters import CHANGE, OUTSIDE, RANDOM, SYSTEMATIC, TOTAL, is_value, other_part
+from station.archive.derived.computed_rasters import (
+    CHANGE,
+    OUTSIDE,
+    RANDOM,
+    SYSTEMATIC,
+    TOTAL,
+    is_value,
+    other_part,
+)
 from station.archive.discovery import time_coverage
 from station.archive.netcdf_layout import Series, create_file, create_variable, decode_text, encode_text
 from station.archive.raster_io import Array, rounded, write_rasters

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from station.archive.computed_rasters import CHANGE, RANDOM, TOTAL, open_raster
+from station.archive.derived.computed_rasters import CHANGE, RANDOM, TOTAL, open_raster
 from station.archive.epochs import EpochRef
 from station.archive.netcdf_layout import Series
 from station.archive.raster_io import Array

@@ -12,7 +12,7 @@ import numpy.typing as npt
 import shapely
 import xarray as xr
 
-from station.archive.computed_rasters import CHANGE, RANDOM, TOTAL
+from station.archive.derived.computed_rasters import CHANGE, RANDOM, TOTAL
 from station.archive.epochs import EpochRef
 from station.archive.series.index import list_epochs, processing_file, series_in
 from station.archive.series.lazy import open_virtual

@@ -9,7 +9,7 @@ import netCDF4
 import numpy as np
 
 from station.archive.areas import AreaChange
-from station.archive.computed_rasters import CHANGE, RANDOM, TOTAL
+from station.archive.derived.computed_rasters import CHANGE, RANDOM, TOTAL
 from station.archive.epochs import EpochRef
 from station.archive.netcdf_layout import Series
 from station.quantities import Bools, Floats, Grid, Quality, Reals

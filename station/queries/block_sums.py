@@ -15,8 +15,8 @@ from typing import Any
 
 import numpy as np
 
-from station.archive.computed_rasters import CHANGE, RANDOM, open_raster
 from station.archive.derived.boxes import DAILY_BLOCK_M
+from station.archive.derived.computed_rasters import CHANGE, RANDOM, open_raster
 from station.archive.epochs import EpochRef
 from station.archive.netcdf_layout import CHUNK, Series
 from station.archive.raster_io import Array

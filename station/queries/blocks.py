@@ -15,7 +15,6 @@ from typing import Any
 import numpy as np
 from scipy import sparse
 
-from station.archive.computed_rasters import CHANGE, RANDOM, TOTAL
 from station.archive.derived.boxes import (
     BOX_M,
     Entries,
@@ -24,6 +23,7 @@ from station.archive.derived.boxes import (
     daily_file,
     update_blocks,
 )
+from station.archive.derived.computed_rasters import CHANGE, RANDOM, TOTAL
 from station.archive.epochs import EpochRef
 from station.archive.netcdf_layout import Series
 from station.archive.series.index import SeriesIndex, references_and_usable

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import netCDF4
 import numpy as np
 
-from station.archive.computed_rasters import CHANGE, RANDOM, is_value, read_raster
+from station.archive.derived.computed_rasters import CHANGE, RANDOM, is_value, read_raster
 from station.archive.epochs import EpochRef
 from station.archive.netcdf_layout import Series, decode_parameters
 from station.archive.raster_io import bounding_slices

@@ -6,7 +6,7 @@ import netCDF4
 import numpy as np
 import xarray as xr
 
-from station.archive.computed_rasters import CHANGE, RANDOM, TOTAL
+from station.archive.derived.computed_rasters import CHANGE, RANDOM, TOTAL
 from station.archive.epochs import EpochRef
 from station.errors import StoreError
 from station.quantities import Bools, Floats

@@ -127,7 +127,7 @@ def test_an_export_of_old_and_new_epochs_has_the_values_of_the_series(mixed, tmp
 
 
 def test_boxes_of_an_old_and_of_a_new_epoch_of_the_same_values_are_equal(mixed):
-    epoch, random_m = sloping_epoch(1)  # in an old file in the series
+    epoch, _ = sloping_epoch(1)  # in an old file in the series
     old = BlockQueries(mixed).boxes(list_epochs(mixed)[0])
     later = replace(epoch, start_s=epoch.start_s + 40 * 3600, end_s=epoch.end_s + 40 * 3600)
     write_epoch(mixed, later)

@@ -9,7 +9,7 @@ import pytest
 from PIL import Image
 
 from station.archive import epochs
-from station.archive.computed_rasters import open_raster
+from station.archive.derived.computed_rasters import open_raster
 from station.archive.netcdf_layout import Series
 from station.archive.reference_files import write_reference
 from station.archive.series import index

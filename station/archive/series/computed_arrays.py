@@ -17,7 +17,7 @@ from xarray.core.indexing import (
     explicit_indexing_adapter,
 )
 
-from station.archive.computed_rasters import (
+from station.archive.derived.computed_rasters import (
     COMPUTED,
     ELEVATION,
     OUTSIDE,

@@ -14,7 +14,7 @@ import netCDF4
 import numpy as np
 
 from station.archive.chunk_codec import read_column
-from station.archive.computed_rasters import CHANGE
+from station.archive.derived.computed_rasters import CHANGE
 from station.archive.epochs import (
     COMPACTED,
     EpochRef,

@@ -12,7 +12,7 @@ from xarray.backends import NetCDF4DataStore
 from xarray.backends.netCDF4_ import NetCDF4ArrayWrapper
 from xarray.core.indexing import LazilyIndexedArray
 
-from station.archive.computed_rasters import CHANGE, OUTSIDE
+from station.archive.derived.computed_rasters import CHANGE, OUTSIDE
 from station.archive.netcdf_layout import CHUNK, decode_text
 from station.archive.raster_io import Array
 from station.archive.schema import BY_NAME

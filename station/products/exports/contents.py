@@ -15,7 +15,7 @@ import netCDF4
 import numpy as np
 
 from station._version import __version__
-from station.archive.computed_rasters import COMPUTED, ReferenceSurfaces, read_raster
+from station.archive.derived.computed_rasters import COMPUTED, ReferenceSurfaces, read_raster
 from station.archive.discovery import time_coverage
 from station.archive.netcdf_layout import UNCERTAINTY_ATTRIBUTE, create_file, create_variable, decode_text
 from station.archive.schema import FILL, VARIABLES, Variable

@@ -12,7 +12,7 @@ from pathlib import Path
 import h5py
 import numpy as np
 
-from station.archive.computed_rasters import COMPUTED, OUTSIDE, RANDOM
+from station.archive.derived.computed_rasters import COMPUTED, OUTSIDE, RANDOM
 from station.archive.epochs import EpochRef
 from station.archive.netcdf_layout import CHUNK, Series
 from station.archive.schema import BY_NAME
