@@ -39,7 +39,7 @@ MANTISSA_BITS, EXPONENT = 23, np.uint32(0x7F800000)  # of a float32
 SIGMA_BITS = 5  # of the mantissa: two digits, 1.6 % at most
 LEAST_STEP_M = 2.0**-24  # of the total σ
 QUANTA_PER_SIGMA = 4.0  # at least, of heights and changes as stored
-LEAST_QUANTUM_M = 2.0**-14
+QUANTUM_M = (2.0**-14, 2.0**-4)  # smallest and largest
 
 
 def round_sigma(sigma_m: Reals) -> Floats32:
@@ -67,7 +67,7 @@ def quantum(random_m: Floats32) -> Floats32:
     Its error, at most an 8th of σ, adds less than 0.3 % to σ.
     """
     quantum_m = _power_of_two(random_m) * np.float32(1 / QUANTA_PER_SIGMA)
-    return np.asarray(np.fmax(quantum_m, np.float32(LEAST_QUANTUM_M)))
+    return np.asarray(np.clip(quantum_m, np.float32(QUANTUM_M[0]), np.float32(QUANTUM_M[1])))
 
 
 def _power_of_two(values: Floats32) -> Floats32:
