@@ -183,7 +183,7 @@ def test_scans_without_scan_lines_are_measured_like_others(tmp_path):
     assert np.isfinite(expected["elevation_change"]).any()
     for name in (
         "point_count",
-        "elevation_outside_reference",
+        "elevation",
         "elevation_change",
         "elevation_change_uncertainty",
     ):

@@ -22,7 +22,7 @@ from station.simulation.station import simulate
 pytestmark = pytest.mark.integration
 
 TILES = 3
-COMPARED = ("point_count", "elevation_outside_reference", "elevation_change", "elevation_change_uncertainty")
+COMPARED = ("point_count", "elevation", "elevation_change", "elevation_change_uncertainty")
 CELL_M, SIZE_M, COUNT = 0.5, 10.0, 20_000
 SITE = """
 [station]
