@@ -51,6 +51,7 @@ from station.processing.site_files import load_areas, series_for
 from station.processing.store_tasks import update_series
 from station.quantities import Bools, Grid, Measurement, Reference, SharedParameters
 from station.queries.blocks import BlockQueries, update_boxes
+from station.science.gridding.cell_estimates import quantum, round_total
 from station.science.uncertainty.parameters import parameter_layout
 from station.service.publishing import publish
 
@@ -63,6 +64,7 @@ TEMPLATES = 3  # different rasters of a store
 ROUNDS = 3
 PAGE_UPDATES = 20  # until all maps are drawn
 READ_VARIABLES = ("elevation", "elevation_change")  # of the year on the full grid
+SYSTEMATIC_M = 0.01
 COVERAGE = 0.31  # share of the cells of a grid that an epoch observes
 READ_COVERAGE = 0.02  # of the year that is read: other cells are neither stored nor read
 SITE = """
@@ -129,14 +131,16 @@ def synthetic_epoch(grid: Grid, start: datetime, coverage: float = COVERAGE) -> 
     random_m = np.where(observed, random.uniform(0.01, 0.03, grid.shape), np.nan).astype(np.float32)
     change_m = random_m * random.normal(size=grid.shape).astype(np.float32)
     change_m -= np.where(_patches(np.random.default_rng(2), grid, 0.5), np.float32(0.2), np.float32(0.0))
+    change_m = np.rint(change_m / quantum(random_m)) * quantum(random_m)
+    systematic_m = np.where(observed, np.float32(SYSTEMATIC_M), np.float32(np.nan))
     count = np.where(observed, random.poisson(3, grid.shape) + 1, 0).astype(np.int32)
     measurement = Measurement.from_rasters(
         grid,
         observed.astype(np.uint8),
         elevation_m=2800.0 + change_m,
         change_m=change_m,
-        uncertainty_m=np.hypot(random_m, 0.01),
-        random_uncertainty_m=random_m,
+        uncertainty_m=round_total(random_m, systematic_m),
+        systematic_uncertainty_m=systematic_m,
         spread_m=random_m,
         count=count,
     )

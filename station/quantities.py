@@ -243,7 +243,7 @@ CELL_DTYPE = np.dtype(
     [
         ("elevation_m", np.float32),
         ("uncertainty_m", np.float32),  # of a single cell, everything included
-        ("random_uncertainty_m", np.float32),  # its random part, which averages out
+        ("systematic_uncertainty_m", np.float32),  # the part that cells share; the random one averages out
         ("spread_m", np.float32),  # standard deviation of the points in the cell
     ]
 )

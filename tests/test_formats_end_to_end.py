@@ -178,10 +178,13 @@ def test_counts_are_exact_and_means_to_the_storage_quantum(kind, tmp_path):
     with xr.open_dataset(next((tmp_path / "data" / "epochs").rglob("*.nc"))) as epoch:
         stored = epoch.isel(time=0) if "time" in epoch.dims else epoch
         np.testing.assert_array_equal(stored["point_count"], count)
-        assert (
-            np.abs(stored["elevation"].to_numpy() - mean_m).max()
-            <= 2**-11 + (kind in {"pcd", "cloudcompare ply", "cloudcompare text"}) * 1e-4
-        )  # single precision
+        total_m, systematic_m = (
+            stored[f"elevation_change{part}_uncertainty"].to_numpy() for part in ("", "_systematic")
+        )
+        rounding_m = np.sqrt(total_m**2 - systematic_m**2) / 8 * (1 + 1 / 32) + 2**-13
+        height_error_m = np.abs(stored["elevation_outside_reference"].to_numpy() - mean_m)
+        single_precision = kind in {"pcd", "cloudcompare ply", "cloudcompare text"}
+        assert (height_error_m <= rounding_m + single_precision * 1e-4).all()
         assert float(stored["point_total"]) == COUNT
     assert not list((tmp_path / "data").glob("converting-*"))
 
@@ -212,7 +215,12 @@ def test_scans_without_scan_lines_are_measured_like_others(tmp_path):
         assert result.returncode == 0, result.stdout + result.stderr
     expected, actual = (open_series(site / "data") for site in (folder, shuffled))
     assert np.isfinite(expected["elevation_change"]).any()
-    for name in ("point_count", "elevation", "elevation_change", "elevation_change_uncertainty"):
+    for name in (
+        "point_count",
+        "elevation",
+        "elevation_change",
+        "elevation_change_uncertainty",
+    ):
         np.testing.assert_array_equal(actual[name], expected[name], name)
 
 

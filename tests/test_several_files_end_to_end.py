@@ -108,12 +108,12 @@ def test_tiles_of_a_scan_are_measured_as_the_whole_scan(tmp_path, has_log):
     np.testing.assert_array_equal(actual["verdict"], expected["verdict"])
     if not has_log:
         np.testing.assert_array_equal(actual["point_count"], expected["point_count"])
-        for name in ("elevation", "elevation_change"):
+        for name in ("elevation_change_uncertainty", "elevation_change"):
             np.testing.assert_allclose(actual[name], expected[name], rtol=0, atol=2**-10)
         return
     same = (actual["point_count"] == expected["point_count"]).to_numpy()
     assert same.mean() > 0.995  # a point on the edge of a cell
-    for name in ("elevation", "elevation_change"):
+    for name in ("elevation_change_uncertainty", "elevation_change"):
         difference_m = (actual[name] - expected[name]).to_numpy()[same]
         sigma_m = expected["elevation_change_uncertainty"].to_numpy()[same]
         assert np.nanmax(np.abs(difference_m)) < 0.02
@@ -234,7 +234,12 @@ def test_scan_positions_are_placed_by_their_sops(tmp_path, into):
     with xr.open_dataset(next((tmp_path / "data" / "epochs").rglob("*.nc"))) as epoch:
         stored = epoch.isel(time=0) if "time" in epoch.dims else epoch
         np.testing.assert_array_equal(stored["point_count"], count)
-        assert np.abs(stored["elevation"].to_numpy() - mean_m).max() <= 2**-11
+        total_m, systematic_m = (
+            stored[f"elevation_change{part}_uncertainty"].to_numpy() for part in ("", "_systematic")
+        )
+        rounding_m = np.sqrt(total_m**2 - systematic_m**2) / 8 * (1 + 1 / 32) + 2**-13
+        height_error_m = np.abs(stored["elevation_outside_reference"].to_numpy() - mean_m)
+        assert (height_error_m <= rounding_m).all()
         assert float(stored["point_total"]) == 2 * COUNT
         assert "2025-07-15" in str(stored["scan_id"].values)
 

@@ -14,6 +14,15 @@ import netCDF4
 import numpy as np
 
 from station.archive.atomic_files import atomic_write
+from station.archive.derived.computed_rasters import (
+    CHANGE,
+    OUTSIDE,
+    RANDOM,
+    SYSTEMATIC,
+    TOTAL,
+    is_value,
+    other_part,
+)
 from station.archive.discovery import time_coverage
 from station.archive.netcdf_layout import Series, create_file, create_variable, decode_text, encode_text
 from station.archive.raster_io import Array, rounded, write_rasters
@@ -24,10 +33,10 @@ from station.quantities import Floats, Measurement, Quality, SharedParameters
 TIME_FORMAT = "%Y%m%dT%H%M%SZ"
 COMPACTED = {"days": "%Y%m%d", "months": "%Y%m"}  # kinds of compacted files: time format in their names
 MEASUREMENT_VARIABLES = {  # column of the measurement, by variable
-    "elevation": "elevation_m",
-    "elevation_change": "change_m",
-    "elevation_change_uncertainty": "uncertainty_m",
-    "elevation_change_random_uncertainty": "random_uncertainty_m",
+    OUTSIDE: "elevation_m",
+    CHANGE: "change_m",
+    TOTAL: "uncertainty_m",
+    SYSTEMATIC: "systematic_uncertainty_m",
     "elevation_spread": "spread_m",
     "point_count": "count",
     "quality": "quality",
@@ -110,9 +119,10 @@ def write_epoch(
                 *specs, rows=block, transform=lambda column, values: rounded(specs[column], values)
             )
             by_name = dict(zip(columns, rasters, strict=True))
-            by_name["quality"][by_name["elevation"] == np.float32(FILL)] |= Quality.NOT_SEEN
+            by_name["quality"][~is_value(by_name[OUTSIDE])] |= Quality.NOT_SEEN
+            by_name[OUTSIDE][is_value(by_name[CHANGE])] = FILL
             if on_rows is not None:
-                on_rows(block, by_name)
+                on_rows(block, by_name | {RANDOM: other_part(by_name[TOTAL], by_name[SYSTEMATIC])})
             return rasters
 
         write_rasters(tmp_path, list(specs.values()), get_rows)

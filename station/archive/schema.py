@@ -59,12 +59,10 @@ _MEAN = "area: mean"
 _ONE_SIGMA = "one standard deviation of a single cell"
 SAFE_BOUND = (
     "not to be averaged or divided by sqrt(n), because values of a scan share errors: an upper bound for the"
-    " mean of n of them is hypot(sqrt(sum(r^2)) / n, mean(sqrt(u^2 - r^2))), where u is this uncertainty and"
-    " r the random uncertainty"
+    " mean of n of them is sqrt(sum(u^2 - s^2) / n^2 + mean(s)^2), where u is this uncertainty and s the"
+    " systematic uncertainty"
 )
-_QUANTUM = (
-    "rounded to the power of two that is a 16th of the random uncertainty or just below, at most 1/1024 m"
-)
+_QUANTUM = "rounded to the power of two that is a quarter of the random uncertainty or just below"
 
 VARIABLES: tuple[Variable, ...] = (
     Variable(
@@ -76,7 +74,20 @@ VARIABLES: tuple[Variable, ...] = (
         "surface_altitude",
         None,
         _MEAN,
-        _QUANTUM,
+        f"reference_elevation + reference_mean_residual of the reference + elevation_change; {_QUANTUM}",
+        ancillary=("elevation_spread", "point_count", "quality"),
+    ),
+    Variable(
+        "elevation_outside_reference",
+        RASTER,
+        "f4",
+        "elevation of the surface where the reference surface is not known, mean over the cell",
+        "m",
+        "surface_altitude",
+        None,
+        _MEAN,
+        "elsewhere the elevation is reference_elevation + reference_mean_residual of reference.nc +"
+        f" elevation_change; {_QUANTUM}",
         ancillary=("elevation_spread", "point_count", "quality"),
     ),
     Variable(
@@ -88,10 +99,11 @@ VARIABLES: tuple[Variable, ...] = (
         None,
         None,
         _MEAN,
-        f"mean height of the points above the reference surface of reference.nc; {_QUANTUM}",
+        "mean height of the points above the reference surface, which is reference_elevation +"
+        f" reference_mean_residual of reference.nc; {_QUANTUM}",
         ancillary=(
             "elevation_change_uncertainty",
-            "elevation_change_random_uncertainty",
+            "elevation_change_systematic_uncertainty",
             "point_count",
             "quality",
         ),
@@ -102,7 +114,16 @@ VARIABLES: tuple[Variable, ...] = (
         "f4",
         "uncertainty of the elevation change",
         "m",
-        comment=f"{_ONE_SIGMA}, three digits; {SAFE_BOUND}; boxes.nc and station.variance are exact",
+        comment=f"{_ONE_SIGMA}, two digits or more; {SAFE_BOUND}; boxes.nc and station.variance are exact",
+    ),
+    Variable(
+        "elevation_change_systematic_uncertainty",
+        RASTER,
+        "f4",
+        "systematic uncertainty of the elevation change",
+        "m",
+        comment=f"{_ONE_SIGMA}, two digits; the part that cells of a scan share, which does not average out:"
+        " the random uncertainty is sqrt(u^2 - s^2), where u is elevation_change_uncertainty and s this one",
     ),
     Variable(
         "elevation_change_random_uncertainty",
@@ -110,7 +131,7 @@ VARIABLES: tuple[Variable, ...] = (
         "f4",
         "random uncertainty of the elevation change",
         "m",
-        comment=f"{_ONE_SIGMA}, three digits; the part that is independent between cells and averages out",
+        comment=f"{_ONE_SIGMA}, two digits; the part that is independent between cells and averages out",
     ),
     Variable(
         "elevation_spread",
@@ -121,6 +142,7 @@ VARIABLES: tuple[Variable, ...] = (
         None,
         3,
         "area: standard_deviation",
+        "of cells with three points or more: that of two is uncertain by three quarters",
     ),
     Variable("point_count", RASTER, "i4", "number of laser points in the cell", "1", None, None, "area: sum"),
     Variable(

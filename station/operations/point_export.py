@@ -96,7 +96,7 @@ def write_points(
         inputs = load_scan_inputs(site, opened, save_tilt_offset=False)
         cells, method = _cells(epoch)
         inputs, correction_m = _adjusted(site, opened, inputs, version if method == "joint" else "", progress)
-        header = _header(site, cells["elevation"])
+        header = _header(site)
 
         def blocks() -> Iterator[laspy.ScaleAwarePointRecord]:
             for shots in inputs.shots(opened, site.scans.intensity):
@@ -146,17 +146,16 @@ def _cells(epoch: EpochRef) -> tuple[dict[str, np.ndarray[Any, Any]], str]:
     with netCDF4.Dataset(epoch.path) as file:
         floats = {
             name: np.ma.filled(file[name][epoch.index].astype(np.float32), np.float32(np.nan))
-            for name in ("elevation", "elevation_change", "elevation_change_uncertainty")
+            for name in ("elevation_change", "elevation_change_uncertainty")
         }
         quality = np.ma.filled(file["quality"][epoch.index], 0).astype(np.uint8)
         return floats | {"quality": quality}, str(file["adjustment"][epoch.index])
 
 
-def _header(site: Site, elevation_m: Floats32) -> laspy.LasHeader:
+def _header(site: Site) -> laspy.LasHeader:
     header = laspy.LasHeader(point_format=POINT_FORMAT, version="1.4")
     grid = site.grid_cells
-    middle_m = np.nan_to_num(np.nanmean(elevation_m)) if np.isfinite(elevation_m).any() else 0.0
-    header.scales, header.offsets = np.full(3, SCALE_M), np.round([grid.west_m, grid.north_m, middle_m])
+    header.scales, header.offsets = np.full(3, SCALE_M), np.round([grid.west_m, grid.north_m, 0.0])
     header.add_extra_dims(
         [laspy.ExtraBytesParams(name, kind, text) for name, (kind, text) in EXTRA_BYTES.items()]
     )

@@ -8,9 +8,10 @@ from pathlib import Path
 
 import numpy as np
 
+from station.archive.derived.computed_rasters import CHANGE, RANDOM, TOTAL, open_raster
 from station.archive.epochs import EpochRef
 from station.archive.netcdf_layout import Series
-from station.archive.raster_io import Array, LazyRaster
+from station.archive.raster_io import Array
 from station.archive.schema import FILL
 from station.quantities import Bools, Floats32, Grid
 from station.queries.aggregates import Aggregates
@@ -19,11 +20,6 @@ from station.science.gridding.significance import significant
 BAND_ROWS = 128  # per chunk of a file
 SUN = (-0.55, 0.55, 0.63)  # east, north, up: from the north-west, as is usual for maps
 VERTICAL_EXAGGERATION = 1.5  # of the hillshade
-CHANGE, SIGMA, RANDOM = (
-    "elevation_change",
-    "elevation_change_uncertainty",
-    "elevation_change_random_uncertainty",
-)
 POINTS = "point_count"
 
 BandReader = Callable[[slice], Iterable[Array]]  # returns some rows (r, nx) of each raster
@@ -106,7 +102,7 @@ class OverviewBuilder:
     def __init__(self, base: BaseMap, *, points: bool = False) -> None:
         """Start an empty overview; with `points`, it includes the points per cell."""
         self._base = base
-        self.names = (CHANGE, SIGMA, RANDOM, *((POINTS,) if points else ()))
+        self.names = (CHANGE, TOTAL, RANDOM, *((POINTS,) if points else ()))
         self.sums = _BlockSums(
             base.rows, base.columns, base.factor, len(self.names), count_rasters=int(points)
         )
@@ -158,7 +154,7 @@ def difference_overview(epoch: EpochRef, other: EpochRef, base: BaseMap, series:
 
 
 def _band_reader(path: Path, index: int | None, *names: str) -> BandReader:
-    rasters = [LazyRaster(path, name, index=index) for name in names]
+    rasters = [open_raster(path, name, index) for name in names]
     return lambda rows: (raster[rows] for raster in rasters)
 
 

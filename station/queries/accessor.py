@@ -12,11 +12,11 @@ import numpy.typing as npt
 import shapely
 import xarray as xr
 
+from station.archive.derived.computed_rasters import CHANGE, RANDOM, TOTAL
 from station.archive.epochs import EpochRef
 from station.archive.series.index import list_epochs, processing_file, series_in
 from station.archive.series.lazy import open_virtual
 from station.errors import StationError
-from station.queries.epoch_cells import CHANGE, RANDOM
 from station.queries.grid_arrays import to_grid, to_mask
 from station.queries.volumes import Volumes
 
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from station.queries.grid_arrays import Epoch
 
 SAME_TIME_S = 1.0  # times of the dataset and of the store that differ less are of one epoch
-POINT_VARIABLES = (CHANGE, f"{CHANGE}_uncertainty", RANDOM, "point_count", "quality")
+POINT_VARIABLES = (CHANGE, TOTAL, RANDOM, "point_count", "quality")
 
 
 @xr.register_dataset_accessor("station")  # type: ignore[no-untyped-call]

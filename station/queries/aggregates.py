@@ -9,10 +9,11 @@ import netCDF4
 import numpy as np
 
 from station.archive.areas import AreaChange
+from station.archive.derived.computed_rasters import CHANGE, RANDOM, TOTAL
 from station.archive.epochs import EpochRef
 from station.archive.netcdf_layout import Series
 from station.quantities import Bools, Floats, Grid, Quality, Reals
-from station.queries.epoch_cells import CHANGE, RANDOM, EpochCells, EpochReader, bounding_box, read_cells_of
+from station.queries.epoch_cells import EpochCells, EpochReader, bounding_box, read_cells_of, read_window
 from station.science.adjustment import ground_classes
 from station.science.adjustment.leverage import leverage
 from station.science.analysis.voids import area_weights, void_variance
@@ -231,8 +232,8 @@ class Aggregates(EpochReader):
             raise ValueError(f"blocks of {cells} cells do not fit a grid of {grid.ny} × {grid.nx}")
         with netCDF4.Dataset(epoch.path) as file:
             change_m, random_m, sigma_m, count = (
-                np.ma.filled(file[name][epoch.index].astype(np.float64), np.nan)[: ny * cells, : nx * cells]
-                for name in (CHANGE, RANDOM, "elevation_change_uncertainty", "point_count")
+                read_window(file, name, epoch.index, (slice(ny * cells), slice(nx * cells)))
+                for name in (CHANGE, RANDOM, TOTAL, "point_count")
             )
         count = np.where(np.isfinite(change_m), count, 0.0)
 
@@ -245,7 +246,7 @@ class Aggregates(EpochReader):
             shared_m2 = block_sum(count * (sigma_m**2 - random_m**2)) / point_sum
             rasters = {
                 CHANGE: block_sum(count * change_m) / point_sum,
-                "elevation_change_uncertainty": np.sqrt(random_m2 + np.maximum(shared_m2, 0.0)),
+                TOTAL: np.sqrt(random_m2 + np.maximum(shared_m2, 0.0)),
                 RANDOM: np.sqrt(random_m2),
                 "point_count": point_sum,
             }
@@ -308,5 +309,5 @@ def observed_in_all(epochs: list[EpochCells], cells: Bools) -> Bools:
 def _has_quality(epoch: EpochRef, cells: Bools, flags: Quality) -> Bools:
     """Return True for selected cells (n,) that have any of the flags in an epoch."""
     with netCDF4.Dataset(epoch.path) as file:
-        quality = read_cells_of(file["quality"], epoch.index, cells).astype(np.int64)
+        quality = read_cells_of(file, "quality", epoch.index, cells).astype(np.int64)
     return np.asarray((quality & flags) > 0)

@@ -16,13 +16,13 @@ from typing import Any
 import numpy as np
 
 from station.archive.derived.boxes import DAILY_BLOCK_M
+from station.archive.derived.computed_rasters import CHANGE, RANDOM, open_raster
 from station.archive.epochs import EpochRef
 from station.archive.netcdf_layout import CHUNK, Series
-from station.archive.raster_io import Array, LazyRaster
+from station.archive.raster_io import Array
 from station.archive.reference_files import reference_path
 from station.archive.schema import FILL
 from station.quantities import Floats, Grid, Quality, Reference
-from station.queries.epoch_cells import CHANGE, RANDOM
 
 FOLDER = ".block_sums"  # in the data folder
 FORMAT = 1  # of the kept sums
@@ -100,7 +100,7 @@ def epoch_sums(series: Series, epoch: EpochRef) -> Sums:
     kept = _read(path, epoch.path)
     if kept is not None:
         return kept
-    rasters = {name: LazyRaster(epoch.path, name, index=epoch.index) for name in (CHANGE, RANDOM, QUALITY)}
+    rasters = {name: open_raster(epoch.path, name, epoch.index) for name in (CHANGE, RANDOM, QUALITY)}
     summer = EpochSummer(series.grid)
     for top in range(0, series.grid.ny, CHUNK):
         rows = slice(top, min(top + CHUNK, series.grid.ny))

@@ -23,12 +23,13 @@ from station.archive.derived.boxes import (
     daily_file,
     update_blocks,
 )
+from station.archive.derived.computed_rasters import CHANGE, RANDOM, TOTAL
 from station.archive.epochs import EpochRef
 from station.archive.netcdf_layout import Series
 from station.archive.series.index import SeriesIndex, references_and_usable
 from station.quantities import Bools, Floats, Ints, Reference, SharedParameters
 from station.queries.block_sums import Sums, cells_per_block, drop_epoch_sums, epoch_sums, reference_sums
-from station.queries.epoch_cells import CHANGE, RANDOM, EpochCells, EpochReader
+from station.queries.epoch_cells import EpochCells, EpochReader
 from station.science.analysis.calibration import SparseJacobian
 from station.science.geometry.observation import Observation
 from station.science.geometry.terrain import GRADIENT_CELLS, smooth_gradient
@@ -111,7 +112,7 @@ class BlockQueries:
             )
         rasters = {
             CHANGE: weights @ blocks.change_m[blocks.observed],
-            f"{CHANGE}_uncertainty": np.sqrt(variance_m2),
+            TOTAL: np.sqrt(variance_m2),
             RANDOM: np.sqrt(random_m2),
             "coverage": total / (self.cells * size) ** 2,
         }
@@ -145,7 +146,7 @@ class BlockQueries:
             missing &= ~first
         rasters = {
             CHANGE: change_m / count,
-            f"{CHANGE}_uncertainty": np.sqrt(random_m2 + shared_m2),
+            TOTAL: np.sqrt(random_m2 + shared_m2),
             RANDOM: np.sqrt(random_m2),
             "coverage": cells / count / self.cells**2,
         }

@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import netCDF4
 import numpy as np
 
+from station.archive.derived.computed_rasters import CHANGE, RANDOM, is_value, read_raster
 from station.archive.epochs import EpochRef
 from station.archive.netcdf_layout import Series, decode_parameters
 from station.archive.raster_io import bounding_slices
 from station.archive.reference_files import open_reference
+from station.archive.schema import FILL
 from station.archive.series.index import list_epochs, nearest_epoch
 from station.errors import StationError, StoreError
 from station.quantities import Bools, ChangeErrors, Floats, Reference, SharedParameters
@@ -22,7 +24,6 @@ from station.science.uncertainty.propagation import align_to
 if TYPE_CHECKING:
     from station.queries.grid_arrays import Epoch
 
-CHANGE, RANDOM = "elevation_change", "elevation_change_random_uncertainty"
 SCANNER_VARIABLES = (
     "scanner_east",
     "scanner_north",
@@ -94,7 +95,7 @@ class EpochReader:
         with netCDF4.Dataset(epoch.path) as file:
             reference = self.reference(str(file["reference_version"][epoch.index]))
             change_m, random_m = (
-                np.empty(0) if cells is None else read_cells_of(file[name], epoch.index, cells)
+                np.empty(0) if cells is None else read_cells_of(file, name, epoch.index, cells)
                 for name in (CHANGE, RANDOM)
             )
             scanner = tuple(
@@ -137,13 +138,24 @@ class EpochReader:
         return parameter_layout(self.grid, position_m, (axis_east, axis_north, axis_up)), position_m
 
 
-def read_cells_of(variable: Any, index: int, cells: Bools) -> Floats:  # noqa: ANN401 - netCDF4 has no types
-    """Return the selected cells (n,) of a raster; only their bounding box is read."""
+def read_cells_of(file: netCDF4.Dataset, name: str, index: int, cells: Bools) -> Floats:
+    """Return the selected cells (n,) of a raster of a file; only their bounding box is read."""
     if not cells.any():
         return np.empty(0)
     bounds = bounding_box(cells, 0)
-    values = np.ma.filled(variable[(index, *bounds)].astype(np.float64), np.nan)
-    return np.asarray(values[cells[bounds]])
+    return np.asarray(read_window(file, name, index, bounds)[cells[bounds]])
+
+
+def read_window(file: netCDF4.Dataset, name: str, index: int, window: tuple[slice, slice]) -> Floats:
+    """Return a window of a raster of a file, NaN without a value; not of the elevation."""
+
+    def read(stored: str) -> Floats | None:
+        if stored not in file.variables:
+            return None
+        return np.ma.filled(file[stored][(index, *window)].astype(np.float64), FILL)
+
+    values = read_raster(name, read, lambda: np.empty(0))
+    return np.where(is_value(values), values, np.nan)
 
 
 def bounding_box(cells: Bools, margin: int) -> tuple[slice, slice]:

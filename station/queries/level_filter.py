@@ -9,13 +9,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from station.archive.derived.computed_rasters import CHANGE, RANDOM, TOTAL, open_raster
 from station.archive.derived.level_files import LEVEL_NAMES
 from station.archive.epochs import EpochRef
-from station.archive.raster_io import LazyRaster
 from station.archive.schema import FILL
 from station.quantities import Bools, Floats, Floats32, Reference
 from station.queries.blocks import BlockQueries, mean_covariances
-from station.queries.epoch_cells import CHANGE, RANDOM
 from station.science.time_series.cell_filter import CellFilter, Motion, ProcessNoise
 from station.science.time_series.class_filter import SAMPLE_CELLS, ClassFilter
 from station.science.time_series.filter_errors import filter_errors
@@ -118,8 +117,7 @@ class LevelFilter:
         return CellFilter(self._filter.cells[block], self._filter.outlier_m[block])
 
     def _read(self, epoch: EpochRef) -> _Observations:
-        names = CHANGE, RANDOM, f"{CHANGE}_uncertainty"
-        rasters = [LazyRaster(epoch.path, name, index=epoch.index) for name in names]
+        rasters = [open_raster(epoch.path, name, epoch.index) for name in (CHANGE, RANDOM, TOTAL)]
         values = np.empty((len(rasters), len(self._read_cells)), np.float32)
         nx = self._shape[1]
         for top in range(0, self._shape[0], BAND_ROWS):

@@ -6,11 +6,12 @@ import netCDF4
 import numpy as np
 import xarray as xr
 
+from station.archive.derived.computed_rasters import CHANGE, RANDOM, TOTAL
 from station.archive.epochs import EpochRef
 from station.errors import StoreError
 from station.quantities import Bools, Floats
 from station.queries.aggregates import Aggregates, common_error_covariance, observed_in_all
-from station.queries.epoch_cells import CHANGE, RANDOM, EpochCells, read_cells_of
+from station.queries.epoch_cells import EpochCells, read_cells_of
 from station.science.analysis.voids import area_weights
 from station.science.analysis.volume import common_contributions, shared_contributions
 from station.science.uncertainty.parameters import parameter_layout
@@ -91,7 +92,7 @@ class Volumes(Aggregates):
         return xr.Dataset(
             {
                 CHANGE: on_map(change_m[cells.ravel()], "elevation change between two scans"),
-                f"{CHANGE}_uncertainty": on_map(
+                TOTAL: on_map(
                     np.sqrt(random_m2 + shared_m2), "uncertainty of the elevation change between two scans"
                 ),
                 RANDOM: on_map(
@@ -104,7 +105,7 @@ class Volumes(Aggregates):
     def _sigma(self, epoch: EpochRef, common_cells: Bools) -> Floats:
         """Return one sigma (n,) of the selected cells in an epoch, random and shared errors [m]."""
         with netCDF4.Dataset(epoch.path) as file:
-            return read_cells_of(file[f"{CHANGE}_uncertainty"], epoch.index, common_cells)
+            return read_cells_of(file, TOTAL, epoch.index, common_cells)
 
     def _variance_contributions(
         self, epochs: list[EpochCells], common_cells: Bools, weights: Floats, random_m2: list[Floats]

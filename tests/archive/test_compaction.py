@@ -9,7 +9,7 @@ import h5py
 import numpy as np
 import pytest
 import xarray as xr
-from support.epochs import GRID, make_epoch
+from support.epochs import GRID, make_epoch, write_surface
 from support.series import open_with_processing, without_dates
 
 import station
@@ -39,6 +39,7 @@ def values(series):
 @pytest.fixture(scope="module")
 def base_store(tmp_path_factory):
     series = Series(tmp_path_factory.mktemp("base"), "hef", GRID, "EPSG:32632")
+    write_surface(series)
     for hour in (1, 5, 9, 25, 30):  # two days
         epochs.write_epoch(series, make_epoch(hour))
     build_series(series)

@@ -8,6 +8,7 @@ import pytest
 from pydantic import ValidationError
 from pyproj import Transformer
 
+import station
 from station.archive import epochs
 from station.archive.discovery import extent, time_coverage
 from station.archive.series.virtual import build_series
@@ -88,5 +89,7 @@ def test_heights_are_above_the_ellipsoid_unless_a_geoid_is_named(series, epoch, 
     other = replace(series, vertical_datum=vertical_datum, crs=crs)
     epochs.write_epoch(other, epoch(0))
     with netCDF4.Dataset(build_series(other)) as file:
-        assert file["elevation"].standard_name == name
+        assert file["elevation_outside_reference"].standard_name == name
         assert set(file["elevation_change"].ancillary_variables.split()) <= file.variables.keys()
+    with station.open(other.folder) as ds:
+        assert ds.elevation.standard_name == name

@@ -36,7 +36,10 @@ def test_an_epoch_reads_back_to_the_last_bit(series, epoch):
     with xr.open_dataset(written.path) as ds:
         assert float(ds.time[0].astype("datetime64[s]").astype(int)) == epoch(5).start_s + 450
         for name, expected in (
-            ("elevation", measurement.to_rasters("elevation_m")[0]),
+            (
+                "elevation_change_systematic_uncertainty",
+                measurement.to_rasters("systematic_uncertainty_m")[0],
+            ),
             ("elevation_change", measurement.to_rasters("change_m")[0]),
             ("elevation_change_uncertainty", measurement.to_rasters("uncertainty_m")[0]),
         ):

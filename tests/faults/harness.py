@@ -258,7 +258,7 @@ def assert_store_intact(station, hours, undisturbed=None):
     with netCDF4.Dataset(station.data / "series.nc") as file:
         assert [str(name) for name in file["scan_id"][:]] == [scan_name(hour) for hour in sorted(hours)]
         assert np.all(np.diff(file["time"][:]) > 0)
-        for name in ("elevation", "elevation_change"):
+        for name in ("elevation_change_uncertainty", "elevation_change"):
             observed = np.isfinite(np.ma.filled(file[name][:], np.nan)).any(axis=(1, 2))
             assert observed.all(), f"{name} of {np.flatnonzero(~observed)} is half written"
     assert_nothing_twice(station)

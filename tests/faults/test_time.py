@@ -49,7 +49,7 @@ def process_scan(station, path):
     site = read_site(station.folder / "site.toml")
     result = scan_tasks.process(site, scan_file(site, path), lambda: None)
     with netCDF4.Dataset(station.data / result.epoch) as file:
-        elevation_m = np.ma.filled(file["elevation"][0], np.nan)
+        elevation_m = np.ma.filled(file["elevation_outside_reference"][0], np.nan)
         return result, elevation_m, np.diff(file["time_bnds"][0]).item()
 
 
@@ -140,4 +140,4 @@ def test_resent_scan_becomes_a_new_revision(make_station, undisturbed):
         netCDF4.Dataset(station.data / "series.nc") as file,
         netCDF4.Dataset(undisturbed().data / "series.nc") as expected,
     ):
-        np.testing.assert_array_equal(file["elevation"][2], expected["elevation"][2])
+        np.testing.assert_array_equal(file["elevation_change"][2], expected["elevation_change"][2])

@@ -24,7 +24,7 @@ STEP = np.radians(0.02)
 
 def epoch(hour, pose, **changes):
     flat = np.zeros(GRID.shape, np.float32)
-    names = ("elevation_m", "change_m", "uncertainty_m", "random_uncertainty_m", "spread_m")
+    names = ("elevation_m", "change_m", "uncertainty_m", "systematic_uncertainty_m", "spread_m")
     rasters = dict.fromkeys(names, flat) | {"count": flat.astype(np.int32)}
     size = len(GLOBAL)
     estimate = np.concatenate([pose, np.zeros(size - len(pose))])

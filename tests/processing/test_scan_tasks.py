@@ -467,13 +467,17 @@ def test_discarded_points_are_counted_and_leave_the_surface_unchanged(folder):
         assert before["discarded_share"][0] == 0
         assert after["discarded_share"][0] == pytest.approx(len(chosen) / len(order))
         assert snowy.epoch != clean.epoch
-        difference_m = np.abs(after["elevation"][:] - before["elevation"][:])
+        before_m, after_m = (file["elevation_outside_reference"][:] for file in (before, after))
+        difference_m = np.abs(after_m - before_m)
         assert difference_m.count() > 5000
-        # The azimuth of the head is sampled at other points, and heights are rounded to a 16th of σ.
-        random_m = before["elevation_change_random_uncertainty"][:]
-        assert (difference_m <= 0.01 + random_m / 16).all()
+        # The azimuth of the head is sampled at other points, and heights are rounded to a quarter of σ.
+        random_m = np.sqrt(
+            before["elevation_change_uncertainty"][:] ** 2
+            - before["elevation_change_systematic_uncertainty"][:] ** 2
+        )
+        assert (difference_m <= 0.01 + random_m / 4).all()
         assert difference_m.mean() < 0.001
-        assert np.ma.allequal(before["elevation"][:].mask, after["elevation"][:].mask)
+        assert np.ma.allequal(before_m.mask, after_m.mask)
 
 
 @pytest.mark.integration

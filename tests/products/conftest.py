@@ -72,7 +72,7 @@ def make_epoch(hour, *, grid=GRID, scan_id=None, reference="1"):
         elevation_m=elevation_m,
         change_m=change_m,
         uncertainty_m=sigma_m,
-        random_uncertainty_m=random_m,
+        systematic_uncertainty_m=np.where(observed, np.float32(0.01), np.float32(np.nan)),
         spread_m=random_m,
         count=count,
     )

@@ -9,8 +9,8 @@ import pytest
 from PIL import Image
 
 from station.archive import epochs
+from station.archive.derived.computed_rasters import open_raster
 from station.archive.netcdf_layout import Series
-from station.archive.raster_io import LazyRaster
 from station.archive.reference_files import write_reference
 from station.archive.series import index
 from station.archive.series.virtual import build_series
@@ -79,9 +79,9 @@ def test_pixels_larger_than_cells_show_block_means_and_their_sigma(series, last,
     assert base.factor == factor
     assert base.rows.stop - base.rows.start == factor * base.grid.ny
     with netCDF4.Dataset(last.path) as file:
-        change, sigma, random = (
+        change, sigma, systematic = (
             np.ma.filled(file[f"elevation_change{suffix}"][0].astype(float), np.nan)[base.rows, base.columns]
-            for suffix in ("", "_uncertainty", "_random_uncertainty")
+            for suffix in ("", "_uncertainty", "_systematic_uncertainty")
         )
         points = np.asarray(file["point_count"][0])[base.rows, base.columns]
     for row, column in np.ndindex(base.grid.shape):
@@ -92,8 +92,8 @@ def test_pixels_larger_than_cells_show_block_means_and_their_sigma(series, last,
             continue
         n = observed.sum()
         assert overview.change_m[row, column] == pytest.approx(change[block][observed].mean(), abs=1e-5)
-        random_variance = np.sum(random[block][observed] ** 2) / n**2
-        systematic_variance = np.mean(sigma[block][observed] ** 2 - random[block][observed] ** 2)
+        random_variance = np.sum(sigma[block][observed] ** 2 - systematic[block][observed] ** 2) / n**2
+        systematic_variance = np.mean(systematic[block][observed] ** 2)
         assert overview.sigma_m[row, column] == pytest.approx(
             np.sqrt(random_variance + systematic_variance), rel=1e-3
         )
@@ -115,7 +115,7 @@ def test_overview_built_while_writing_equals_that_of_the_stored_epoch(series, sm
     by_bands = OverviewBuilder(base, points=True)
     for top in range(0, small.GRID.ny, 7):  # not a multiple of the pixel size
         rows = slice(top, min(top + 7, small.GRID.ny))
-        by_bands.add(rows, {name: LazyRaster(written.path, name, index=0)[rows] for name in by_bands.names})
+        by_bands.add(rows, {name: open_raster(written.path, name, 0)[rows] for name in by_bands.names})
     assert np.isfinite(while_writing.points).sum() > 100 * (base.factor == 1)
     for name in ("change_m", "sigma_m", "points"):
         expected = getattr(stored, name)

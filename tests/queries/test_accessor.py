@@ -50,7 +50,8 @@ def ds(folder):
 def test_the_series_has_the_results_and_the_accessor_how_they_were_computed(ds):
     assert set(ds.data_vars) == {
         "elevation", "elevation_change", "elevation_change_uncertainty",
-        "elevation_change_random_uncertainty", "elevation_spread", "point_count", "quality", "scan_id",
+        "elevation_change_systematic_uncertainty", "elevation_change_random_uncertainty",
+        "elevation_spread", "point_count", "quality", "scan_id",
         "verdict", "verdict_reason", "coverage", "valid_count", "stable_nmad", "air_temperature",
         "reference_version", "epoch_file",
     }  # fmt: skip

@@ -181,7 +181,7 @@ def test_sums_kept_while_an_epoch_is_written_have_the_bits_of_the_stored_rasters
     ref = list_epochs(stored)[-1]
     kept = stored.folder / FOLDER / f"{path.name}.npz"
     with monkeypatch.context() as no_raster:
-        no_raster.setattr(block_sums, "LazyRaster", None)
+        no_raster.setattr(block_sums, "open_raster", None)
         expected = BlockQueries(stored).boxes(ref)
     content = bytearray(kept.read_bytes())
     content[len(content) // 2] ^= 1

@@ -41,7 +41,9 @@ def add(series, hours):
         epoch = random_epoch(hour, GRID, SIGMA_M, scatter_m=0.02, provenance={"reference_version": "1"})
         change_m = epoch.measurement.change_m - np.float32(hour / 10 + 0.05 * hour / 24)
         cells = epoch.measurement.cells.copy()
-        cells["uncertainty_m"] = 1.02 * cells["random_uncertainty_m"]
+        random_m2 = cells["uncertainty_m"] ** 2 - cells["systematic_uncertainty_m"] ** 2
+        cells["uncertainty_m"] = 1.02 * np.sqrt(random_m2)
+        cells["systematic_uncertainty_m"] = np.sqrt((1.02**2 - 1) * random_m2)
         measurement = replace(epoch.measurement, change_m=change_m, cells=cells)
         write_epoch(series, replace(epoch, measurement=measurement))
     build_series(series)

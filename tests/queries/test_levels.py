@@ -49,7 +49,7 @@ def scan(hour):
         elevation_m=np.where(observed, 2800.0, np.nan),
         change_m=np.where(observed, change_m, np.nan).astype(np.float32),
         uncertainty_m=1.01 * sigma_m,
-        random_uncertainty_m=sigma_m,
+        systematic_uncertainty_m=np.sqrt(np.float32(1.01**2 - 1)) * sigma_m,
         spread_m=sigma_m,
         count=observed.astype(np.int32),
     )

@@ -87,7 +87,7 @@ def write_store(folder, errors, *, factor=1.0, adjustment="joint"):
             elevation_m=np.where(observed, ELEVATION_M, np.nan),
             change_m=change_m,
             uncertainty_m=np.where(observed, sigma_m, np.nan).astype(np.float32),
-            random_uncertainty_m=random_m,
+            systematic_uncertainty_m=np.sqrt(np.maximum(sigma_m**2 - random_m**2, 0)).astype(np.float32),
             spread_m=random_m,
             count=observed.astype(np.int32),
         )

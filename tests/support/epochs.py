@@ -7,10 +7,12 @@ import pytest
 
 from station.archive.epochs import Epoch
 from station.archive.netcdf_layout import Series
-from station.quantities import ChangeErrors, Grid, Measurement, SharedParameters
+from station.archive.reference_files import write_reference
+from station.quantities import ChangeErrors, Grid, Measurement, Reference, SharedParameters
 
 GRID = Grid(west_m=632000.0, north_m=5186000.0, cell_m=10.0, nx=150, ny=140)
 START_S = 1_763_683_200.0  # 2025-11-21 00:00 UTC
+SURFACE_M = 2800.0  # height of the reference, less a slope of a millionth to the north
 
 
 @pytest.fixture
@@ -18,6 +20,13 @@ def series(tmp_path):
     return Series(
         tmp_path, "hef", GRID, "EPSG:32632", "EGM2008 geoid", "Hintereisferner", "Institute of Tests"
     )
+
+
+def write_surface(series):
+    """Write the reference that the changes of `make_epoch` are counted from."""
+    grid = series.grid
+    surface_m = np.broadcast_to(SURFACE_M + grid.y_m[:, None] / 1e6, grid.shape)
+    write_reference(series, Reference.from_elevation(grid, "1", surface_m, surface_m > 0))
 
 
 @pytest.fixture
@@ -30,16 +39,16 @@ def make_epoch(hour, *, value=None, grid=GRID, terms=False):
     observed = np.zeros(grid.shape, bool)
     observed[:, : grid.nx // 2] = True
     change = np.where(observed, hour / 100 if value is None else value, np.nan).astype(np.float32)
-    elevation = np.where(observed, 2800.0 + grid.y_m[:, None] / 1e6, np.nan)
+    elevation = np.where(observed, SURFACE_M + grid.y_m[:, None] / 1e6, np.nan)
     count = np.where(observed, 3, 0).astype(np.int32)
     sigma = np.where(observed, 0.05, np.nan).astype(np.float32)
     measurement = Measurement.from_rasters(
         grid,
         observed.astype(np.uint8),
-        elevation_m=elevation,
+        elevation_m=elevation + np.nan_to_num(change),
         change_m=change,
         uncertainty_m=2 * sigma,
-        random_uncertainty_m=sigma,
+        systematic_uncertainty_m=np.sqrt(np.float32(3)) * sigma,
         spread_m=sigma,
         count=count,
         **({"sigma_geometry": sigma} if terms else {}),
@@ -83,7 +92,7 @@ def random_epoch(hour, grid, random_m, *, unseen=None, quality=0, scatter_m=0.1,
         elevation_m=np.where(observed, 2900.0, np.nan),
         change_m=change_m,
         uncertainty_m=2 * sigma_m,
-        random_uncertainty_m=sigma_m,
+        systematic_uncertainty_m=np.sqrt(np.float32(3)) * sigma_m,
         spread_m=sigma_m,
         count=observed.astype(np.int32),
     )

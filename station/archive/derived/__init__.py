@@ -1,1 +1,1 @@
-"""Files that are computed from the epochs, and parts of them: fingerprints, outlines of areas, boxes."""
+"""What is computed from the epochs: files, parts of them, and rasters that are not stored."""

@@ -14,6 +14,7 @@ import netCDF4
 import numpy as np
 
 from station.archive.chunk_codec import read_column
+from station.archive.derived.computed_rasters import CHANGE
 from station.archive.epochs import (
     COMPACTED,
     EpochRef,
@@ -123,7 +124,7 @@ class SeriesIndex(Sequence[EpochRef]):
             bounds_s = np.asarray(file["time_bnds"][:], dtype=np.float64)
             self.time_s, self.start_s = middle(bounds_s), bounds_s[:, 0]
             self.epoch_file = read_column(file["epoch_file"]).view(self.epoch_file.dtype)[:, 0]
-            for source in file["elevation"].virtual_sources():
+            for source in file[CHANGE].virtual_sources():
                 is_whole_file = source.src_space.get_select_type() == h5py.h5s.SEL_ALL
                 file_start = 0 if is_whole_file else source.src_space.get_select_bounds()[0][0]
                 self._file_starts.append(source.vspace.get_select_bounds()[0][0])
@@ -171,7 +172,7 @@ def source_files(series_path: Path) -> set[Path]:
     if not series_path.is_file():
         return set()
     with read_errors(series_path), h5py.File(series_path, "r") as file:
-        linked = file["elevation" if "elevation" in file else "time"]
+        linked = file[CHANGE if CHANGE in file else "time"]
         return {series_path.parent / source.file_name for source in linked.virtual_sources()}
 
 

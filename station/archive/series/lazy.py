@@ -6,12 +6,17 @@ from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import xarray as xr
 from xarray.backends import NetCDF4DataStore
 from xarray.backends.netCDF4_ import NetCDF4ArrayWrapper
 from xarray.core.indexing import LazilyIndexedArray
 
-from station.archive.netcdf_layout import CHUNK
+from station.archive.derived.computed_rasters import CHANGE, OUTSIDE
+from station.archive.netcdf_layout import CHUNK, decode_text
+from station.archive.raster_io import Array
+from station.archive.schema import BY_NAME
+from station.archive.series.computed_arrays import ComputedArrays, Key
 from station.archive.series.index import data_folder, source_files
 from station.archive.series.virtual import COMMENT, PROCESSING_COMMENT
 from station.errors import StoreError
@@ -45,9 +50,9 @@ def open_virtual(path: Path, chunks: Chunks = None) -> xr.Dataset:
             f"{path}: {len(missing)} of its source files are missing, the first is {missing[0]}: restore them"
         )
     store = _SeriesStore.open(path)  # type: ignore[no-untyped-call]
-    store.sources = sources
-    large = {name for name, variable in store.ds.variables.items() if variable.ndim > 2}
+    store.folder, store.sources = path.parent, sources
     ds = xr.open_dataset(store, decode_timedelta=False)
+    large = {str(name) for name, variable in ds.variables.items() if variable.ndim > 2}
     if chunks is not None:  # texts have no chunks that dask could choose
         small = set(map(str, ds.variables)) - large - set(map(str, ds.dims))
         if isinstance(chunks, Mapping):
@@ -64,9 +69,31 @@ def open_virtual(path: Path, chunks: Chunks = None) -> xr.Dataset:
 
 
 class _SeriesStore(NetCDF4DataStore):
-    """The variables of a `series.nc`; reading a raster raises StoreError if a source has vanished."""
+    """The variables of a `series.nc`, and those that are computed from them.
 
+    Reading a raster raises StoreError if a source has vanished.
+    """
+
+    folder = Path()
     sources: Collection[Path] = ()
+
+    def get_variables(self) -> Mapping[str, xr.Variable]:
+        """Return the lazy variables by name, rasters in the order of the schema."""
+        stored: dict[str, xr.Variable] = dict(super().get_variables())  # type: ignore[no-untyped-call]
+        if CHANGE not in stored:
+            return stored
+        computed = ComputedArrays(self.folder, stored, self._read_stored, self._read_versions)
+        variables = stored | computed.variables()
+        variables.pop(OUTSIDE, None)  # it is in the elevation
+        position = {name: number for number, name in enumerate(BY_NAME)}
+        return dict(sorted(variables.items(), key=lambda item: position.get(item[0], -1)))
+
+    def _read_stored(self, name: str, key: Key) -> Array:
+        return np.asarray(_CheckedArray(name, self)._getitem(key))  # type: ignore[no-untyped-call]  # noqa: SLF001 - of this module
+
+    def _read_versions(self) -> list[str]:
+        characters = _CheckedArray("reference_version", self)._getitem(...)  # type: ignore[no-untyped-call]  # noqa: SLF001
+        return decode_text(np.asarray(characters))
 
     def open_store_variable(self, name: str, var: Any) -> xr.Variable:  # noqa: ANN401 - netCDF4 has no types
         """Return a lazy variable; that of a raster has chunks to read and to write it by."""

@@ -15,8 +15,9 @@ import netCDF4
 import numpy as np
 
 from station._version import __version__
+from station.archive.derived.computed_rasters import COMPUTED, ReferenceSurfaces, read_raster
 from station.archive.discovery import time_coverage
-from station.archive.netcdf_layout import UNCERTAINTY_ATTRIBUTE, create_file, create_variable
+from station.archive.netcdf_layout import UNCERTAINTY_ATTRIBUTE, create_file, create_variable, decode_text
 from station.archive.schema import FILL, VARIABLES, Variable
 from station.archive.series.epoch_reader import EpochSource, Parameters, contiguous_runs, read_source
 from station.errors import StoreError
@@ -52,14 +53,16 @@ class PartContents:
             id(source): [order[name] for name in source.parameters] for source in self.sources
         }  # of the parameters
         large = {name for source in self.sources for name in source.raster_shapes}
+        present = large if selection.refers_to_store else large | set(COMPUTED)
         self.variables = [
             spec
             for spec in VARIABLES
-            if spec.name in selection.variables and (spec.name in large or not spec.is_large)
+            if spec.name in selection.stored_or_computed and (spec.name in present or not spec.is_large)
         ]
         self.rasters = [spec for spec in self.variables if spec.is_raster]
         opened = partial(h5py.File, mode="r", rdcc_nbytes=0)
         self._open = lru_cache(MAX_OPEN_FILES)(opened)  # a file is closed when it is dropped
+        self._surfaces = ReferenceSurfaces(selection.series)
 
     @property
     def shape(self) -> tuple[int, int, int]:
@@ -152,19 +155,41 @@ class PartContents:
         steps = chunks[0], chunks[1] * scale, chunks[2] * scale
         yield from product(*(_slices(size, step) for size, step in zip(self.shape, steps, strict=True)))
 
-    def read(self, spec: Variable, block: Block) -> Array:
-        """Return a block of a raster as it is stored; fill values where a source does not have it."""
-        times, rows, columns = block
-        window = tuple(
-            slice(cells.start + within.start, cells.start + within.stop)
-            for cells, within in ((self.selection.rows, rows), (self.selection.columns, columns))
+    def is_stored(self, spec: Variable) -> bool:
+        """Return True if no epoch needs a raster to be computed."""
+        if spec.name not in COMPUTED:
+            return True
+        replacement = COMPUTED[spec.name][1]
+        return all(
+            spec.name in source.raster_shapes and replacement not in source.raster_shapes
+            for source in self.sources
         )
+
+    def read(self, spec: Variable, block: Block) -> Array:
+        """Return a block of a raster as stored or computed; fill values where a source does not have it."""
+        times, rows, columns = block
+        window = _shifted(rows, self.selection.rows.start), _shifted(columns, self.selection.columns.start)
         shape = tuple(part.stop - part.start for part in block)
         values = np.full(shape, fill_value(spec.dtype), spec.dtype)
         for source, stored_times, target_times in self._overlapping(times):
-            if spec.name in source.raster_shapes:
+            if spec.name in COMPUTED:
+                for index, target in zip(_indices(stored_times), _indices(target_times), strict=True):
+                    values[target] = self._compute(source, spec.name, index, window)
+            elif spec.name in source.raster_shapes:
                 values[target_times] = self.dataset(source, spec.name)[(stored_times, *window)]
         return values
+
+    def _compute(self, source: EpochSource, name: str, index: int, window: tuple[slice, slice]) -> Array:
+        """Return a window of a raster of one epoch, computed if it is not stored."""
+
+        def read(stored: str) -> Array | None:
+            if stored not in source.raster_shapes:
+                return None
+            return np.asarray(self.dataset(source, stored)[(index, *window)])
+
+        versions = source.scalars["reference_version"][index - source.file_start]
+        version = decode_text(versions[None])[0]
+        return read_raster(name, read, lambda: self._surfaces.height_m(version, *window))
 
     def dataset(self, source: EpochSource, name: str) -> Any:  # noqa: ANN401 - h5py has no types
         """Return a variable of a source as an HDF5 dataset; raise StoreError if it cannot be read."""
@@ -177,6 +202,14 @@ class PartContents:
 def fill_value(dtype: Any) -> Any:  # noqa: ANN401 - of any type
     """Return the value of missing data of a type."""
     return {"f": FILL, "S": b""}.get(np.dtype(dtype).kind, 0)
+
+
+def _shifted(part: slice, start: int) -> slice:
+    return slice(part.start + start, part.stop + start)
+
+
+def _indices(times: slice) -> range:
+    return range(times.start, times.stop)
 
 
 def _slices(size: int, step: int) -> list[slice]:

@@ -65,9 +65,8 @@ def _write_raster(contents: PartContents, spec: Variable, target: Any, advance: 
     """Write a raster of all epochs, whose chunks are in the file afterwards if they contain a value."""
     sources = [source for source in contents.sources if spec.name in source.raster_shapes]
     datasets = {source.path: contents.dataset(source, spec.name) for source in sources}
-    if contents.selection.is_whole_grid and all(
-        has_same_encoding(dataset, target) for dataset in datasets.values()
-    ):
+    is_copied = contents.selection.is_whole_grid and contents.is_stored(spec)
+    if is_copied and all(has_same_encoding(dataset, target) for dataset in datasets.values()):
         for source in sources:
             copy_chunks(datasets[source.path], source.file_start, target, source.series_start, source.count)
             advance(source.count / len(contents.rasters))

@@ -12,6 +12,7 @@ from pathlib import Path
 import h5py
 import numpy as np
 
+from station.archive.derived.computed_rasters import COMPUTED, OUTSIDE, RANDOM
 from station.archive.epochs import EpochRef
 from station.archive.netcdf_layout import CHUNK, Series
 from station.archive.schema import BY_NAME
@@ -21,7 +22,7 @@ from station.products.area_tables import Span
 from station.quantities import Grid
 from station.readers.polygons import read_polygons
 
-FORMAT_VERSION = 1  # of exported files: those of another version are written again
+FORMAT_VERSION = 2  # of exported files: those of another version are written again
 FINGERPRINT = "export_fingerprint"  # global attribute by which an exported file is recognised
 PERIODS = {"1D": "%Y%m%d", "1M": "%Y%m"}  # periods of files: time format in their names
 MAX_CHUNK_BYTES = 2**26  # a reader decodes whole chunks
@@ -58,6 +59,19 @@ class Selection:
         west_m = grid.west_m + self.columns.start * grid.cell_m
         north_m = grid.north_m - self.rows.start * grid.cell_m
         return replace(self.series, grid=Grid(west_m, north_m, grid.cell_m, nx, ny))
+
+    @property
+    def refers_to_store(self) -> bool:
+        """True if the files refer to those of the store, which do not have what is computed."""
+        return self.url is not None
+
+    @property
+    def stored_or_computed(self) -> frozenset[str]:
+        """Names of the variables; for files that refer to the store, with what computed ones come from."""
+        if not self.refers_to_store:
+            return self.variables
+        sources = (COMPUTED[name] for name in self.variables if name in COMPUTED)
+        return self.variables.union(*sources)
 
     def fingerprint(self, epochs: list[EpochRef]) -> str:
         """Return what decides the content of a file with these epochs, as a checksum.
@@ -147,22 +161,26 @@ def _metres(values_m: tuple[float, ...]) -> str:
 
 
 def _names(series: Series, text: str | None) -> frozenset[str]:
-    """Return the variables of `series.nc`; or those that are named and KEPT; or all, with `processing.nc`."""
+    """Return the variables of `station.open`, the random uncertainty left out, which the others imply.
+
+    With a text those that it names and KEPT, or all of `processing.nc` too.
+    """
     results, processing = (_stored_names(path) for path in (series.path, processing_file(series)))
+    results = {*results, *COMPUTED} - {OUTSIDE}
     if text is None:
-        return frozenset(results)
-    stored = [name for name in BY_NAME if name in {*results, *processing}]
-    names = stored if text.strip() == ALL else [name.strip() for name in text.split(",")]
-    if unknown := [name for name in names if name not in stored]:
+        return frozenset(results - {RANDOM})
+    known = [name for name in BY_NAME if name in results | processing]
+    names = known if text.strip() == ALL else [name.strip() for name in text.split(",")]
+    if unknown := [name for name in names if name not in known]:
         raise StationError(
-            f"{unknown[0]!r}: not a variable of the series: choose {ALL} or from {', '.join(stored)}"
+            f"{unknown[0]!r}: not a variable of the series: choose {ALL} or from {', '.join(known)}"
         )
     return frozenset((*names, *KEPT))
 
 
-def _stored_names(path: Path) -> list[str]:
+def _stored_names(path: Path) -> set[str]:
     with h5py.File(path, "r") as file:
-        return [name for name in BY_NAME if name in file]
+        return {name for name in BY_NAME if name in file}
 
 
 def _chunks(text: str | None, shape: tuple[int, int, int]) -> tuple[int, int, int]:

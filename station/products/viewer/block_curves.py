@@ -23,6 +23,7 @@ import numpy as np
 from scipy import sparse
 
 from station.archive.derived.boxes import BOXES, read_entry
+from station.archive.derived.computed_rasters import CHANGE, RANDOM
 from station.archive.epochs import EpochRef
 from station.archive.netcdf_layout import Series
 from station.products.viewer.tiles import (
@@ -36,7 +37,6 @@ from station.products.viewer.tiles import (
 from station.quantities import Bools, Floats, Ints, SharedParameters
 from station.queries.block_sums import Sums
 from station.queries.blocks import DAY_S, BlockQueries, SurfaceBlocks
-from station.queries.epoch_cells import CHANGE, RANDOM
 from station.science.analysis.calibration import SparseJacobian
 from station.science.uncertainty.jacobian import HeightJacobian
 

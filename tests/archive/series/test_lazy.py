@@ -11,7 +11,7 @@ import pytest
 import rasterio
 import rioxarray  # noqa: F401 - ds.rio
 import xarray as xr
-from support.epochs import GRID, make_epoch
+from support.epochs import GRID, make_epoch, write_surface
 
 import station
 from station.archive.chunk_codec import read_column
@@ -30,9 +30,10 @@ RASTERS = ("elevation_change", "elevation_change_uncertainty", "point_count", "q
 def stored(tmp_path_factory):
     """Epochs in a compacted day and in their own files; the eastern half of the grid is never observed."""
     series = Series(tmp_path_factory.mktemp("store"), "hef", GRID, "EPSG:32632")
+    write_surface(series)
     for hour in HOURS:
         result = make_epoch(hour, terms=hour != WITHOUT_TERMS)
-        result.measurement.cells["elevation_m"] = np.nan  # a variable without any chunk
+        result.measurement.cells["spread_m"] = np.nan  # a variable without any chunk
         write_epoch(series, result)
     compact(series, datetime(2025, 11, 22, 12, tzinfo=UTC), lambda: None)
     build_series(series)
@@ -58,7 +59,7 @@ def test_rasters_equal_those_of_the_epochs(stored):
                 expected = measurement.to_rasters(column)[0]
                 assert np.allclose(ds[name][index], expected, atol=1e-3, equal_nan=True)
             assert np.array_equal(ds.point_count[index], measurement.to_rasters("count")[0])
-        assert np.isnan(ds.elevation).all()
+        assert np.isnan(ds.elevation_spread).all()
         assert np.isnan(ds.sigma_geometry[HOURS.index(WITHOUT_TERMS)]).all()
         assert np.isfinite(ds.sigma_geometry[0, :, :75]).all()
 

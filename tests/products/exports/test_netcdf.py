@@ -8,9 +8,12 @@ from datetime import UTC, datetime
 import netCDF4
 import numpy as np
 import pytest
+from support.epochs import write_surface
 
+import station
 from station.archive import epochs
 from station.archive.compaction import compact
+from station.archive.schema import FILL
 from station.archive.series.virtual import build_series
 from station.errors import StationError, StoreError
 from station.products.area_tables import Span
@@ -49,11 +52,19 @@ def raw(path):
         return {name: variable[...] for name, variable in file.variables.items()}, attrs
 
 
+def computed(series):
+    """Return the rasters that `station.open` computes, with fill values."""
+    with station.open(series.folder) as ds:
+        names = "elevation", "elevation_change_random_uncertainty"
+        return {name: ds[name].fillna(np.float32(FILL)).to_numpy() for name in names}
+
+
 @pytest.mark.parametrize("chunks", [None, "2,64,150", "5,7,11"])
 def test_every_variable_has_the_bits_of_the_series(stored, tmp_path, chunks):
     (path,) = write(select(stored, ALWAYS, variables="all", chunks=chunks), tmp_path / "all.nc")
     (expected, series_attrs), (actual, attrs) = raw(stored.path), raw(path)
-    expected |= raw(stored.processing_path)[0]
+    expected |= raw(stored.processing_path)[0] | computed(stored)
+    del expected["elevation_outside_reference"]
     assert set(actual) == set(expected)
     assert {"sigma_geometry", "shared_parameter_covariance", "change_errors"} < set(actual)
     for name, values in expected.items():
@@ -69,7 +80,9 @@ def test_every_variable_has_the_bits_of_the_series(stored, tmp_path, chunks):
 def test_attributes_of_variables_are_those_of_the_series(stored, tmp_path):
     (path,) = write(select(stored, ALWAYS), tmp_path / "all.nc")
     with netCDF4.Dataset(stored.path) as series_file, netCDF4.Dataset(path) as file:
-        for name, variable in series_file.variables.items():
+        names = series_file.variables.keys() - {"elevation_outside_reference"}
+        assert set(file.variables) - names == {"elevation"}
+        for name, variable in ((name, series_file[name]) for name in names):
             for attr in variable.ncattrs():
                 assert np.array_equal(file[name].getncattr(attr), variable.getncattr(attr)), (name, attr)
 
@@ -81,13 +94,13 @@ def test_the_attributes_of_the_draft_on_uncertainty_are_an_option(stored, epoch,
     epochs.write_epoch(drafted, epoch(27))
     build_series(drafted)
     (all_path,) = write(select(drafted, ALWAYS), tmp_path / "all.nc")
-    selected = select(drafted, ALWAYS, variables="elevation_change,elevation_change_random_uncertainty")
+    selected = select(drafted, ALWAYS, variables="elevation_change,elevation_change_systematic_uncertainty")
     (part_path,) = write(selected, tmp_path / "part.nc")
-    both = "elevation_change_uncertainty elevation_change_random_uncertainty"
+    both = "elevation_change_uncertainty elevation_change_systematic_uncertainty"
     for path, named in ((drafted.path, both), (all_path, both), (part_path, both.split()[1])):
         with netCDF4.Dataset(path) as file:
             assert file["elevation_change"].uncertainty_variables == named
-            assert file["elevation_change_random_uncertainty"].coverage_interval == "standard_deviation"
+            assert file["elevation_change_systematic_uncertainty"].coverage_interval == "standard_deviation"
             assert "uncertainty_variables" not in file["verdict"].ncattrs()
 
 
@@ -122,6 +135,7 @@ def test_a_box_and_some_variables(stored, tmp_path):
 def test_coordinates_of_a_box_keep_their_bits(series, epoch, tmp_path):
     grid = dataclasses.replace(series.grid, west_m=632_000.1, cell_m=0.3)
     fine = dataclasses.replace(series, grid=grid)
+    write_surface(fine)
     epochs.write_epoch(fine, epoch(0, grid=grid))
     build_series(fine)
     selection = select(fine, ALWAYS, (632_010.0, 5_185_970.0, 632_020.0, 5_185_990.0))
