@@ -95,7 +95,17 @@ def make_adjustment(estimate, covariance, log):
     )
     redundancy, predicted_rad = np.ones(len(estimate)), LINE_DESIGN @ estimate
     return Adjustment(
-        PARAMS, estimate, posterior, 0.001, np.ones(9), (1.0, 1.0), 0.0, redundancy, log, predicted_rad
+        PARAMS,
+        estimate,
+        posterior,
+        0.001,
+        np.ones(9),
+        (1.0, 1.0),
+        0.0,
+        redundancy,
+        log,
+        predicted_rad,
+        np.zeros(3),
     )
 
 
