@@ -51,7 +51,8 @@
   tools.append(...buttons, command("+", text.zoom_in, () => map.zoom(1.5)), command("−", text.zoom_out, () => map.zoom(1 / 1.5)),
     command("⤢", text.whole_map, () => map.home()), form);
   const figure = image.closest("figure");
-  figure.prepend(tools, hint, frame);
+  const key = make("canvas", { id: "map-key", "aria-hidden": "true" });  // the caption says it in words
+  figure.prepend(tools, hint, frame, key);
   image.parentElement.hidden = true;  // the picture itself is drawn on the canvas
   byId("slider-row").after(panel);
 
@@ -82,6 +83,16 @@
     context.imageSmoothingEnabled = x1 - x0 < width * image.naturalWidth;
     context.drawImage(image, left * image.naturalWidth, top * image.naturalHeight, width * image.naturalWidth,
       height * image.naturalHeight, x0, y0, x1 - x0, y1 - y0);
+  }
+
+  // The colour bar and the legend, which are below the ground in the picture.
+  function drawKey() {
+    const frameOf = data.frames[data.maps[shown].version];
+    if (!frameOf || !image.complete || !image.naturalWidth) return;
+    const [, top, , height] = frameOf.box, from = Math.round((top + height) * image.naturalHeight) + 2;
+    key.width = image.naturalWidth;
+    key.height = image.naturalHeight - from;
+    key.getContext("2d").drawImage(image, 0, -from);
   }
 
   function drawShape(context, now, corners, isClosed) {
@@ -141,6 +152,8 @@
   }
 
   function drawScale(now) {
+    const { west, east, south, north } = extent, [x0, y1] = now.toPixel([west, south]), [x1, y0] = now.toPixel([east, north]);
+    bar.hidden = x0 >= -1 && y0 >= -1 && x1 <= now.width + 1 && y1 <= now.height + 1;  // the picture has its own
     const target_m = 110 * now.view.scale, decade = 10 ** Math.floor(Math.log10(target_m));
     const length_m = [5, 2, 1].map((k) => k * decade).find((m) => m <= target_m) || decade;
     bar.style.width = `${length_m / now.view.scale}px`;
@@ -309,7 +322,8 @@
     showValues();
     if (current) link();
   });
-  image.addEventListener("load", map.draw);
+  image.addEventListener("load", () => { map.draw(); drawKey(); });
+  drawKey();
   addEventListener("hashchange", follow);
   choose("place");
   follow();
