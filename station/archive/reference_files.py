@@ -23,7 +23,8 @@ from station.archive.netcdf_layout import (
 from station.archive.raster_io import LazyRaster, rounded, write_rasters
 from station.archive.schema import FILL, Variable
 from station.errors import StoreError
-from station.quantities import Floats32, Reference, SharedParameters, VarianceComponents
+from station.quantities import Floats, Floats32, Reference, SharedParameters, VarianceComponents
+from station.science.geometry.terrain import known_cell_means
 
 # Prefix of the attributes with the variance components of the station, one sigma each.
 COMPONENT_PREFIX = "component_"
@@ -36,6 +37,12 @@ _VARIABLES = (
         "reference_mean_residual", ("y", "x"), "f4",
         "mean height of the reference's scans above its surface in the cell", "m", None, 4, None,
         "elevation changes are counted from the surface plus this height",
+    ),
+    Variable(
+        "reference_mean_elevation", ("y", "x"), "f4",
+        "elevation of the reference, mean over the cell", "m", "surface_altitude", 4, None,
+        "elevation changes are counted from it: mean of reference_elevation over the cell, plus"
+        " reference_mean_residual",
     ),
     Variable(
         "reference_random_uncertainty", ("y", "x"), "f4", "random uncertainty of the reference surface", "m",
@@ -196,6 +203,7 @@ def _raster_rows(reference: Reference, rows: slice) -> list[np.ndarray[Any, Any]
     return [
         reference.elevation_m[rows],
         reference.mean_residual_m[rows],
+        mean_elevation(reference.elevation_m, reference.mean_residual_m, rows, slice(0, reference.grid.nx)),
         np.sqrt(reference.random_variance_m2[rows]),
         np.sqrt(reference.roughness_m2[rows]),
         reference.variance_factor[rows],
@@ -203,6 +211,11 @@ def _raster_rows(reference: Reference, rows: slice) -> list[np.ndarray[Any, Any]
         reference.stable[rows],
         reference.visibility[rows],
     ]
+
+
+def mean_elevation(elevation_m: Floats, mean_residual_m: Floats32, rows: slice, columns: slice) -> Floats:
+    """Return the mean elevation of cells in a window of a reference (r, c) [m]: change is counted from it."""
+    return known_cell_means(elevation_m, rows, columns) + mean_residual_m[rows, columns]
 
 
 def repair_reference_link(series: Series) -> None:

@@ -74,7 +74,7 @@ VARIABLES: tuple[Variable, ...] = (
         "surface_altitude",
         None,
         _MEAN,
-        f"reference_elevation + reference_mean_residual of the reference + elevation_change; {_QUANTUM}",
+        f"reference_mean_elevation of the reference + elevation_change; {_QUANTUM}",
         ancillary=("elevation_spread", "point_count", "quality"),
     ),
     Variable(
@@ -86,8 +86,7 @@ VARIABLES: tuple[Variable, ...] = (
         "surface_altitude",
         None,
         _MEAN,
-        "elsewhere the elevation is reference_elevation + reference_mean_residual of reference.nc +"
-        f" elevation_change; {_QUANTUM}",
+        f"elsewhere the elevation is reference_mean_elevation of reference.nc + elevation_change; {_QUANTUM}",
         ancillary=("elevation_spread", "point_count", "quality"),
     ),
     Variable(

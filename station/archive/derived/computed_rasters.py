@@ -1,7 +1,8 @@
 """Rasters that are computed from what is stored, because storing them too would double the size of an epoch.
 
-The elevation is the reference surface plus the change, the random uncertainty what the systematic one leaves
-of the total. Epochs of older versions have both stored, but no systematic uncertainty. Source: store.md, 3.
+The elevation is the mean elevation of the cell in the reference plus the change, the random uncertainty what
+the systematic one leaves of the total. Epochs of older versions have both stored, but no systematic
+uncertainty. Source: store.md, 3.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ import numpy as np
 from station.archive.netcdf_layout import Series
 from station.archive.raster_io import Array, LazyRaster
 from station.archive.read_errors import read_errors
-from station.archive.reference_files import open_reference
+from station.archive.reference_files import mean_elevation, open_reference
 from station.archive.schema import FILL
 from station.errors import StoreError
 from station.quantities import Reference
@@ -81,7 +82,7 @@ class ReferenceSurfaces:
         self._references: dict[str, Reference] = {}
 
     def height_m(self, version: str, rows: slice, columns: slice) -> Array:
-        """Return the surface in a window of the grid [m]; raise StoreError if its file is missing."""
+        """Return the mean height of cells in a window of the grid [m]; raise StoreError without the file."""
         if version not in self._references:
             reference = open_reference(self._series, version)
             if reference is None:
@@ -91,7 +92,7 @@ class ReferenceSurfaces:
                 )
             self._references[version] = reference
         reference = self._references[version]
-        return np.asarray(reference.elevation_m[rows, columns] + reference.mean_residual_m[rows, columns])
+        return mean_elevation(reference.elevation_m, reference.mean_residual_m, rows, columns)
 
 
 class ComputedRaster:

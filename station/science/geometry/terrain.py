@@ -208,6 +208,24 @@ def cell_means(nodes: Floats | Floats32) -> Floats:
     return np.asarray((rows[:, :-2] + 6 * rows[:, 1:-1] + rows[:, 2:]) / 8)
 
 
+def known_cell_means(nodes: Floats, rows: slice, columns: slice) -> Floats:
+    """Mean over each cell (r, c) of a window of a surface with nodes (ny, nx); NaN where they are unknown.
+
+    Nodes around the known ones are extrapolated, as for the shots.
+    """
+    halos = [slice(max(part.start - HALO_ROWS, 0), part.stop + HALO_ROWS) for part in (rows, columns)]
+    inner = tuple(
+        slice(part.start - halo.start, part.stop - halo.start)
+        for part, halo in zip((rows, columns), halos, strict=True)
+    )
+    window = np.asarray(nodes[halos[0], halos[1]], dtype=np.float64)
+    known = np.isfinite(window)
+    datum = float(window[known].mean()) if known.any() else 0.0
+    extended = extrapolate_ring((window - datum).astype(np.float32))
+    means = datum + cell_means(np.nan_to_num(extended, copy=False))
+    return np.where(known, means, np.nan)[inner]
+
+
 def _with_neighbours(rows: slice) -> slice:
     return slice(max(rows.start - 1, 0), rows.stop + 1)
 

@@ -85,6 +85,22 @@ def test_bilinear_surface_is_exact_on_a_plane_up_to_its_edge():
     assert north == pytest.approx(0.25, abs=1e-3)
 
 
+def test_cell_means_of_a_window_are_those_of_the_whole_surface_that_shots_see():
+    """Against the bilinear surface at 32 x 32 points in each cell, at gaps and at the border of the grid."""
+    x_m, y_m = np.meshgrid(GRID.x_m, GRID.y_m)
+    nodes = 2000 + 0.02 * (x_m - 20) ** 2 - 0.01 * (y_m - 20) ** 2
+    nodes[20:, 10:20] = np.nan
+    surface = terrain.bilinear_surface(Reference.from_elevation(GRID, "1", nodes))
+    rows, columns = slice(15, GRID.ny), slice(0, 25)
+    actual = terrain.known_cell_means(nodes, rows, columns)
+    offset = (np.arange(32) + 0.5) / 32
+    expected = np.full(actual.shape, np.nan)
+    for row, column in np.argwhere(np.isfinite(nodes[rows, columns])):
+        across, down = (grid.ravel() for grid in np.meshgrid(column + offset, row + rows.start + offset))
+        expected[row, column] = surface.height(across, down).mean()
+    np.testing.assert_allclose(actual, expected, atol=2e-4)
+
+
 def test_cell_means_of_a_curved_surface_and_nodes_from_them():
     """A paraboloid of radius 1 km on 10 m cells: means differ from nodes by 12.5 mm per direction."""
     rng = np.random.default_rng(2)
