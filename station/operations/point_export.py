@@ -23,7 +23,7 @@ from station.inbox.listing import ScanFile
 from station.processing.pipeline import stacking_inputs, to_map
 from station.processing.provenance import stored_epochs
 from station.processing.scan_inputs import ScanInputs
-from station.processing.scan_tasks import grid_and_adjust, load_viewing_geometry
+from station.processing.scans.adjusted_scan import grid_and_adjust, load_viewing_geometry
 from station.processing.scans.epoch_inputs import load_scan_inputs
 from station.processing.scans.open_scans import OpenScan, open_scan_for
 from station.processing.scans.scan_files import find_scan

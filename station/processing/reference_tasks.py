@@ -33,7 +33,7 @@ from station.processing.pipeline import (
 )
 from station.processing.provenance import ScanProvenance
 from station.processing.scan_inputs import ScanInputs
-from station.processing.scan_tasks import adjust_scan, load_viewing_geometry, stable_cells
+from station.processing.scans.adjusted_scan import adjust_scan, load_viewing_geometry, stable_cells
 from station.processing.scans.epoch_inputs import load_scan_inputs
 from station.processing.scans.open_scans import open_scan_for
 from station.processing.site_files import exclusion_reason, series_for, sha256_log

@@ -11,11 +11,8 @@ from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from pathlib import Path
 
-import numpy as np
-
 from station._version import __version__
 from station.archive import epochs
-from station.archive.geometry_cache import cached_viewing_geometry
 from station.archive.netcdf_layout import Series, roundtrip_text
 from station.archive.reference_files import open_reference, valid_versions, write_reference
 from station.config import Site
@@ -27,32 +24,27 @@ from station.processing.epoch_recorder import EpochRecorder
 from station.processing.epoch_scalars import air_key, log_metrics, scalar_variables
 from station.processing.pipeline import (
     AdjustmentInputs,
-    adjust_to_reference,
-    grid_scan,
     has_brightness,
     holdout_statistics,
     measure,
-    new_gridder,
-    reference_viewing_geometry,
     stable_sampling_ratio,
     usual_motion,
     variance_factors,
 )
-from station.processing.scan_inputs import ScanInputs
+from station.processing.scans.adjusted_scan import grid_and_adjust, is_usable, load_viewing_geometry
 from station.processing.scans.epoch_inputs import load_scan_inputs
-from station.processing.scans.open_scans import OpenScan, open_scan_for
+from station.processing.scans.open_scans import open_scan_for
 from station.processing.scans.registration import registration_difference
 from station.processing.site_files import (
     exclusion_reason,
     file_version,
-    polygon_cells,
     series_for,
     sha256_log,
 )
 from station.processing.usable_inputs import usable_site
 from station.processing.workers.worker_process import Progress, trim_heap
 from station.products.overview import Overview
-from station.quantities import Bools, Reference, ScanGeometry, VarianceComponents
+from station.quantities import Reference, VarianceComponents
 from station.queries.aggregates import LEVERAGE_VARIABLES
 from station.readers.raster import read_geotiff
 from station.readers.scan import reject_future
@@ -61,13 +53,7 @@ from station.science.adjustment import ground_classes
 from station.science.adjustment.joint import Adjustment
 from station.science.analysis import inclination_check, verdict
 from station.science.geometry.terrain import nodes_from_means
-from station.science.gridding.gridder import Gridder
-from station.science.gridding.viewing_geometry import ViewingGeometry
 from station.science.uncertainty.variance_factors import UNIT_FACTORS
-
-# Estimated rotation that the points of a scan may lack, 0.35 m at 1 km; beyond, they are gridded again.
-MAX_UNAPPLIED_RAD = np.radians(0.02)
-UNUSABLE_REJECTED_SHARE = 0.6  # of the stable ground; above it the filtered log alone is safer
 
 
 @dataclass(frozen=True)
@@ -241,7 +227,7 @@ def _compute_epoch(
     flag = exclusion_reason(site, start.timestamp(), end.timestamp())
     attempt = adjustment[1] if adjustment else None
     registration, registration_warnings = registration_difference(site, scan, attempt)
-    if adjustment is not None and (inputs.is_given or not _is_usable(adjustment[1])):
+    if adjustment is not None and (inputs.is_given or not is_usable(adjustment[1])):
         adjustment = None
     components = usual_motion(reference, start.timestamp()) if reference else VarianceComponents()
     shared, factors = inputs.log_only_shared(components), UNIT_FACTORS
@@ -301,81 +287,6 @@ def _compute_epoch(
     )
 
 
-def grid_and_adjust(
-    site: Site, opened: OpenScan, inputs: ScanInputs, viewing: ViewingGeometry | None, progress: Progress
-) -> tuple[ScanInputs, Gridder, int, tuple[AdjustmentInputs, Adjustment] | None]:
-    """Return the inputs of a scan, its grid, the number of its points, and its adjustment to the reference.
-
-    If the scanner turned so far that its points lie beside the ground they hit, as after a season, they are
-    gridded a second time, at the estimated pose, which the returned inputs have: ground does not respond to a
-    motion of the beams as the slope of the reference tells, so that the first estimate is off.
-    Raises ScanError if no point falls on the grid.
-    """
-
-    def gridded(inputs: ScanInputs) -> tuple[Gridder, int]:
-        blocks = inputs.shots(opened, site.scans.intensity if site.adjusts else "none")  # decodes
-        gridder = new_gridder(inputs.geometry, viewing)
-        return gridder, grid_scan(gridder, blocks, inputs.pose, progress)
-
-    gridder, count = gridded(inputs)
-    if gridder.is_empty():
-        raise ScanError("no point falls on the grid: wrong scans.frame, SOP, CRS or units?")
-    progress()
-    first = adjust_scan(site, gridder, inputs, viewing, even_if_given=True)
-    if first is None or not inputs.can_rotate or not _is_usable(first[1]):
-        return inputs, gridder, count, first
-    unapplied_rad = first[1].unapplied_rad
-    if np.linalg.norm(unapplied_rad) <= MAX_UNAPPLIED_RAD:
-        return inputs, gridder, count, first
-    del gridder  # the memory of a worker does not hold two
-    rotated = inputs.rotated(unapplied_rad)
-    gridder, count = gridded(rotated)
-    second = adjust_scan(site, gridder, rotated, viewing)
-    if second is not None and _is_usable(second[1]):
-        return rotated, gridder, count, second
-    del gridder
-    return inputs, *gridded(inputs), first
-
-
-def _is_usable(adjustment: Adjustment) -> bool:
-    """Return True unless so much stable ground was rejected that the filtered log alone is safer."""
-    return adjustment.rejected_share <= UNUSABLE_REJECTED_SHARE
-
-
-def load_viewing_geometry(site: Site, geometry: ScanGeometry, reference: Reference) -> ViewingGeometry:
-    """Return the viewing geometry of a stored reference version, cached for one scan geometry."""
-    setting = site.adjustment.stable
-    polygon_hash = sha256_file(setting) if isinstance(setting, Path) and setting.is_file() else ""
-    return cached_viewing_geometry(
-        series_for(site),
-        reference,
-        (geometry.position_m, geometry.axis),
-        repr((geometry.grid, geometry.scanner, geometry.published_budget, site.map.crs, polygon_hash)),
-        lambda: reference_viewing_geometry(reference, geometry, stable_cells(site, reference)),
-    )
-
-
-def adjust_scan(
-    site: Site,
-    gridder: Gridder,
-    inputs: ScanInputs,
-    viewing: ViewingGeometry | None,
-    *,
-    even_if_given: bool = False,
-) -> tuple[AdjustmentInputs, Adjustment] | None:
-    """Return the adjustment of a scan to the reference; None if it is disabled or there is no reference.
-
-    Also None if its registration is given, unless `even_if_given`.
-    """
-    if inputs.is_given and not even_if_given:
-        return None
-    if not site.adjusts or inputs.adjustment_inputs is None or viewing is None:
-        return None
-    adjustment = adjust_to_reference(gridder, inputs.geometry, inputs.adjustment_inputs, viewing)
-    trim_heap()
-    return inputs.adjustment_inputs, adjustment
-
-
 def _check_log(
     adjustment: tuple[AdjustmentInputs, Adjustment] | None, reference: Reference | None
 ) -> tuple[list[str], dict[str, float]]:
@@ -396,12 +307,6 @@ def _check_log(
         "log_clock_offset": clock_offset.offset_s,
         "log_clock_offset_uncertainty": clock_offset.sigma_s,
     }
-
-
-def stable_cells(site: Site, reference: Reference) -> Bools:
-    """Return the stable cells (ny, nx): those in the polygons of the site, else those of the reference."""
-    setting = site.adjustment.stable
-    return polygon_cells(setting, site) if isinstance(setting, Path) else reference.stable
 
 
 def _identical_epoch(series: Series, epoch: epochs.Epoch) -> epochs.EpochFile | None:

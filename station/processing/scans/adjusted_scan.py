@@ -1,0 +1,112 @@
+"""Gridding of one scan and its adjustment to the reference."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from station.archive.geometry_cache import cached_viewing_geometry
+from station.config import Site
+from station.errors import ScanError
+from station.inbox.file_hash import sha256_file
+from station.processing.pipeline import (
+    AdjustmentInputs,
+    adjust_to_reference,
+    grid_scan,
+    new_gridder,
+    reference_viewing_geometry,
+)
+from station.processing.scan_inputs import ScanInputs
+from station.processing.scans.open_scans import OpenScan
+from station.processing.site_files import polygon_cells, series_for
+from station.processing.workers.worker_process import Progress, trim_heap
+from station.quantities import Bools, Reference, ScanGeometry
+from station.science.adjustment.joint import Adjustment
+from station.science.gridding.gridder import Gridder
+from station.science.gridding.viewing_geometry import ViewingGeometry
+
+# Estimated rotation that the points of a scan may lack, 0.35 m at 1 km; beyond, they are gridded again.
+MAX_UNAPPLIED_RAD = np.radians(0.02)
+UNUSABLE_REJECTED_SHARE = 0.6  # of the stable ground; above it the filtered log alone is safer
+
+
+def grid_and_adjust(
+    site: Site, opened: OpenScan, inputs: ScanInputs, viewing: ViewingGeometry | None, progress: Progress
+) -> tuple[ScanInputs, Gridder, int, tuple[AdjustmentInputs, Adjustment] | None]:
+    """Return the inputs of a scan, its grid, the number of its points, and its adjustment to the reference.
+
+    If the scanner turned so far that its points lie beside the ground they hit, as after a season, they are
+    gridded a second time, at the estimated pose, which the returned inputs have: ground does not respond to a
+    motion of the beams as the slope of the reference tells, so that the first estimate is off.
+    Raises ScanError if no point falls on the grid.
+    """
+
+    def gridded(inputs: ScanInputs) -> tuple[Gridder, int]:
+        blocks = inputs.shots(opened, site.scans.intensity if site.adjusts else "none")  # decodes
+        gridder = new_gridder(inputs.geometry, viewing)
+        return gridder, grid_scan(gridder, blocks, inputs.pose, progress)
+
+    gridder, count = gridded(inputs)
+    if gridder.is_empty():
+        raise ScanError("no point falls on the grid: wrong scans.frame, SOP, CRS or units?")
+    progress()
+    first = adjust_scan(site, gridder, inputs, viewing, even_if_given=True)
+    if first is None or not inputs.can_rotate or not is_usable(first[1]):
+        return inputs, gridder, count, first
+    unapplied_rad = first[1].unapplied_rad
+    if np.linalg.norm(unapplied_rad) <= MAX_UNAPPLIED_RAD:
+        return inputs, gridder, count, first
+    del gridder  # the memory of a worker does not hold two
+    rotated = inputs.rotated(unapplied_rad)
+    gridder, count = gridded(rotated)
+    second = adjust_scan(site, gridder, rotated, viewing)
+    if second is not None and is_usable(second[1]):
+        return rotated, gridder, count, second
+    del gridder
+    return inputs, *gridded(inputs), first
+
+
+def is_usable(adjustment: Adjustment) -> bool:
+    """Return True unless so much stable ground was rejected that the filtered log alone is safer."""
+    return adjustment.rejected_share <= UNUSABLE_REJECTED_SHARE
+
+
+def adjust_scan(
+    site: Site,
+    gridder: Gridder,
+    inputs: ScanInputs,
+    viewing: ViewingGeometry | None,
+    *,
+    even_if_given: bool = False,
+) -> tuple[AdjustmentInputs, Adjustment] | None:
+    """Return the adjustment of a scan to the reference; None if it is disabled or there is no reference.
+
+    Also None if its registration is given, unless `even_if_given`.
+    """
+    if inputs.is_given and not even_if_given:
+        return None
+    if not site.adjusts or inputs.adjustment_inputs is None or viewing is None:
+        return None
+    adjustment = adjust_to_reference(gridder, inputs.geometry, inputs.adjustment_inputs, viewing)
+    trim_heap()
+    return inputs.adjustment_inputs, adjustment
+
+
+def load_viewing_geometry(site: Site, geometry: ScanGeometry, reference: Reference) -> ViewingGeometry:
+    """Return the viewing geometry of a stored reference version, cached for one scan geometry."""
+    setting = site.adjustment.stable
+    polygon_hash = sha256_file(setting) if isinstance(setting, Path) and setting.is_file() else ""
+    return cached_viewing_geometry(
+        series_for(site),
+        reference,
+        (geometry.position_m, geometry.axis),
+        repr((geometry.grid, geometry.scanner, geometry.published_budget, site.map.crs, polygon_hash)),
+        lambda: reference_viewing_geometry(reference, geometry, stable_cells(site, reference)),
+    )
+
+
+def stable_cells(site: Site, reference: Reference) -> Bools:
+    """Return the stable cells (ny, nx): those in the polygons of the site, else those of the reference."""
+    setting = site.adjustment.stable
+    return polygon_cells(setting, site) if isinstance(setting, Path) else reference.stable
