@@ -63,7 +63,7 @@ FULL = Grid(west_m=632_000.0, north_m=5_186_000.0, cell_m=1.0, nx=4000, ny=5000)
 TEMPLATES = 3  # different rasters of a store
 ROUNDS = 3
 PAGE_UPDATES = 20  # until all maps are drawn
-READ_VARIABLES = ("elevation", "elevation_change")  # of the year on the full grid
+READ_VARIABLES = ("elevation_change", "elevation_change_uncertainty")  # of the year on the full grid
 SYSTEMATIC_M = 0.01
 COVERAGE = 0.31  # share of the cells of a grid that an epoch observes
 READ_COVERAGE = 0.02  # of the year that is read: other cells are neither stored nor read
