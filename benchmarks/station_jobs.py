@@ -30,6 +30,7 @@ from station.inbox.journal_reader import JournalReader, State
 from station.processing import scan_tasks
 from station.processing.pipeline import Pose
 from station.processing.reference_tasks import build_reference_version
+from station.processing.scans import adjusted_scan
 from station.processing.scans.epoch_inputs import load_scan_inputs
 from station.processing.scans.open_scans import open_scan_for
 from station.processing.scans.scan_files import scan_file
@@ -79,7 +80,7 @@ class _GriddedError(Exception):
 
 def gridding(site: str, scan: str) -> dict[str, Any]:
     """Grid a scan: decode, tilt, SOP, air, map projection, residuals, sums of each cell; nothing else."""
-    grid_scan = scan_tasks.grid_scan  # type: ignore[attr-defined]
+    grid_scan = adjusted_scan.grid_scan  # type: ignore[attr-defined]
 
     def grid_only(
         gridder: Gridder, blocks: Iterable[Shots], pose: Pose, progress: Callable[[], None]
@@ -88,9 +89,9 @@ def gridding(site: str, scan: str) -> dict[str, Any]:
         grid_scan(gridder, blocks, pose, progress)
         raise _GriddedError
 
-    with mock.patch.object(scan_tasks, "grid_scan", grid_only), suppress(_GriddedError):
+    with mock.patch.object(adjusted_scan, "grid_scan", grid_only), suppress(_GriddedError):
         epoch(site, scan)
-        raise RuntimeError("the scan was not gridded by `scan_tasks.grid_scan`")
+        raise RuntimeError("the scan was not gridded by `adjusted_scan.grid_scan`")
     return {}
 
 

@@ -210,11 +210,19 @@ def test_epochs_of_an_older_version_are_compacted_with_newer_ones(filled):
     expected = values(filled)
     for epoch_file in epochs.epoch_files(filled)[:2]:
         with h5py.File(epoch_file.path, "r+") as file:
-            old = file["elevation_change"]
+            name = "elevation_change"
+            old = file[name]
             data, attributes, scales = old[:], dict(old.attrs), [file[dim] for dim in ("time", "y", "x")]
-            del file["elevation_change"], file["stable_nmad"], file["sop_tilt_offset"], file["elevation_spread"]
+            del (
+                file["elevation_change"],
+                file["stable_nmad"],
+                file["sop_tilt_offset"],
+                file["elevation_spread"],
+            )
             del file["change_errors"], file["change_pattern"]
-            new = file.create_dataset("elevation_change", data=data, chunks=(1, 64, 64), maxshape=(None, 140, 150))
+            new = file.create_dataset(
+                "elevation_change", data=data, chunks=(1, 64, 64), maxshape=(None, 140, 150)
+            )
             for key in attributes.keys() - {"DIMENSION_LIST"}:
                 new.attrs[key] = attributes[key]
             for axis, scale in enumerate(scales):

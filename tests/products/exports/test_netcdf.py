@@ -255,6 +255,7 @@ def test_memory_does_not_grow_with_the_series(series, epoch, tmp_path, kind, chu
 
     grid = dataclasses.replace(series.grid, nx=500, ny=500)
     series = dataclasses.replace(series, grid=grid)
+    write_surface(series)
     for hour in range(12):
         epochs.write_epoch(series, epoch(hour, grid=grid))
     build_series(series)
