@@ -226,10 +226,10 @@ def as_text(records: Iterable[AreaRecord]) -> str:
         (
             f"{record.start:%Y-%m-%d %H:%M}",
             record.area,
-            f"{statistics['mean_change']:+.4f}",
+            f"{statistics['mean_change']:+z.4f}",
             f"±{statistics['mean_change_high'] - statistics['mean_change']:.4f}",
-            f"{statistics['median_change']:+.4f}",
-            f"{statistics['volume_change']:+.1f}",
+            f"{statistics['median_change']:+z.4f}",
+            f"{statistics['volume_change']:+z.1f}",
             f"±{statistics['volume_change_high'] - statistics['volume_change']:.1f}",
             f"{100 * statistics['coverage']:.0f} %",
             record.verdict,

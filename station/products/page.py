@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -17,7 +17,7 @@ from station._version import __version__
 from station.archive.derived.event_table import read_events
 from station.archive.netcdf_layout import Series
 from station.archive.series.index import SeriesIndex
-from station.products.epoch_table import AreaSeries, EpochTable, read_area_series, read_epoch_table
+from station.products.epoch_table import AreaSeries, EpochTable, read_epoch_table
 from station.products.gallery import (
     Gallery,
     MeasuredEpoch,
@@ -29,10 +29,11 @@ from station.products.gallery import (
 )
 from station.products.maps import ASSETS, map_box
 from station.products.overview import Overview
+from station.products.page_areas import newest_value, usable_area_series
+from station.products.page_text import format_number, format_utc
 from station.products.viewer.block_curves import CurveEpoch, curve_tiers, update_curves
 from station.quantities import Floats
 from station.science.geometry.robust_statistics import NORMAL_95
-from station.science.gridding.significance import SIGNIFICANT_SIGMAS
 
 STATIC = {  # the parts of each file; a single style sheet is a single round trip
     "page.css": ("uplot.css", "page.css"),
@@ -79,10 +80,8 @@ def write_page(
     The maps are written first, then the data, then the page that refers to them.
     """
     table = read_epoch_table(series) if series.path.is_file() else None
-    all_areas = read_area_series(series)
+    all_areas = usable_area_series(series, table) if table is not None else []
     areas = all_areas[:MAX_AREAS]
-    if table is not None:
-        areas = [_mask_unusable(area, table) for area in areas]
     gallery, curves = Gallery([], None, None, None, (0, 0)), None
     if table is not None:
         style = Style(context.name or series.station_id, width_px, limit_m)
@@ -183,17 +182,8 @@ def _decimate(count: int) -> slice:
 
 
 def _json_numbers(values: Floats, digits: int) -> list[float | None]:
-    rounded = (round(float(value), digits) if np.isfinite(value) else None for value in values)
+    rounded = (round(float(value), digits) + 0.0 if np.isfinite(value) else None for value in values)
     return [int(value) if value is not None and not digits else value for value in rounded]
-
-
-def _mask_unusable(area: AreaSeries, table: EpochTable) -> AreaSeries:
-    """Return the series of an area with gaps at epochs whose change and sigma are unusable."""
-    unusable_s = table.start_s[[verdict == "unusable" for verdict in table.verdict]]
-    gaps = np.isin(area.start_s, unusable_s)
-    return replace(
-        area, columns={name: np.where(gaps, np.nan, values) for name, values in area.columns.items()}
-    )
 
 
 def _area_curve(area: AreaSeries) -> dict[str, Any]:
@@ -234,7 +224,7 @@ def _render(
         version=__version__,
         gallery=gallery,
         scans=[_scan_row(table, context, index) for index in recent] if table is not None else [],
-        areas=[_area_row(area) for area in areas],
+        areas=[newest_value(area) for area in areas],
         calibration=_sigma_calibration(table),
         waiting=context.waiting[:MAX_LISTED],
         set_aside=context.set_aside[-MAX_LISTED:][::-1],
@@ -259,18 +249,6 @@ def _scan_row(table: EpochTable, context: PageContext, index: int) -> dict[str, 
     }
 
 
-def _area_row(area: AreaSeries) -> dict[str, Any] | None:
-    """Return a row of the table of areas: the newest values of an area."""
-    mean_m, sigma_m = (area.columns[key] for key in ("mean_change", "mean_change_uncertainty"))
-    known = np.flatnonzero(np.isfinite(mean_m))
-    row: dict[str, Any] = {"name": area.name, "size_m2": area.size_m2, "time_s": None}
-    if len(known):
-        newest = known[-1]
-        row |= {key: float(column[newest]) for key, column in area.columns.items()}
-        row |= {"time_s": float(area.start_s[newest]), "half95": SIGNIFICANT_SIGMAS * float(sigma_m[newest])}
-    return row
-
-
 def _sigma_calibration(table: EpochTable | None) -> dict[str, Any] | None:
     """Return how sigma compares with the change of hold-out stable ground; None if there is none."""
     if table is None:
@@ -285,22 +263,12 @@ def _sigma_calibration(table: EpochTable | None) -> dict[str, Any] | None:
     return {"z": median, "status": status, "scans": len(z), "low": low, "high": high}
 
 
-def _format_number(value: float | None, digits: int, sign: bool = False) -> str:  # noqa: FBT001, FBT002 - a filter
-    if value is None or not math.isfinite(value):
-        return "–"
-    return f"{value:{'+' if sign else ''},.{digits}f}".replace("-", "−").replace(",", "\u202f")
-
-
-def _format_utc(time_s: float) -> str:
-    return f"{datetime.fromtimestamp(time_s, UTC):%Y-%m-%d %H:%M}"
-
-
 def _template() -> jinja2.Template:
     environment = jinja2.Environment(
         loader=jinja2.FileSystemLoader(ASSETS), autoescape=True, undefined=jinja2.StrictUndefined,
         trim_blocks=True, lstrip_blocks=True,
     )  # fmt: skip
-    environment.filters |= {"number": _format_number, "utc": _format_utc}
+    environment.filters |= {"number": format_number, "utc": format_utc}
     return environment.get_template("page.html")
 
 

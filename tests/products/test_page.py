@@ -21,6 +21,7 @@ from station.products.epoch_table import AreaSeries, EpochTable, read_epoch_tabl
 from station.products.gallery import MeasuredEpoch, Style, cached_base_map, retention_indices, update_gallery
 from station.products.maps import MAX_BYTES
 from station.products.overview import base_map
+from station.products.page_areas import mask_unusable
 
 NOW_S = 1_763_710_000.0
 
@@ -106,7 +107,7 @@ def test_unusable_epochs_are_gaps_in_the_curves(write, series, small):
     build_series(series)
     folder = write()
     assert len(page_data(folder)["health"]["time_s"]) == 7
-    masked = page._mask_unusable(
+    masked = mask_unusable(
         AreaSeries("a", 1.0, *2 * [read_epoch_table(series).start_s], {"mean_change": np.ones(7)}),
         read_epoch_table(series),
     )

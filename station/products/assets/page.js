@@ -112,7 +112,7 @@
       cell(top, "th", "time, UTC");
       for (const line of lines) {
         cell(top, "th", line.label || "value");
-        if (line.half) cell(top, "th", "±");
+        if (line.half) cell(top, "th", "± (95 %)");
       }
       for (let i = time_s.length - 1; i >= 0; i--) {
         const row = body.insertRow();
@@ -212,7 +212,9 @@
   function drawHealth(health, h) {
     const t = h.time_s;
     curve(health, "Change / σ on stable ground (expected: 1)", t, [{ values: h.stable_z_std, digits: 2 }], [0.8, 1.25]);
-    curve(health, "Stable ground, median ± NMAD, m", t, [{ values: h.stable_median, half: h.stable_nmad, digits: 3 }]);
+    curve(health, "Stable ground, m", t, [
+      { label: "median", values: h.stable_median, digits: 3 },
+      { label: "scatter (NMAD)", values: h.stable_nmad, digits: 3, colour: "--second" }]);
     const medianOf = (values) => {
       const known = values.filter((v) => v != null).sort((a, b) => a - b);
       return known.length ? known[Math.floor(known.length / 2)] : null;
