@@ -30,7 +30,14 @@ from station.products.gallery import (
 from station.products.maps import ASSETS, map_box
 from station.products.overview import Overview
 from station.products.page_areas import newest_value, usable_area_series
-from station.products.page_text import format_number, format_utc
+from station.products.page_health import (
+    calibration_by_range,
+    log_entries,
+    reasons,
+    summary_of_sigma,
+    timeline,
+)
+from station.products.page_text import PAGE_TEXT, format_number, format_utc, script_text
 from station.products.viewer.block_curves import CurveEpoch, curve_tiers, update_curves
 from station.quantities import Floats
 from station.science.geometry.robust_statistics import NORMAL_95
@@ -42,14 +49,11 @@ STATIC = {  # the parts of each file; a single style sheet is a single round tri
     "uplot.js": ("uplot.js",),
     "icon.svg": ("icon.svg",),
 }
-TEXT: dict[str, str] = json.loads((ASSETS / "text.en.json").read_text(encoding="utf-8"))
 MAX_CURVE_POINTS = 250  # of a curve; of a longer series every nth, the newest included
 MAX_AREAS = 8  # with a curve, so that the page stays small
 TABLE_ROWS = 24
 MAX_EVENTS = 20  # newest events in the table
 MAX_LISTED = 20  # scans that wait or were set aside
-CALIBRATED_Z_STD = (0.8, 1.25)  # limits of the standard deviation of change / sigma on stable ground
-RECENT_SCANS = 24  # scans used for it
 
 
 @dataclass(frozen=True)
@@ -64,6 +68,10 @@ class PageContext:
     set_aside: list[dict[str, Any]]  # keys scan, reason, since
     faults: list[str]
     durations_s: dict[str, float]  # processing time by scan id
+    language: str = "en"
+    alarms: list[dict[str, Any]] = field(default_factory=list)  # active; keys text, since_s
+    alarm_log: list[tuple[float, str]] = field(default_factory=list)  # time [s] and message
+    measured_again: list[tuple[float, int, float, float]] = field(default_factory=list)  # see `log_entries`
     overviews: dict[str, Overview] = field(default_factory=dict)  # those in memory already, by epoch file
 
 
@@ -94,7 +102,7 @@ def write_page(
         "written_s": context.written_s,
         "expected_every_s": context.expected_every_s,
         "station": series.station_id,
-        "text": TEXT,
+        "text": script_text(context.language),
         "maps": [
             {"time_s": image.start.timestamp(), "file": image.file, "version": image.version}
             for image in gallery.change
@@ -108,7 +116,8 @@ def write_page(
     _write_script(folder / "data.js", "STATION", data)
     _write_script(folder / "written.js", "STATION_WRITTEN_S", context.written_s)
     replace_if_changed(
-        folder / "index.html", _render(series, context, table, areas, gallery, len(all_areas)).encode()
+        folder / "index.html",
+        _render(series, folder, context, table, areas, gallery, len(all_areas)).encode(),
     )
 
 
@@ -210,13 +219,15 @@ def _health_curves(table: EpochTable, context: PageContext) -> dict[str, Any]:
 
 def _render(
     series: Series,
+    folder: Path,
     context: PageContext,
     table: EpochTable | None,
     areas: list[AreaSeries],
     gallery: Gallery,
     area_count: int,
 ) -> str:
-    events = read_events(series.folder)
+    events, text = read_events(series.folder), PAGE_TEXT[context.language]
+    by_range = calibration_by_range(series, table, folder, text) if table is not None else []
     recent = range(max(0, len(table) - TABLE_ROWS), len(table))[::-1] if table is not None else []
     return PAGE.render(
         id=series.station_id,
@@ -225,7 +236,13 @@ def _render(
         gallery=gallery,
         scans=[_scan_row(table, context, index) for index in recent] if table is not None else [],
         areas=[newest_value(area) for area in areas],
-        calibration=_sigma_calibration(table),
+        t=text,
+        language=context.language,
+        calibration=summary_of_sigma(table, by_range),
+        by_range=by_range,
+        days=timeline(table, context.expected_every_s, context.written_s) if table is not None else [],
+        reasons=reasons(table) if table is not None else [],
+        log=log_entries(series, context.measured_again, context.alarm_log, text),
         waiting=context.waiting[:MAX_LISTED],
         set_aside=context.set_aside[-MAX_LISTED:][::-1],
         max_listed=MAX_LISTED,
@@ -247,20 +264,6 @@ def _scan_row(table: EpochTable, context: PageContext, index: int) -> dict[str, 
         "seconds": context.durations_s.get(scan_id, math.nan),
         **{name: float(column[index]) for name, column in table.scalars.items()},
     }
-
-
-def _sigma_calibration(table: EpochTable | None) -> dict[str, Any] | None:
-    """Return how sigma compares with the change of hold-out stable ground; None if there is none."""
-    if table is None:
-        return None
-    z = table.scalars["stable_z_std"]
-    z = z[np.isfinite(z)][-RECENT_SCANS:]
-    if not len(z):
-        return None
-    median = float(np.median(z))
-    low, high = CALIBRATED_Z_STD
-    status = "calibrated" if low <= median <= high else "too large" if median < low else "too small"
-    return {"z": median, "status": status, "scans": len(z), "low": low, "high": high}
 
 
 def _template() -> jinja2.Template:
