@@ -19,8 +19,8 @@ from station.processing.epoch_recorder import page_folder
 from station.processing.site_files import series_for
 from station.products.area_tables import area_cells
 from station.products.epoch_table import read_epoch_table
-from station.products.page_areas import newest_value, usable_area_series
-from station.products.page_text import format_number, format_utc
+from station.products.web.page_areas import newest_value, usable_area_series
+from station.products.web.page_text import format_number, format_utc
 from station.simulation.station import demo, simulate
 
 

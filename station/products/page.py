@@ -29,16 +29,16 @@ from station.products.gallery import (
 )
 from station.products.maps import ASSETS, map_box
 from station.products.overview import Overview
-from station.products.page_areas import newest_value, usable_area_series
-from station.products.page_health import (
+from station.products.viewer.block_curves import CurveEpoch, curve_tiers, update_curves
+from station.products.web.page_areas import newest_value, usable_area_series
+from station.products.web.page_health import (
     calibration_by_range,
     log_entries,
     reasons,
     summary_of_sigma,
     timeline,
 )
-from station.products.page_text import PAGE_TEXT, format_number, format_utc, script_text
-from station.products.viewer.block_curves import CurveEpoch, curve_tiers, update_curves
+from station.products.web.page_text import PAGE_TEXT, format_number, format_utc, script_text
 from station.quantities import Floats
 from station.science.geometry.robust_statistics import NORMAL_95
 
@@ -115,6 +115,7 @@ def write_page(
     }
     _write_script(folder / "data.js", "STATION", data)
     _write_script(folder / "written.js", "STATION_WRITTEN_S", context.written_s)
+    _write_summary(series, folder, context, table, gallery)
     replace_if_changed(
         folder / "index.html",
         _render(series, folder, context, table, areas, gallery, len(all_areas)).encode(),
@@ -125,6 +126,25 @@ def _write_script(path: Path, name: str, value: object) -> None:
     """Write data as a script, the only kind that a page opened from a folder may load."""
     body = json.dumps(value, allow_nan=False, separators=(",", ":"), ensure_ascii=True)
     replace_if_changed(path, f"window.{name}={body};\n".encode("ascii"))
+
+
+def _write_summary(
+    series: Series, folder: Path, context: PageContext, table: EpochTable | None, gallery: Gallery
+) -> None:
+    """Write what the page of several stations shows of this one."""
+    summary: dict[str, Any] = {"written_s": context.written_s, "expected_every_s": context.expected_every_s}
+    if table is not None and len(table):
+        verdict = table.verdict[-1]
+        summary |= {"scan_s": float(table.start_s[-1]), "verdict": verdict}
+        summary |= {"reason": table.texts["verdict_reason"][-1]}
+        summary |= {"verdict_word": PAGE_TEXT[context.language][verdict]}
+    if gallery.change:
+        summary |= {"map": gallery.change[-1].file, "map_s": gallery.change[-1].start.timestamp()}
+    if alarms := sorted(context.alarms, key=lambda alarm: float(alarm["since_s"])):
+        summary |= {"alarm": alarms[-1]["text"]}
+    elif context.faults:
+        summary |= {"alarm": context.faults[0]}
+    _write_script(folder / "summary.js", f"STATIONS[{json.dumps(series.station_id)}]", summary)
 
 
 def _measured_epochs(
@@ -266,13 +286,16 @@ def _scan_row(table: EpochTable, context: PageContext, index: int) -> dict[str, 
     }
 
 
-def _template() -> jinja2.Template:
-    environment = jinja2.Environment(
+def environment() -> jinja2.Environment:
+    """Return the environment of the templates."""
+    templates = jinja2.Environment(
         loader=jinja2.FileSystemLoader(ASSETS), autoescape=True, undefined=jinja2.StrictUndefined,
         trim_blocks=True, lstrip_blocks=True,
     )  # fmt: skip
-    environment.filters |= {"number": format_number, "utc": format_utc}
-    return environment.get_template("page.html")
+    templates.filters |= {"number": format_number, "utc": format_utc}
+    return templates
 
 
-PAGE = _template()  # compiled once, before worker processes are forked: it takes as long as drawing a map
+PAGE = environment().get_template(
+    "page.html"
+)  # compiled once, before worker processes are forked: it takes as long as drawing a map

@@ -21,7 +21,7 @@ from station.products.epoch_table import AreaSeries, EpochTable, read_epoch_tabl
 from station.products.gallery import MeasuredEpoch, Style, cached_base_map, retention_indices, update_gallery
 from station.products.maps import MAX_BYTES
 from station.products.overview import base_map
-from station.products.page_areas import mask_unusable
+from station.products.web.page_areas import mask_unusable
 
 NOW_S = 1_763_710_000.0
 

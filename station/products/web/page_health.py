@@ -1,4 +1,7 @@
-"""Health of the station in words: is sigma right at every distance, what was not good and why, the log."""
+"""Health of the station in words: is sigma right at every distance, what was not good and why, the log.
+
+The texts of the page explain each reason.
+"""
 
 from __future__ import annotations
 
@@ -20,13 +23,14 @@ from station.archive.schema import VERDICTS
 from station.archive.series.index import SeriesIndex
 from station.products.epoch_table import EpochTable
 from station.products.gallery import replace_if_changed
-from station.products.page_text import format_utc
+from station.products.web.page_text import format_utc
 from station.quantities import Floats
 from station.queries.stable_ground import z_by_range
 
 CALIBRATED_Z_STD = (0.8, 1.25)  # limits of the standard deviation of change / sigma on stable ground
 RECENT_SCANS = 24  # scans used for it
-READ_SCANS = 2  # per page: stable ground of older scans is read over several pages
+READ_EVERY_S = 21_600.0  # of their stable ground, as reading costs half of a decoding on a large grid
+READ_SCANS = 1  # per page: older scans are read over several pages
 MIN_CELLS = 20  # of stable ground, for a distance to be judged
 DAYS, DAY_S, DAY_MIN = 14, 86_400.0, 1440.0
 MAX_LOG = 20
@@ -102,10 +106,9 @@ def sigma_status(z_std: float) -> str:
 def calibration_by_range(
     series: Series, table: EpochTable, folder: Path, text: dict[str, str]
 ) -> list[RangeCalibration]:
-    """Return the calibration of sigma by distance, from the newest scans that are not of the reference.
+    """Return the calibration of sigma by distance, from four scans a day that are not of the reference.
 
-    What was read of a scan is kept in `folder`, so that a page reads the newest scan only. Raises StoreError
-    if an epoch cannot be read.
+    What was read of a scan is kept in `folder`. Raises StoreError if an epoch cannot be read.
     """
     path = folder / ".calibration.json"
     try:
@@ -118,6 +121,8 @@ def calibration_by_range(
         for position, z_std in enumerate(table.scalars["stable_z_std"])
         if np.isfinite(z_std) and table.texts["reference_version"][position]
     ]
+    windows = table.start_s[usable] // READ_EVERY_S
+    usable = [usable[index] for index in np.flatnonzero(np.diff(windows, prepend=-1.0))]
     by_scan: dict[str, Any] = {}
     reads = 0
     for position in usable[: -RECENT_SCANS - 1 : -1]:
