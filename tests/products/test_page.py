@@ -122,7 +122,7 @@ def test_unusable_epochs_are_gaps_in_the_curves(write, series, small):
     )
     assert np.isnan(masked.columns["mean_change"]).tolist() == [False] * 6 + [True]
     html = (folder / "index.html").read_text()
-    assert html.count('class="unusable"') == 4  # the tile, the timeline, the reasons, the table
+    assert html.count('class="unusable"') == 4  # the tile, the timeline, the reasons, the table of scans
     assert "unusable: fallen over" in html
 
 
@@ -138,7 +138,7 @@ def test_only_changed_files_are_replaced_and_no_temporary_file_remains(write, co
     before = {path: path.stat().st_ino for path in folder.rglob("*") if path.is_file()}
     again = write(replace(context, written_s=NOW_S + 60))
     changed = {path.name for path, inode in before.items() if path.stat().st_ino != inode}
-    assert changed == {"index.html", "data.js", "written.js", ".calibration.json"}
+    assert changed == {"index.html", "data.js", "written.js", "summary.js"}
     assert {path for path in again.rglob("*") if path.is_file()} == before.keys()
 
 
@@ -239,8 +239,8 @@ def test_page_size_is_limited_after_a_year_of_hourly_scans(write, context, monke
     names = [f"area {'with a rather long name ' * 2}{n}" for n in range(12)]
     monkeypatch.setattr(
         page,
-        "read_area_series",
-        lambda _: [AreaSeries(n, 1e6, start_s, start_s + 900, columns) for n in names],
+        "usable_area_series",
+        lambda *_: [AreaSeries(n, 1e6, start_s, start_s + 900, columns) for n in names],
     )
 
     def year_of_epochs(series):
