@@ -3,6 +3,7 @@
 `station.open(site_or_folder)` returns the whole series of a station as one lazy `xarray.Dataset`,
 `station.variance(site_or_folder, weights, epoch)` the variance of any mean, volume or difference in it, and
 `station.volume(site_or_folder, area, epoch)` a volume with its uncertainty and each cell's share in it.
+`station.view(site_or_folder)` shows the page in a notebook.
 """
 
 from __future__ import annotations
@@ -20,6 +21,7 @@ if TYPE_CHECKING:
     import xarray as xr
 
     from station.archive.series.lazy import Chunks
+    from station.operations.notebook_view import View
     from station.queries.grid_arrays import Epoch
 
 
@@ -118,6 +120,18 @@ def levels(
 
     series = series_in(site_or_folder)
     return filter_levels(series, to_mask(area, series), lambda: None, monthly=every == "1M")
+
+
+def view(site_or_folder: str | Path, height_px: int = 900) -> View:
+    """Return the page of a station for a notebook, which shows it as the value of a cell.
+
+    A web server in this process serves it to this machine until it is closed (`view.close()`), with the
+    answers of `station serve`. Needs `tls-station[serve]`. Raises StationError without it, or if there is no
+    page yet; StoreError if there is no series.
+    """
+    from station.operations.notebook_view import show
+
+    return show(site_or_folder, height_px)
 
 
 def point_covariance(

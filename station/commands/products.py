@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 from enum import StrEnum
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -23,6 +24,12 @@ from station.commands._options import (
 
 if TYPE_CHECKING:
     from station.config import Site
+
+
+MAX_ANSWER_S = 60.0  # of the server, for one request
+SitesArgument = Annotated[
+    list[Path], typer.Argument(metavar="SITE…", help="The site files (TOML).", show_default=False)
+]
 
 
 class PlotKind(StrEnum):
@@ -173,14 +180,43 @@ def plot(
 
 
 def serve(
-    site: SiteArgument,
+    sites: SitesArgument,
     port: Annotated[int, typer.Option(min=1, max=65535, help="On 127.0.0.1.")] = 8750,
 ) -> None:
-    """Serve the station's page on this machine, read-only."""
-    from station.config import read_site
-    from station.processing.epoch_recorder import page_folder
-    from station.products.serve import server_for
+    """Serve the page of a station on this machine, read-only; of several below a page with all.
 
-    serve_page = server_for(page_folder(read_site(site)), port)
+    Below api/ it answers what a static page cannot: the change of any polygon over any epochs, and parts of
+    the series as NetCDF and GeoTIFF.
+    """
+    from station.config import read_site
+    from station.processing.workers.isolation import TaskRunner
+    from station.products.serve import Served, server_for
+
+    settings = [read_site(site) for site in sites]
+    stations = [Served(site.station.id, site.station.name, site.station.data) for site in settings]
+    run = partial(
+        TaskRunner().run,
+        memory_gb=min(site.service.memory_gb for site in settings),
+        timeout_s=MAX_ANSWER_S,
+    )
+    serve_page = server_for(stations, port, run, settings[0].products.language)
     print(f"http://127.0.0.1:{port}/ (Ctrl-C ends it)", file=sys.stderr)
     serve_page()
+
+
+def index(
+    sites: SitesArgument,
+    out: Annotated[Path, typer.Option("--out", "-o", metavar="FILE", help="The page.")] = Path("index.html"),
+) -> None:
+    """Write a page of several stations: a row each with its state, newest map and newest alarm.
+
+    It reads the pages of the stations when it is opened: write it again for another list of stations only.
+    """
+    from station.config import read_site
+    from station.processing.epoch_recorder import page_folder
+    from station.products.web.stations_page import write_stations
+
+    settings = [read_site(site) for site in sites]
+    stations = [(site.station.id, site.station.name, page_folder(site)) for site in settings]
+    write_stations(out, stations, settings[0].products.language)
+    print(out)

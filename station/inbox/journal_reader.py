@@ -198,6 +198,19 @@ class JournalReader:
         """Return the rows changed since a time, in order of their change."""
         return self._select("WHERE changed_utc_s >= ? ORDER BY changed_utc_s", utc_s)
 
+    def measured_again(self, count: int) -> list[tuple[float, int, float, float]]:
+        """Return when scans were measured again, newest day first: last time, number, first and last start.
+
+        At most `count` days, times in seconds since 1970.
+        """
+        query = (
+            "SELECT max(changed_utc_s), count(*), min(start_utc_s), max(start_utc_s) FROM scan"
+            " WHERE state = 'stored' AND revision > 1 GROUP BY CAST(changed_utc_s / 86400 AS INTEGER)"
+            " ORDER BY 1 DESC LIMIT ?"
+        )
+        with self._store_errors():
+            return self._connection.execute(query, (count,)).fetchall()
+
     def newest(self, count: int) -> list[Entry]:
         """Return the newest stored scans, in order of their start."""
         entries = self._select("WHERE state = 'stored' ORDER BY start_utc_s DESC LIMIT ?", count)

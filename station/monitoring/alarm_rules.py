@@ -205,7 +205,7 @@ def _events(site: Site, rule: EventAlarm, assessed_until_utc_s: float | None) ->
         if is_new or event.state == "active":
             half_m3 = NORMAL_95 * event.volume_sigma_m3
             text = (
-                f"{event.kind} of {event.volume_m3:+.0f} m³ (± {half_m3:.0f} m³ at 95 %) on"
+                f"{event.kind} of {event.volume_m3:+z.0f} m³ (± {half_m3:.0f} m³ at 95 %) on"
                 f" {event.area_m2:.0f} m² at {event.east_m:.0f} {event.north_m:.0f},"
                 f" {event.begin[:16].replace('T', ' ')} UTC"
             )

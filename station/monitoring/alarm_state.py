@@ -12,6 +12,7 @@ from station.errors import StoreError
 
 FILE_NAME = "alarms.json"
 CLEAR_AFTER_S = 3600.0  # an alarm must be absent for this long: one at its threshold is not sent each time
+MAX_LOG = 20  # newest messages that the page lists
 FILE_BYTES = 65536  # size of the file, padded with blanks, so that it can be rewritten on a full disk
 
 
@@ -46,6 +47,9 @@ class AlarmState:
     sent_digest: str = ""  # name of the last digest sent
     active: dict[str, ActiveAlarm] = field(default_factory=dict)
     unsent: dict[str, list[str]] = field(default_factory=dict)
+    log: list[tuple[float, str]] = field(
+        default_factory=list
+    )  # newest messages and their times, for the page
 
 
 def active(data: Path) -> dict[str, str]:
@@ -53,6 +57,19 @@ def active(data: Path) -> dict[str, str]:
     state = load(data / FILE_NAME)
     alarms = state.active if state else {}
     return {key: alarm.text for key, alarm in alarms.items() if alarm.notified_utc_s is not None}
+
+
+def active_since(data: Path) -> dict[str, float]:
+    """Return since when each active alarm that was sent lasts [s since 1970], by its text."""
+    state = load(data / FILE_NAME)
+    alarms = state.active.values() if state else ()
+    return {alarm.text: alarm.since_utc_s for alarm in alarms if alarm.notified_utc_s is not None}
+
+
+def recent_messages(data: Path) -> list[tuple[float, str]]:
+    """Return time [s since 1970] and text of the newest messages, the oldest first."""
+    state = load(data / FILE_NAME)
+    return state.log if state else []
 
 
 def due_messages(state: AlarmState, alarms: list[Alarm], now_s: float, repeat_s: float) -> list[str]:
@@ -77,6 +94,7 @@ def due_messages(state: AlarmState, alarms: list[Alarm], now_s: float, repeat_s:
         cleared = state.active.pop(key)
         if cleared.notified_utc_s is not None:
             lines.append(f"over: {cleared.text} (since {_format_utc(cleared.since_utc_s)})")
+    state.log = [*state.log, *((now_s, line) for line in lines)][-MAX_LOG:]
     return lines
 
 
@@ -85,7 +103,8 @@ def load(path: Path) -> AlarmState | None:
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
         alarms = {key: ActiveAlarm(**alarm) for key, alarm in content.pop("active").items()}
-        return AlarmState(**content, active=alarms)
+        messages = [(float(time_s), str(text)) for time_s, text in content.pop("log", [])]
+        return AlarmState(**content, active=alarms, log=messages)
     except (OSError, ValueError, TypeError, KeyError, AttributeError):
         return None
 

@@ -117,11 +117,11 @@ def _area_changes(curves: list[AreaCurve], begin_s: float) -> Iterator[str]:
         if end < 0 or curve.time_s[end] < begin_s:
             yield f"{curve.name}: not observed"
             continue
-        since_reference = f"{curve.change_m[end]:+.3f} ± {SIGNIFICANT_SIGMAS * curve.sigma_m[end]:.3f}"
+        since_reference = f"{curve.change_m[end]:+z.3f} ± {SIGNIFICANT_SIGMAS * curve.sigma_m[end]:.3f}"
         start = max(start, 0)
         day_change_m = curve.change_m[end] - curve.change_m[start]
         sigma_m = np.hypot(curve.sigma_m[end], curve.sigma_m[start])
-        yield f"{curve.name}: {day_change_m:+.3f} ± {SIGNIFICANT_SIGMAS * sigma_m:.3f}, {since_reference}"
+        yield f"{curve.name}: {day_change_m:+z.3f} ± {SIGNIFICANT_SIGMAS * sigma_m:.3f}, {since_reference}"
 
 
 def _truncate(lines: list[str]) -> str:

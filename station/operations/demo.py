@@ -11,14 +11,16 @@ from rich.console import Console
 from rich.progress import Progress
 from rich.table import Table
 
-from station.archive.series.lazy import open_series
+from station.archive.reference_files import read_reference
 from station.config import Site, read_site
 from station.inbox.journal_reader import Entry, State
 from station.operations.batch import format_entry, process_scans
 from station.processing.epoch_recorder import page_folder
 from station.processing.site_files import series_for
-from station.quantities import Quality
-from station.queries.aggregates import Aggregates
+from station.products.area_tables import area_cells
+from station.products.epoch_table import read_epoch_table
+from station.products.web.page_areas import newest_value, usable_area_series
+from station.products.web.page_text import format_number, format_utc
 from station.simulation.station import demo, simulate
 
 
@@ -40,8 +42,8 @@ def run_demo(folder: Path, hours: int) -> int:
 
         status = process_scans(site, scans, report)
         progress.update(task, completed=len(scans) + scenario.reference_scans)
-    with open_series(site.station.data) as series, xr.open_dataset(folder / "truth.nc") as truth:
-        Console(width=None if sys.stdout.isatty() else 100).print(_change_table(site, series, truth))
+    with xr.open_dataset(folder / "truth.nc") as truth:
+        Console(width=None if sys.stdout.isatty() else 100).print(_area_table(site, truth))
     print(f"\n{site.station.data / 'series.nc'}")
     print(
         f"open it:  {sys.executable} -c \"import station; print(station.open('"
@@ -53,27 +55,28 @@ def run_demo(folder: Path, hours: int) -> int:
     return status
 
 
-def _change_table(site: Site, series: xr.Dataset, truth: xr.Dataset) -> Table:
-    """Return a table of the mean change of the glacier, measured and true, per scan [m]."""
-    aggregates = Aggregates(series_for(site))
-    truth_scans = [str(scan_id) for scan_id in truth.scan_id.values]
-    reference_change_m = truth.change.values[
-        [truth_scans.index(scan_id) for scan_id in aggregates.reference().scan_ids]
-    ].mean(axis=0)
-    ice = truth.ice.values > 0.5
-    table = Table(title="Mean change of the glacier", caption="against the mean of the reference's scans")
-    for name in ("scan", "measured, m", "± 1 σ, m", "true, m", "cells changed at 95 %"):
-        table.add_column(name, justify="left" if name == "scan" else "right", no_wrap=True)
-    for index, scan_id in enumerate(str(value) for value in series.scan_id.values):
-        observed = ice & np.isfinite(series.elevation_change[index].values)
-        measured = aggregates.area(observed, aggregates.find_epoch(index))
-        true_m = (truth.change.values[truth_scans.index(scan_id)] - reference_change_m)[observed].mean()
-        significant = (series.quality[index].values[observed].astype(int) & Quality.CHANGE_SIGNIFICANT) > 0
-        columns = (
-            f"{measured.mean_m:+.3f}",
-            f"{measured.mean_sigma_m:.3f}",
-            f"{true_m:+.3f}",
-            f"{100 * significant.mean():.0f} %",
-        )
-        table.add_row(scan_id, *columns)
+def _area_table(site: Site, truth: xr.Dataset) -> Table:
+    """Return a table of the newest change of each area, as the page shows it, next to the true one."""
+    series = series_for(site)
+    epochs, reference, cells = read_epoch_table(series), read_reference(series), area_cells(site, None)
+    scan_ids = [str(scan_id) for scan_id in truth.scan_id.values]
+    of_reference = [scan_ids.index(scan_id) for scan_id in (reference.scan_ids if reference else ())]
+    true_change_m = truth.change.values - truth.change.values[of_reference].mean(axis=0)
+    table = Table(
+        title="Change of the areas since the reference",
+        caption="± is the 95 % interval, systematic errors included. The page and areas.nc show the same.",
+    )
+    for name in ("area", "time, UTC", "mean, m", "true, m", "volume, m³"):
+        table.add_column(name, justify="left" if name == "area" else "right", no_wrap=True)
+    for value in map(newest_value, usable_area_series(series, epochs)):
+        if value.start_s is not None:
+            scan_id = epochs.texts["scan_id"][int(np.searchsorted(epochs.start_s, value.start_s))]
+            true_m = true_change_m[scan_ids.index(scan_id)][cells[value.name]].mean()
+            table.add_row(
+                value.name,
+                format_utc(value.start_s),
+                f"{format_number(value.mean_m, 3, sign=True)} ± {format_number(value.mean_half_m, 3)}",
+                format_number(true_m, 3, sign=True),
+                f"{format_number(value.volume_m3, 0, sign=True)} ± {format_number(value.volume_half_m3, 0)}",
+            )
     return table

@@ -364,7 +364,7 @@ def _tilt_record(
         MIN_CLOCK_OFFSET_S, MIN_CLOCK_OFFSET_SIGMAS * tilt_record.offset_sigma_s
     ):
         warnings.append(
-            f"clock of the inclination log {tilt_record.offset_s:+.1f} s off,"
+            f"clock of the inclination log {tilt_record.offset_s:+z.1f} s off,"
             f" sigma {tilt_record.offset_sigma_s:.1f} s"
         )
     if track is None:

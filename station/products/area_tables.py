@@ -127,7 +127,7 @@ def area_records(
     ):
         yield from _from_file(stored, span, read_epoch_table(series))
     else:
-        yield from _compute(series, areas, span, against, track)
+        yield from computed_records(series, areas, span, against, track)
 
 
 def area_cells(site: Site, polygons: Path | None) -> dict[str, Bools]:
@@ -160,13 +160,17 @@ def _from_file(stored: list[AreaSeries], span: Span, table: EpochTable) -> Itera
                 yield AreaRecord(start, end, area.name, area.size_m2, verdict, statistics)
 
 
-def _compute(
+def computed_records(
     series: Series,
     areas: dict[str, Bools],
     span: Span,
     against: str,
     track: Callable[[list[EpochRef]], Iterable[EpochRef]],
 ) -> Iterator[AreaRecord]:
+    """Yield the change of areas, masks (ny, nx) by name, as `area_records` does, from the epochs.
+
+    Raises StationError if `against` is no epoch.
+    """
     table = read_epoch_table(series)
     versions = dict(zip(table.texts["epoch_file"], table.texts["reference_version"], strict=True))
     verdicts = dict(zip(table.texts["epoch_file"], table.verdict, strict=True))
@@ -226,10 +230,10 @@ def as_text(records: Iterable[AreaRecord]) -> str:
         (
             f"{record.start:%Y-%m-%d %H:%M}",
             record.area,
-            f"{statistics['mean_change']:+.4f}",
+            f"{statistics['mean_change']:+z.4f}",
             f"±{statistics['mean_change_high'] - statistics['mean_change']:.4f}",
-            f"{statistics['median_change']:+.4f}",
-            f"{statistics['volume_change']:+.1f}",
+            f"{statistics['median_change']:+z.4f}",
+            f"{statistics['volume_change']:+z.1f}",
             f"±{statistics['volume_change_high'] - statistics['volume_change']:.1f}",
             f"{100 * statistics['coverage']:.0f} %",
             record.verdict,

@@ -51,8 +51,8 @@ def as_text(events: Iterable[Event]) -> str:
             f"{event.east_m:.0f}",
             f"{event.north_m:.0f}",
             f"{event.area_m2:.0f}",
-            f"{event.mean_depth_m:+.2f}",
-            f"{event.volume_m3:+.0f}",
+            f"{event.mean_depth_m:+z.2f}",
+            f"{event.volume_m3:+z.0f}",
             f"±{NORMAL_95 * event.volume_sigma_m3:.0f}",
             _balance(event),
         )
@@ -64,7 +64,7 @@ def as_text(events: Iterable[Event]) -> str:
 def _balance(event: Event) -> str:
     if event.balance_m3 is None or event.balance_sigma_m3 is None:
         return ""
-    return f"{event.balance_m3:+.0f} ±{NORMAL_95 * event.balance_sigma_m3:.0f}"
+    return f"{event.balance_m3:+z.0f} ±{NORMAL_95 * event.balance_sigma_m3:.0f}"
 
 
 def _minute(time: str) -> str:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -17,7 +17,7 @@ from station._version import __version__
 from station.archive.derived.event_table import read_events
 from station.archive.netcdf_layout import Series
 from station.archive.series.index import SeriesIndex
-from station.products.epoch_table import AreaSeries, EpochTable, read_area_series, read_epoch_table
+from station.products.epoch_table import AreaSeries, EpochTable, read_epoch_table
 from station.products.gallery import (
     Gallery,
     MeasuredEpoch,
@@ -30,9 +30,17 @@ from station.products.gallery import (
 from station.products.maps import ASSETS, map_box
 from station.products.overview import Overview
 from station.products.viewer.block_curves import CurveEpoch, curve_tiers, update_curves
+from station.products.web.page_areas import newest_value, usable_area_series
+from station.products.web.page_health import (
+    calibration_by_range,
+    log_entries,
+    reasons,
+    summary_of_sigma,
+    timeline,
+)
+from station.products.web.page_text import PAGE_TEXT, format_number, format_utc, script_text
 from station.quantities import Floats
 from station.science.geometry.robust_statistics import NORMAL_95
-from station.science.gridding.significance import SIGNIFICANT_SIGMAS
 
 STATIC = {  # the parts of each file; a single style sheet is a single round trip
     "page.css": ("uplot.css", "page.css"),
@@ -41,14 +49,11 @@ STATIC = {  # the parts of each file; a single style sheet is a single round tri
     "uplot.js": ("uplot.js",),
     "icon.svg": ("icon.svg",),
 }
-TEXT: dict[str, str] = json.loads((ASSETS / "text.en.json").read_text(encoding="utf-8"))
 MAX_CURVE_POINTS = 250  # of a curve; of a longer series every nth, the newest included
 MAX_AREAS = 8  # with a curve, so that the page stays small
 TABLE_ROWS = 24
 MAX_EVENTS = 20  # newest events in the table
 MAX_LISTED = 20  # scans that wait or were set aside
-CALIBRATED_Z_STD = (0.8, 1.25)  # limits of the standard deviation of change / sigma on stable ground
-RECENT_SCANS = 24  # scans used for it
 
 
 @dataclass(frozen=True)
@@ -63,6 +68,10 @@ class PageContext:
     set_aside: list[dict[str, Any]]  # keys scan, reason, since
     faults: list[str]
     durations_s: dict[str, float]  # processing time by scan id
+    language: str = "en"
+    alarms: list[dict[str, Any]] = field(default_factory=list)  # active; keys text, since_s
+    alarm_log: list[tuple[float, str]] = field(default_factory=list)  # time [s] and message
+    measured_again: list[tuple[float, int, float, float]] = field(default_factory=list)  # see `log_entries`
     overviews: dict[str, Overview] = field(default_factory=dict)  # those in memory already, by epoch file
 
 
@@ -79,10 +88,8 @@ def write_page(
     The maps are written first, then the data, then the page that refers to them.
     """
     table = read_epoch_table(series) if series.path.is_file() else None
-    all_areas = read_area_series(series)
+    all_areas = usable_area_series(series, table) if table is not None else []
     areas = all_areas[:MAX_AREAS]
-    if table is not None:
-        areas = [_mask_unusable(area, table) for area in areas]
     gallery, curves = Gallery([], None, None, None, (0, 0)), None
     if table is not None:
         style = Style(context.name or series.station_id, width_px, limit_m)
@@ -95,7 +102,7 @@ def write_page(
         "written_s": context.written_s,
         "expected_every_s": context.expected_every_s,
         "station": series.station_id,
-        "text": TEXT,
+        "text": script_text(context.language),
         "maps": [
             {"time_s": image.start.timestamp(), "file": image.file, "version": image.version}
             for image in gallery.change
@@ -108,8 +115,10 @@ def write_page(
     }
     _write_script(folder / "data.js", "STATION", data)
     _write_script(folder / "written.js", "STATION_WRITTEN_S", context.written_s)
+    _write_summary(series, folder, context, table, gallery)
     replace_if_changed(
-        folder / "index.html", _render(series, context, table, areas, gallery, len(all_areas)).encode()
+        folder / "index.html",
+        _render(series, folder, context, table, areas, gallery, len(all_areas)).encode(),
     )
 
 
@@ -117,6 +126,25 @@ def _write_script(path: Path, name: str, value: object) -> None:
     """Write data as a script, the only kind that a page opened from a folder may load."""
     body = json.dumps(value, allow_nan=False, separators=(",", ":"), ensure_ascii=True)
     replace_if_changed(path, f"window.{name}={body};\n".encode("ascii"))
+
+
+def _write_summary(
+    series: Series, folder: Path, context: PageContext, table: EpochTable | None, gallery: Gallery
+) -> None:
+    """Write what the page of several stations shows of this one."""
+    summary: dict[str, Any] = {"written_s": context.written_s, "expected_every_s": context.expected_every_s}
+    if table is not None and len(table):
+        verdict = table.verdict[-1]
+        summary |= {"scan_s": float(table.start_s[-1]), "verdict": verdict}
+        summary |= {"reason": table.texts["verdict_reason"][-1]}
+        summary |= {"verdict_word": PAGE_TEXT[context.language][verdict]}
+    if gallery.change:
+        summary |= {"map": gallery.change[-1].file, "map_s": gallery.change[-1].start.timestamp()}
+    if alarms := sorted(context.alarms, key=lambda alarm: float(alarm["since_s"])):
+        summary |= {"alarm": alarms[-1]["text"]}
+    elif context.faults:
+        summary |= {"alarm": context.faults[0]}
+    _write_script(folder / "summary.js", f"STATIONS[{json.dumps(series.station_id)}]", summary)
 
 
 def _measured_epochs(
@@ -183,17 +211,8 @@ def _decimate(count: int) -> slice:
 
 
 def _json_numbers(values: Floats, digits: int) -> list[float | None]:
-    rounded = (round(float(value), digits) if np.isfinite(value) else None for value in values)
+    rounded = (round(float(value), digits) + 0.0 if np.isfinite(value) else None for value in values)
     return [int(value) if value is not None and not digits else value for value in rounded]
-
-
-def _mask_unusable(area: AreaSeries, table: EpochTable) -> AreaSeries:
-    """Return the series of an area with gaps at epochs whose change and sigma are unusable."""
-    unusable_s = table.start_s[[verdict == "unusable" for verdict in table.verdict]]
-    gaps = np.isin(area.start_s, unusable_s)
-    return replace(
-        area, columns={name: np.where(gaps, np.nan, values) for name, values in area.columns.items()}
-    )
 
 
 def _area_curve(area: AreaSeries) -> dict[str, Any]:
@@ -220,13 +239,15 @@ def _health_curves(table: EpochTable, context: PageContext) -> dict[str, Any]:
 
 def _render(
     series: Series,
+    folder: Path,
     context: PageContext,
     table: EpochTable | None,
     areas: list[AreaSeries],
     gallery: Gallery,
     area_count: int,
 ) -> str:
-    events = read_events(series.folder)
+    events, text = read_events(series.folder), PAGE_TEXT[context.language]
+    by_range = calibration_by_range(series, table, folder, text) if table is not None else []
     recent = range(max(0, len(table) - TABLE_ROWS), len(table))[::-1] if table is not None else []
     return PAGE.render(
         id=series.station_id,
@@ -234,8 +255,14 @@ def _render(
         version=__version__,
         gallery=gallery,
         scans=[_scan_row(table, context, index) for index in recent] if table is not None else [],
-        areas=[_area_row(area) for area in areas],
-        calibration=_sigma_calibration(table),
+        areas=[newest_value(area) for area in areas],
+        t=text,
+        language=context.language,
+        calibration=summary_of_sigma(table, by_range),
+        by_range=by_range,
+        days=timeline(table, context.expected_every_s, context.written_s) if table is not None else [],
+        reasons=reasons(table) if table is not None else [],
+        log=log_entries(series, context.measured_again, context.alarm_log, text),
         waiting=context.waiting[:MAX_LISTED],
         set_aside=context.set_aside[-MAX_LISTED:][::-1],
         max_listed=MAX_LISTED,
@@ -259,49 +286,16 @@ def _scan_row(table: EpochTable, context: PageContext, index: int) -> dict[str, 
     }
 
 
-def _area_row(area: AreaSeries) -> dict[str, Any] | None:
-    """Return a row of the table of areas: the newest values of an area."""
-    mean_m, sigma_m = (area.columns[key] for key in ("mean_change", "mean_change_uncertainty"))
-    known = np.flatnonzero(np.isfinite(mean_m))
-    row: dict[str, Any] = {"name": area.name, "size_m2": area.size_m2, "time_s": None}
-    if len(known):
-        newest = known[-1]
-        row |= {key: float(column[newest]) for key, column in area.columns.items()}
-        row |= {"time_s": float(area.start_s[newest]), "half95": SIGNIFICANT_SIGMAS * float(sigma_m[newest])}
-    return row
-
-
-def _sigma_calibration(table: EpochTable | None) -> dict[str, Any] | None:
-    """Return how sigma compares with the change of hold-out stable ground; None if there is none."""
-    if table is None:
-        return None
-    z = table.scalars["stable_z_std"]
-    z = z[np.isfinite(z)][-RECENT_SCANS:]
-    if not len(z):
-        return None
-    median = float(np.median(z))
-    low, high = CALIBRATED_Z_STD
-    status = "calibrated" if low <= median <= high else "too large" if median < low else "too small"
-    return {"z": median, "status": status, "scans": len(z), "low": low, "high": high}
-
-
-def _format_number(value: float | None, digits: int, sign: bool = False) -> str:  # noqa: FBT001, FBT002 - a filter
-    if value is None or not math.isfinite(value):
-        return "–"
-    return f"{value:{'+' if sign else ''},.{digits}f}".replace("-", "−").replace(",", "\u202f")
-
-
-def _format_utc(time_s: float) -> str:
-    return f"{datetime.fromtimestamp(time_s, UTC):%Y-%m-%d %H:%M}"
-
-
-def _template() -> jinja2.Template:
-    environment = jinja2.Environment(
+def environment() -> jinja2.Environment:
+    """Return the environment of the templates."""
+    templates = jinja2.Environment(
         loader=jinja2.FileSystemLoader(ASSETS), autoescape=True, undefined=jinja2.StrictUndefined,
         trim_blocks=True, lstrip_blocks=True,
     )  # fmt: skip
-    environment.filters |= {"number": _format_number, "utc": _format_utc}
-    return environment.get_template("page.html")
+    templates.filters |= {"number": format_number, "utc": format_utc}
+    return templates
 
 
-PAGE = _template()  # compiled once, before worker processes are forked: it takes as long as drawing a map
+PAGE = environment().get_template(
+    "page.html"
+)  # compiled once, before worker processes are forked: it takes as long as drawing a map

@@ -137,9 +137,9 @@ def as_text(records: Iterable[TrendRecord]) -> str:
                 f"{record.first:%Y-%m-%d %H:%M}",
                 f"{record.last:%Y-%m-%d %H:%M}",
                 str(record.epochs),
-                f"{trend.rate_m_d:+.4f}",
+                f"{trend.rate_m_d:+z.4f}",
                 f"±{NORMAL_95 * trend.rate_sigma_m_d:.4f}",
-                f"{trend.acceleration_m_d2:+.4f}" if has_acceleration else "",
+                f"{trend.acceleration_m_d2:+z.4f}" if has_acceleration else "",
                 f"±{NORMAL_95 * trend.acceleration_sigma_m_d2:.4f}" if has_acceleration else "",
                 accelerates,
             )

@@ -4,24 +4,30 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass
+from itertools import pairwise
 from typing import Any
 
 import netCDF4
 import numpy as np
 from scipy import sparse
 
+from station.archive.derived.computed_rasters import CHANGE, TOTAL
 from station.archive.epochs import EpochRef, read_provenance
 from station.archive.netcdf_layout import Series
+from station.archive.read_errors import read_errors
 from station.archive.series.index import list_epochs
 from station.quantities import Bools, Floats, Floats32, Ints, Quality, Reference, SharedParameters
 from station.queries.aggregates import Aggregates
+from station.queries.epoch_cells import read_window
 from station.science.adjustment import ground_classes
 from station.science.analysis import calibration
+from station.science.geometry.robust_statistics import nmad
 from station.science.uncertainty.propagation import difference_to_reference
 
 Table = list[dict[str, Any]]
 
 MIN_BLOCK_SHARE = 0.5  # share of the cells of a block that a scan must have observed
+RANGE_EDGES_M = (100.0, 250.0, 500.0, 1000.0, 2000.0, 4000.0)  # of the distances that the page names
 RECENT_EPOCHS = 50  # epochs that determine the current factor of sigma
 LAG_CLASSES = 8  # distance classes
 PAIRS_PER_CLASS = 500  # pairs per distance class
@@ -70,6 +76,41 @@ def validate_sigma(series: Series, max_epochs: int, progress: Callable[[], None]
         lags.append(holdout_ground.variogram_sums(epoch_cells))
         progress()
     return SigmaValidation(epochs, _overall(epochs), _variogram(np.array(lags), holdout_ground.edges_m))
+
+
+def z_by_range(series: Series, epoch: EpochRef) -> list[tuple[float, float | None, int, float]]:
+    """Return how the change of hold-out stable ground scatters over its sigma, by distance from the scanner.
+
+    Rows of lower and upper distance [m], number of cells, and robust standard deviation of the standardised
+    change, as in `stable_z_std`; distances without a cell are left out. Empty without a scanner position.
+    Raises StoreError if the epoch cannot be read.
+    """
+    grid = series.grid
+    with read_errors(epoch.path), netCDF4.Dataset(epoch.path) as file:
+        if "scanner_east" not in file.variables:
+            return []
+        east_m, north_m = (
+            float(np.ma.filled(file[name][epoch.index], np.nan)) for name in ("scanner_east", "scanner_north")
+        )
+        quality = np.ma.filled(file["quality"][epoch.index], 0)
+        row, column = np.nonzero((quality & Quality.STABLE_GROUND) > 0)
+        holdout = ground_classes.is_holdout(grid.x_m[column], grid.y_m[row])
+        row, column = row[holdout], column[holdout]
+        if not len(row) or not np.isfinite(east_m + north_m):
+            return []
+        window = slice(row.min(), row.max() + 1), slice(column.min(), column.max() + 1)
+        change_m, sigma_m = (
+            read_window(file, name, epoch.index, window)[row - row.min(), column - column.min()]
+            for name in (CHANGE, TOTAL)
+        )
+    z = change_m / sigma_m
+    range_m = np.hypot(grid.x_m[column] - east_m, grid.y_m[row] - north_m)
+    band, table = np.searchsorted(RANGE_EDGES_M, range_m, side="right"), []
+    for number, (low_m, high_m) in enumerate(pairwise((0.0, *RANGE_EDGES_M, None))):
+        band_z = z[(band == number) & np.isfinite(z)]
+        if len(band_z):
+            table.append((low_m or 0.0, high_m, len(band_z), nmad(band_z)))
+    return table
 
 
 def sample_epochs(series: Series, max_epochs: int) -> list[EpochRef]:

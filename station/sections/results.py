@@ -213,6 +213,7 @@ class ProductsSection(Section):
     """What is produced from every scan for people and other programs."""
 
     page: bool = True
+    language: Literal["en", "de"] = "en"
     geotiff: bool = False
     quicklook_width_px: Annotated[int, Field(ge=400, le=4000)] = 1200
     change_limit_m: Positive | None = None

@@ -9,6 +9,7 @@ from pathlib import Path
 from station.config import Site
 from station.errors import StationError
 from station.inbox.journal_reader import JournalReader
+from station.monitoring.alarm_state import MAX_LOG, active_since, recent_messages
 from station.monitoring.log_clock import log_clock_offset
 from station.monitoring.pose_stability import step_shown_by
 from station.monitoring.status import queue_status
@@ -63,7 +64,8 @@ def _write_products(site: Site, result: StoredResult | None, faults: list[str], 
 def _page_context(site: Site, result: StoredResult | None, faults: list[str]) -> PageContext:
     backlog = queue_status(site)
     with JournalReader(site.station.data / "journal.sqlite") as journal:
-        durations_s = journal.durations_s()
+        durations_s, measured_again = journal.durations_s(), journal.measured_again(MAX_LOG)
+    data = site.station.data
     return PageContext(
         name=site.station.name,
         institution=site.station.institution,
@@ -73,5 +75,9 @@ def _page_context(site: Site, result: StoredResult | None, faults: list[str]) ->
         set_aside=sorted(backlog["set_aside"], key=lambda scan: str(scan["since"])),
         faults=[*backlog["faults"], *faults],
         durations_s={scan_id(name): duration_s for name, duration_s in durations_s.items()},
+        language=site.products.language,
+        alarms=[{"text": text, "since_s": since_s} for text, since_s in active_since(data).items()],
+        alarm_log=recent_messages(data),
+        measured_again=measured_again,
         overviews={Path(result.epoch).name: result.overview} if result and result.overview else {},
     )

@@ -14,6 +14,7 @@ import pytest
 from station.archive.series.index import SeriesIndex, series_in
 from station.operations.batch import process_scans
 from station.products.page import PageContext, write_page
+from station.products.web.stations_page import write_stations
 from station.queries.aggregates import Aggregates
 from station.simulation.station import simulate, small
 
@@ -277,3 +278,24 @@ def test_a_link_leads_to_the_curve_of_a_place(tab, address, folder):
     assert tab.run("document.getElementById('asked').hidden")
     assert tab.run("location.hash") == ""
     assert tab.errors() == []
+
+
+def test_page_of_several_stations_reads_their_pages(tab, folder, tmp_path):
+    """From a folder: a row each, its state and newest map; a station without a page is told."""
+    station_id = json.loads((folder / "summary.js").read_text().partition("[")[2].partition("]")[0])
+    stations = [(station_id, EVIL, folder), ("gone", "Far away", tmp_path / "nothing")]
+    write_stations(tmp_path / "all" / "index.html", stations, "en")
+    tab.open((tmp_path / "all" / "index.html").as_uri())
+    tab.await_("document.querySelectorAll('.lamp').length == 2")
+    cells = tab.run(
+        "[...document.querySelectorAll('tbody tr')].map(r => [...r.cells].map(c => c.textContent))"
+    )
+    assert cells[0][0] == EVIL
+    assert cells[0][1].startswith("Up to date")
+    assert re.match(r"2025-07-15 \d\d:00 UTC: (good|degraded)", cells[0][2])
+    assert cells[1] == ["Far away", "no page found", "", "", ""]
+    assert tab.await_(
+        "(() => { const i = document.querySelector('img'); return i.complete && i.naturalWidth; })()"
+    )
+    assert tab.run("document.querySelector('a').href").endswith("page/index.html")
+    assert tab.run("document.title") == "Stations"

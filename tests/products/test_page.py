@@ -21,6 +21,7 @@ from station.products.epoch_table import AreaSeries, EpochTable, read_epoch_tabl
 from station.products.gallery import MeasuredEpoch, Style, cached_base_map, retention_indices, update_gallery
 from station.products.maps import MAX_BYTES
 from station.products.overview import base_map
+from station.products.web.page_areas import mask_unusable
 
 NOW_S = 1_763_710_000.0
 
@@ -96,8 +97,17 @@ def test_page_shows_the_stored_values(write, small):
     assert data["health"]["stable_z_std"] == [1.02] * 6
     html = Elements((folder / "index.html").read_text()).text
     assert re.search(r"\+0\.30\d ± 0\.00\d", html)  # newest value of the area
-    assert "calibrated" in html
+    assert "right" in html
     assert "1.02 σ" in html
+
+
+def test_page_in_german(write, context):
+    folder = write(replace(context, language="de", alarms=[{"text": "no scan", "since_s": NOW_S}]))
+    html = (folder / "index.html").read_text()
+    assert '<html lang="de">' in html
+    assert "Geht es der Station gut?" in html
+    assert "Alarm:</strong> no scan (seit 2025-11-21 07:26 UTC)" in html
+    assert page_data(folder)["text"]["js_late"] == "Verspätet"
 
 
 def test_unusable_epochs_are_gaps_in_the_curves(write, series, small):
@@ -106,13 +116,13 @@ def test_unusable_epochs_are_gaps_in_the_curves(write, series, small):
     build_series(series)
     folder = write()
     assert len(page_data(folder)["health"]["time_s"]) == 7
-    masked = page._mask_unusable(
+    masked = mask_unusable(
         AreaSeries("a", 1.0, *2 * [read_epoch_table(series).start_s], {"mean_change": np.ones(7)}),
         read_epoch_table(series),
     )
     assert np.isnan(masked.columns["mean_change"]).tolist() == [False] * 6 + [True]
     html = (folder / "index.html").read_text()
-    assert html.count('class="unusable"') == 2  # the tile and the table
+    assert html.count('class="unusable"') == 4  # the tile, the timeline, the reasons, the table of scans
     assert "unusable: fallen over" in html
 
 
@@ -128,7 +138,7 @@ def test_only_changed_files_are_replaced_and_no_temporary_file_remains(write, co
     before = {path: path.stat().st_ino for path in folder.rglob("*") if path.is_file()}
     again = write(replace(context, written_s=NOW_S + 60))
     changed = {path.name for path, inode in before.items() if path.stat().st_ino != inode}
-    assert changed == {"index.html", "data.js", "written.js"}
+    assert changed == {"index.html", "data.js", "written.js", "summary.js"}
     assert {path for path in again.rglob("*") if path.is_file()} == before.keys()
 
 
@@ -229,8 +239,8 @@ def test_page_size_is_limited_after_a_year_of_hourly_scans(write, context, monke
     names = [f"area {'with a rather long name ' * 2}{n}" for n in range(12)]
     monkeypatch.setattr(
         page,
-        "read_area_series",
-        lambda _: [AreaSeries(n, 1e6, start_s, start_s + 900, columns) for n in names],
+        "usable_area_series",
+        lambda *_: [AreaSeries(n, 1e6, start_s, start_s + 900, columns) for n in names],
     )
 
     def year_of_epochs(series):

@@ -18,7 +18,6 @@ import netCDF4
 import numpy as np
 import scipy
 
-import station
 from station._version import __version__
 from station.config import Site
 from station.errors import ConfigError, NotReadyError, StoreError
@@ -131,7 +130,7 @@ def versions() -> dict[str, str]:
 def _source_hash() -> str:
     """Return a hash of the source of the package: two builds of one version may differ."""
     digest = hashlib.sha256()
-    for path in sorted(Path(station.__file__).parent.rglob("*.py")):
+    for path in sorted(Path(__file__).parents[2].rglob("*.py")):
         digest.update(path.read_bytes())
     return digest.hexdigest()[:8]
 

@@ -1,7 +1,8 @@
 "use strict";
 // The page is complete without this script, which adds the status light, the slider and the curves.
 (() => {
-  const data = window.STATION;
+  const data = window.STATION, text = data.text;
+  const fill = (key, values) => text[key].replace(/\{(\w+)\}/g, (_, name) => values[name]);
   const byId = (id) => document.getElementById(id);
   const pad = (n) => String(n).padStart(2, "0");
   const utc = (s) => {
@@ -10,7 +11,7 @@
       `${pad(t.getUTCHours())}:${pad(t.getUTCMinutes())}`;
   };
   const span = (s) => s < 5400 ? `${Math.max(0, Math.round(s / 60))} min`
-    : s < 172800 ? `${Math.round(s / 3600)} h` : `${Math.round(s / 86400)} days`;
+    : s < 172800 ? `${Math.round(s / 3600)} h` : `${Math.round(s / 86400)} ${text.js_days}`;
 
   // ---- the status light: computed in the browser, so that it also shows when the service is dead
 
@@ -24,16 +25,16 @@
   function updateLight() {
     const age_s = Date.now() / 1000 - shown_s, every_s = data.expected_every_s;
     const state = age_s > STALE * every_s ? "stale" : age_s > LATE * every_s || age_s < -FUTURE_S ? "late" : "fresh";
-    const word = age_s < -FUTURE_S ? "Clock error"
-      : { fresh: "Up to date", late: "Late", stale: "Stale" }[state];
-    const text = age_s < -FUTURE_S ? "this clock or the station's is wrong"
-      : `written ${span(age_s)} ago, a scan is expected every ${span(every_s)}` +
-        (state === "stale" ? `: check that the service runs and scans arrive (systemctl status station@${data.station})` : "");
+    const word = age_s < -FUTURE_S ? text.js_clock_error
+      : text[`js_${state}`];
+    const words = age_s < -FUTURE_S ? text.js_clock_wrong
+      : fill("js_written_ago", { age: span(age_s), every: span(every_s) }) +
+        (state === "stale" ? fill("js_check_service", { station: data.station }) : "");
     const lamp = byId("lamp");
     if (lamp.className !== `lamp ${state}`) lamp.className = `lamp ${state}`;
     if (byId("lamp-word").textContent !== word) byId("lamp-word").textContent = word;
-    if (byId("lamp-text").textContent !== text) byId("lamp-text").textContent = text;
-    document.title = state === "stale" ? `STALE – ${title}` : title;
+    if (byId("lamp-text").textContent !== words) byId("lamp-text").textContent = words;
+    document.title = state === "stale" ? `${text.js_stale.toUpperCase()} – ${title}` : title;
     return age_s;
   }
 
@@ -77,7 +78,7 @@
       byId("map-caption").textContent = `${when}. ${rest}`;
     };
     image.addEventListener("error", () => {
-      byId("map-caption").textContent = "This map is no longer kept: reload the page.";
+      byId("map-caption").textContent = text.js_map_gone;
     });
     slider.max = maps.length - 1;
     slider.addEventListener("input", () => show(Number(slider.value)));
@@ -100,7 +101,7 @@
   // The values of a curve as a table, newest first; created when opened.
   function table(heading, time_s, lines) {
     const fold = document.createElement("details");
-    fold.appendChild(document.createElement("summary")).textContent = "As a table";
+    fold.appendChild(document.createElement("summary")).textContent = text.js_as_table;
     fold.addEventListener("toggle", () => {
       if (fold.querySelector("table")) return;
       const wide = fold.appendChild(document.createElement("div"));
@@ -109,10 +110,10 @@
       const element = wide.appendChild(document.createElement("table"));
       element.createCaption().textContent = heading;
       const top = element.createTHead().insertRow(), body = element.createTBody();
-      cell(top, "th", "time, UTC");
+      cell(top, "th", text.js_time);
       for (const line of lines) {
-        cell(top, "th", line.label || "value");
-        if (line.half) cell(top, "th", "±");
+        cell(top, "th", line.label || text.js_value);
+        if (line.half) cell(top, "th", "± (95 %)");
       }
       for (let i = time_s.length - 1; i >= 0; i--) {
         const row = body.insertRow();
@@ -144,7 +145,7 @@
         (line.half && line.half[i] != null ? ` ± ${formatNumber(line.half[i], line.digits)}` : "")).join(", ");
     };
     showReading(null);
-    plotBox.setAttribute("aria-label", `${heading}. Newest, ${reading.textContent}`);
+    plotBox.setAttribute("aria-label", `${heading}. ${text.js_newest}, ${reading.textContent}`);
     const rows = [time_s], series = [{}], bands = [];
     for (const line of lines) {
       const colour = cssColour(line.colour || "--accent");
@@ -198,7 +199,7 @@
     if (areas) areas.replaceChildren();
     health.replaceChildren();
     for (const area of data.areas) {
-      curve(areas, `${area.name}: mean change since the reference, m`, data.area_time_s, [
+      curve(areas, fill("js_area_curve", { area: area.name }), data.area_time_s, [
         { values: area.mean_m, half: area.sigma_m.map((s) => s == null ? null : 1.959964 * s), digits: 3 }]);
     }
     if (data.health) drawHealth(health, data.health);
@@ -211,20 +212,22 @@
 
   function drawHealth(health, h) {
     const t = h.time_s;
-    curve(health, "Change / σ on stable ground (expected: 1)", t, [{ values: h.stable_z_std, digits: 2 }], [0.8, 1.25]);
-    curve(health, "Stable ground, median ± NMAD, m", t, [{ values: h.stable_median, half: h.stable_nmad, digits: 3 }]);
+    curve(health, text.js_z, t, [{ values: h.stable_z_std, digits: 2 }], [0.8, 1.25]);
+    curve(health, text.js_stable, t, [
+      { label: text.js_median, values: h.stable_median, digits: 3 },
+      { label: text.js_scatter, values: h.stable_nmad, digits: 3, colour: "--second" }]);
     const medianOf = (values) => {
       const known = values.filter((v) => v != null).sort((a, b) => a - b);
       return known.length ? known[Math.floor(known.length / 2)] : null;
     };
     const [roll, pitch] = [medianOf(h.platform_roll), medianOf(h.platform_pitch)];
     const subtract = (values, m) => values.map((v) => v == null ? null : v - m);
-    curve(health, `Tilt minus its median (roll ${formatNumber(roll, 3)}°, pitch ${formatNumber(pitch, 3)}°), °`, t, [
-      { label: "roll", values: subtract(h.platform_roll, roll), digits: 4 },
-      { label: "pitch", values: subtract(h.platform_pitch, pitch), digits: 4, colour: "--second" }]);
-    curve(health, "Air temperature, °C", t, [{ values: h.air_temperature, digits: 1 }]);
-    curve(health, "Air pressure, hPa", t, [{ values: h.air_pressure, digits: 1 }]);
-    curve(health, "Processing time of a scan, s", t, [{ values: h.seconds, digits: 1 }]);
+    curve(health, fill("js_tilt", { roll: formatNumber(roll, 3), pitch: formatNumber(pitch, 3) }), t, [
+      { label: text.js_roll, values: subtract(h.platform_roll, roll), digits: 4 },
+      { label: text.js_pitch, values: subtract(h.platform_pitch, pitch), digits: 4, colour: "--second" }]);
+    curve(health, text.js_temperature, t, [{ values: h.air_temperature, digits: 1 }]);
+    curve(health, text.js_pressure, t, [{ values: h.air_pressure, digits: 1 }]);
+    curve(health, text.js_seconds, t, [{ values: h.seconds, digits: 1 }]);
   }
   addEventListener("DOMContentLoaded", draw);  // once the last script is loaded; status light and map do not wait for it
   matchMedia("(prefers-color-scheme: dark)").addEventListener("change", draw);

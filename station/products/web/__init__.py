@@ -1,0 +1,1 @@
+"""Parts of the page, the page of several stations, and the answers of the web server."""
