@@ -30,6 +30,8 @@ from station.products.gallery import (
 from station.products.maps import ASSETS, map_box
 from station.products.overview import Overview
 from station.products.viewer.block_curves import CurveEpoch, curve_tiers, update_curves
+from station.products.viewer.overlays import area_outlines, browser_scales, event_outlines
+from station.products.viewer.value_tiles import describe_levels, value_codes
 from station.quantities import Floats
 from station.science.geometry.robust_statistics import NORMAL_95
 from station.science.gridding.significance import SIGNIFICANT_SIGMAS
@@ -37,11 +39,23 @@ from station.science.gridding.significance import SIGNIFICANT_SIGMAS
 STATIC = {  # the parts of each file; a single style sheet is a single round trip
     "page.css": ("uplot.css", "page.css"),
     "page.js": ("page.js",),
-    "explore.js": ("tiles.js", "covariance.js", "curves.js", "map.js", "explore.js"),
+    "explore.js": (
+        "tiles.js",
+        "covariance.js",
+        "curves.js",
+        "map.js",
+        "values.js",
+        "layers.js",
+        "explore.js",
+    ),
     "uplot.js": ("uplot.js",),
     "icon.svg": ("icon.svg",),
 }
-TEXT: dict[str, str] = json.loads((ASSETS / "text.en.json").read_text(encoding="utf-8"))
+LANGUAGES = ("en", "de")  # of the map; the first is used for readers of any other
+TEXTS: dict[str, dict[str, str]] = {
+    language: json.loads((ASSETS / f"text.{language}.json").read_text(encoding="utf-8"))
+    for language in LANGUAGES
+}
 MAX_CURVE_POINTS = 250  # of a curve; of a longer series every nth, the newest included
 MAX_AREAS = 8  # with a curve, so that the page stays small
 TABLE_ROWS = 24
@@ -83,7 +97,7 @@ def write_page(
     areas = all_areas[:MAX_AREAS]
     if table is not None:
         areas = [_mask_unusable(area, table) for area in areas]
-    gallery, curves = Gallery([], None, None, None, (0, 0)), None
+    gallery, curves = Gallery([], None, (0, 0)), None
     if table is not None:
         style = Style(context.name or series.station_id, width_px, limit_m)
         measured = _measured_epochs(series, table, context.overviews)
@@ -95,12 +109,21 @@ def write_page(
         "written_s": context.written_s,
         "expected_every_s": context.expected_every_s,
         "station": series.station_id,
-        "text": TEXT,
+        "texts": TEXTS,
         "maps": [
-            {"time_s": image.start.timestamp(), "file": image.file, "version": image.version}
+            {
+                "time_s": image.start.timestamp(),
+                "file": image.file,
+                "version": image.version,
+                "values": Path(image.epoch_file).stem,
+            }
             for image in gallery.change
         ],
         "frames": _frames(series, folder, gallery, width_px),
+        "values": value_codes(),
+        "scales": browser_scales(gallery.limit_m) if gallery.limit_m else {},
+        "picture_px": gallery.size[0],
+        "outlines": {"areas": area_outlines(series), "events": event_outlines(series, MAX_EVENTS)},
         "curves": curves,
         "area_time_s": _json_numbers(areas[0].start_s[_decimate(len(areas[0].start_s))], 0) if areas else [],
         "areas": [_area_curve(area) for area in areas],
@@ -172,7 +195,8 @@ def _frames(series: Series, folder: Path, gallery: Gallery, width_px: int) -> di
         grid = base.grid
         extent = {"west": grid.west_m, "east": grid.west_m + grid.nx * grid.cell_m, "north": grid.north_m}
         extent["south"] = grid.north_m - grid.ny * grid.cell_m
-        frames[version] = {"box": [round(share, 6) for share in map_box(base, width_px)], "extent": extent}
+        box = [round(share, 6) for share in map_box(base, width_px)]
+        frames[version] = {"box": box, "extent": extent, "levels": describe_levels(base)}
     return frames
 
 
