@@ -173,15 +173,15 @@
   function drawOutlines(context, now) {
     drawKey();
     if (!outlined) return;
-    const draw = (rings, name, dash) => {
+    const draw = (rings, name, dash = []) => {
       if (!rings.length) return;
       context.setLineDash(dash);
       for (const ring of rings) drawShape(context, now, ring, true, 1.2);
       context.setLineDash([]);
-      const top = rings[0].reduce((a, b) => b[1] > a[1] ? b : a), [x, y] = now.toPixel(top);
-      label(context, name, x + 4, y - 5);
+      const end = rings[0].reduce((a, b) => b[1] > a[1] === !dash.length ? b : a), [x, y] = now.toPixel(end);
+      label(context, name, x + 4, dash.length ? y + 15 : y - 5);  // areas above, events below
     };
-    for (const area of data.outlines.areas) draw(area.rings, area.name, []);
+    for (const area of data.outlines.areas) draw(area.rings, area.name);
     for (const event of data.outlines.events) draw(event.rings, text[`event_${event.kind}`] || event.kind, [5, 4]);
   }
 

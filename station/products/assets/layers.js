@@ -92,7 +92,7 @@ function stationLayers(data, text, shownIndex, redraw) {
       }));
     }
     if (!state.contours) return;
-    every_m = niceStep(30 * now.view.scale);
+    every_m = niceStep(12 * now.view.scale);
     drawTiles(context, now, fine, (name) => kept(`contours ${version} ${level_m(fine)} ${every_m} ${name}`, async () => {
       const found = await lightAt(version, fine, name);
       return found && stationValues.paintContours(found.ground, every_m);
