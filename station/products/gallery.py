@@ -27,6 +27,7 @@ from station.products.colours import round_up
 from station.products.maps import Caption, change_map, encode_webp
 from station.products.overview import BaseMap, Overview, base_map, read_overview
 from station.products.viewer.value_tiles import (
+    delete_cells,
     delete_old_values,
     has_values,
     read_cells,
@@ -39,6 +40,7 @@ from station.quantities import Floats, Grid
 KEEP_ALL_FOR = timedelta(days=2)  # before the newest epoch; then the last map of each day …
 KEEP_DAILY_FOR = timedelta(days=60)  # … and before that the last of each month
 DAY_S = 86_400.0
+MAX_CELL_MAPS = 60  # newest maps with tiles of cells; before them, of means only
 MAX_MADE = 8  # per call: the maps of an archive older than the page are made over several calls
 DELETE_GRACE_S = 3600.0  # an open page may still refer to a map that is no longer kept
 LIMIT_SIGMAS = 10.0
@@ -77,6 +79,7 @@ class MapImage:
     file: str
     version: str  # of the reference
     epoch_file: str
+    finest: int  # level of its tiles of values
 
 
 @dataclass(frozen=True)
@@ -110,17 +113,18 @@ def update_gallery(
         for index in retention_indices(np.array([item.start.timestamp() for item in measured]))
     ]
     made_count, images, bases = 0, list[MapImage](), dict[str, BaseMap]()
-    for item in reversed(retained):
+    for age, item in enumerate(reversed(retained)):
         epoch_file = item.epoch.epoch_file
         image = folder / "maps" / f"{Path(epoch_file).stem}_{tag}.webp"
         if item.version not in bases:
             bases[item.version] = cached_base_map(series, folder, item.version, style.width_px)
             write_heights(series, folder, bases[item.version])
         base = bases[item.version]
+        with_cells = base.factor > 1 and age < MAX_CELL_MAPS
         missing = [
             not _is_whole(image),
             not has_values(folder, epoch_file, base, cells=False),
-            base.factor > 1 and not has_values(folder, epoch_file, base, cells=True),
+            with_cells and not has_values(folder, epoch_file, base, cells=True),
         ]
         if any(missing):
             if made_count == MAX_MADE:
@@ -128,7 +132,17 @@ def update_gallery(
             _make(item, folder, image, base, missing, style, limit_m)
             made_count += 1
             progress()
-        images.append(MapImage(item.start, f"maps/{image.name}", item.version, epoch_file))
+        if not with_cells:
+            delete_cells(folder, epoch_file, base)
+        images.append(
+            MapImage(
+                item.start,
+                f"maps/{image.name}",
+                item.version,
+                epoch_file,
+                int(base.factor > 1 and not with_cells),
+            )
+        )
     images.reverse()
     _delete_old(folder / "maps", {Path(item.file).name for item in images})
     delete_old_values(folder, [item.epoch_file for item in images], bases)

@@ -121,12 +121,10 @@ class OverviewBuilder:
             random_m2 = random_m2 / count**2
             change_m, sigma_m = total / count, np.sqrt(random_m2 + shared_m2)
         cells = self._base.factor**2
-        mean_points = [
-            np.where(point_sum > 0, point_sum / cells, np.nan).astype(np.float32) for point_sum in points
-        ]
-        return Overview(
-            self._base, change_m, sigma_m, *(mean_points or [None]), count=count, random_m2=random_m2
-        )
+        mean_points = None
+        if points:
+            mean_points = np.where(points[0] > 0, points[0] / cells, np.nan).astype(np.float32)
+        return Overview(self._base, change_m, sigma_m, mean_points, count, random_m2)
 
 
 def difference_overview(epoch: EpochRef, other: EpochRef, base: BaseMap, series: Series) -> Overview:

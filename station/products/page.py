@@ -36,8 +36,9 @@ from station.quantities import Floats
 from station.science.geometry.robust_statistics import NORMAL_95
 from station.science.gridding.significance import SIGNIFICANT_SIGMAS
 
-STATIC = {  # the parts of each file; a single style sheet is a single round trip
-    "page.css": ("uplot.css", "page.css"),
+STATIC = {  # the parts of each file; what the first words do not need is loaded by page.js after them
+    "page.css": ("page.css",),
+    "explore.css": ("uplot.css", "explore.css"),
     "page.js": ("page.js",),
     "explore.js": (
         "tiles.js",
@@ -116,6 +117,7 @@ def write_page(
                 "file": image.file,
                 "version": image.version,
                 "values": Path(image.epoch_file).stem,
+                "finest": image.finest,
             }
             for image in gallery.change
         ],

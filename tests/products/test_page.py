@@ -77,7 +77,7 @@ def test_hostile_names_are_escaped(write, small):
         name.startswith("on") or name == "style" for _, attributes in html.elements for name in attributes
     )
     scripts = [attributes["src"] for tag, attributes in html.elements if tag == "script"]
-    assert scripts == ["data.js", "page.js", "uplot.js", "explore.js"]
+    assert scripts == ["data.js", "page.js"]
     # station, title, area, scan, reason of its verdict, a waiting scan, a scan set aside
     assert html.text.count(small.EVIL) >= 7
     assert "Institute of <Tests>" in html.text

@@ -42,10 +42,12 @@ function stationLayers(data, text, shownIndex, redraw) {
     return ground && { ground, light: stationValues.hillshade(ground, levels()[level].value_m) };
   }
 
+  const finest = () => Math.max(shown().finest, before()?.finest || 0);
+
   function levelFor(now) {
     const all = levels(), wanted_m = now.view.scale * DETAIL;
     const level = all.findLastIndex((candidate) => candidate.value_m <= wanted_m);
-    return Math.max(level, 0);
+    return Math.max(level, finest());
   }
 
   // Tiles of a level that are in sight, as [name, west, north, width_m, height_m].
@@ -118,11 +120,11 @@ function stationLayers(data, text, shownIndex, redraw) {
 
   // The values at a place at the finest level; null if nothing was observed there.
   async function at([east, north]) {
-    const { extent } = data.frames[shown().version], { value_m, tiles: known } = levels()[0];
+    const level = finest(), { extent } = data.frames[shown().version], { value_m, tiles: known } = levels()[level];
     const column = Math.floor((east - extent.west) / value_m), row = Math.floor((extent.north - north) / value_m);
     const name = [row, column].map((k) => Math.floor(k / size)).join("_");
     if (row < 0 || column < 0 || known[Math.floor(row / size)]?.[Math.floor(column / size)] !== "1") return null;
-    const tile = await valuesAt(0, name), ground = await tiles.heights(shown().version, 0, name);
+    const tile = await valuesAt(level, name), ground = await tiles.heights(shown().version, level, name);
     const width = (tile || ground)?.columns, i = row % size * width + column % size;
     const change = tile ? tile.change[i] : NaN;
     return { height: ground?.height[i], change, sigma: tile?.sigma[i], isObserved: Number.isFinite(change) };

@@ -47,7 +47,7 @@ CHANGE_STEP_M = (2.0 ** np.floor(np.log2(SIGMA_M / 4))).astype(np.float32)
 def sigma_codes(sigma_m: Floats32) -> Array:
     """Return codes (n,) of sigmas [m], to 4 %; those beyond the codes are clipped."""
     code = np.log(np.maximum(sigma_m, SIGMA_MIN_M) * np.float32(1 / SIGMA_MIN_M)) / np.float32(SIGMA_STEP)
-    return np.minimum(np.rint(code) + 1, MAX_CODE).astype(np.uint8)
+    return np.asarray(np.minimum(np.rint(code) + 1, MAX_CODE).astype(np.uint8))
 
 
 def value_tile(name: str, change_m: Floats32, sigma_m: Floats32, share: Floats32 | None = None) -> bytes:
@@ -233,6 +233,12 @@ def _write_height_level(target: Path, number: int, level: Level, sums: list[Floa
         for row, column in level.tiles
     }
     _write_level(target / str(number), scripts)
+
+
+def delete_cells(folder: Path, epoch_file: str, base: BaseMap) -> None:
+    """Delete the tiles of the cells of an epoch of which those of means are kept."""
+    if base.factor > 1:
+        shutil.rmtree(_epoch_folder(folder, epoch_file) / CELLS, ignore_errors=True)
 
 
 def delete_old_values(folder: Path, keep: Iterable[str], versions: Iterable[str]) -> None:

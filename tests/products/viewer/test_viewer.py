@@ -50,9 +50,9 @@ def value_under_the_pointer(tab, east_m, north_m):
     box = tab.run("JSON.parse(JSON.stringify(document.getElementById('map-canvas').getBoundingClientRect()))")
     x, y = box["left"] + box["width"] / 2, box["top"] + box["height"] / 2
     tab.call("Input.dispatchMouseEvent", type="mouseMoved", x=x, y=y)
-    text = tab.await_(
-        "(() => { const t = document.getElementById('map-hover').textContent; return t.includes(':') && t; })()"
-    )
+    hover = "document.getElementById('map-hover').textContent"
+    tab.await_(f"{hover}.includes(':')")
+    text = tab.run(hover)
     return [float(n) for n in re.findall(r"[-\d.]+", text.split(": ")[1].replace("−", "-"))]
 
 
@@ -94,7 +94,9 @@ def test_layers_play_and_german_texts(tab, address):
     tab.open(f"{address}#layer=sigma")  # a picture from a folder could not be read back from the canvas
     assert "Höhenänderung" in tab.run("document.getElementById('map-key').textContent")
     colours = """(() => { const c = document.getElementById('map-canvas');
-        const p = c.getContext('2d').getImageData(0, 0, c.width, c.height).data, seen = new Set();
+        const copy = new OffscreenCanvas(c.width, c.height).getContext('2d', { willReadFrequently: true });
+        copy.drawImage(c, 0, 0);
+        const p = copy.getImageData(0, 0, c.width, c.height).data, seen = new Set();
         for (let i = 0; i < p.length; i += 4 * 97) seen.add(p[i] << 16 | p[i + 1] << 8 | p[i + 2]);
         return seen.size; })()"""
     for layer in ("significance", "sigma", "coverage"):
