@@ -55,7 +55,7 @@ def event_outlines(series: Series, count: int) -> list[dict[str, Any]]:
             "after": event.after,
             "begin": event.begin,
             "end": event.end,
-            "rings": _rings(outline, series.grid.cell_m),
+            "rings": _rings(outline, 0.0),
         }
         for event, outline in read_outlines(series.folder)[: -count - 1 : -1]
     ]
