@@ -59,6 +59,7 @@
   const { row: layerRow, sinceRow, playButton } = layerControls();
   for (const element of [tools, hint, canvas, key, layerRow, sinceRow, playButton, panel]) element.lang = language;
   figure.prepend(tools, hint, frame, key, layerRow);
+  image.loading = "eager";  // a hidden picture would never be loaded
   image.parentElement.hidden = true;  // the picture itself is drawn on the canvas
   byId("slider-row").append(playButton);
   byId("slider-row").after(sinceRow, panel);
@@ -104,6 +105,7 @@
     const every_m = contours ? layers.every_m() : 0, now = [layer, since, every_m, layers.isComparable()].join();
     if (now === keyShown) return;
     keyShown = now;
+    byId("map-caption").hidden = layer !== "change" || layers.before() !== null;  // it speaks of the picture
     const bar = make("canvas", { width: 256, height: 1 }), context = bar.getContext("2d");
     layers.scales[stationValues.LAYERS[layer].scale].table.forEach((rgb, i) => {
       context.fillStyle = `rgb(${rgb.join()})`;

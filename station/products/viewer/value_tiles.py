@@ -50,9 +50,10 @@ def sigma_codes(sigma_m: Floats32) -> Array:
     return np.asarray(np.minimum(np.rint(code) + 1, MAX_CODE).astype(np.uint8))
 
 
-def value_tile(name: str, change_m: Floats32, sigma_m: Floats32, share: Floats32 | None = None) -> bytes:
-    """Return a tile of changes and sigmas (r, c) [m], NaN where not observed, and observed shares."""
-    seen = np.isfinite(change_m)
+def value_tile(
+    name: str, seen: Bools, change_m: Floats32, sigma_m: Floats32, share: Floats32 | None = None
+) -> bytes:
+    """Return a tile of changes and sigmas (r, c) [m] where they were observed, and of observed shares."""
     where = np.flatnonzero(seen)
     sigmas = sigma_codes(sigma_m.ravel()[where])
     steps = np.rint(change_m.ravel()[where] / CHANGE_STEP_M[sigmas]).astype(np.int32)
@@ -126,31 +127,32 @@ class CellTiles:
 
     def __init__(self, base: BaseMap) -> None:
         self._base, self._level = base, levels(base)[0]
-        self._waiting: list[tuple[Array, ...]] = []
-        self._done, self._next = 0, base.rows.start  # rows of tiles; next row of the grid
+        width = base.columns.stop - base.columns.start
+        self._waiting = [np.zeros((TILE, width), np.float32) for _ in self.names]
+        self._done = 0  # rows of tiles
         self.tiles: dict[str, bytes] = {}  # scripts by name
 
     def add(self, rows: slice, band: Mapping[str, Array]) -> None:
         """Add some rows (r, nx) of the rasters as stored, fill values included."""
-        first, stop = max(rows.start, self._base.rows.start), min(rows.stop, self._base.rows.stop)
+        start = self._base.rows.start
+        first, stop = max(rows.start, start), min(rows.stop, self._base.rows.stop)
         while first < stop:
-            end = min(stop, self._base.rows.start + (self._done + 1) * TILE)
-            part = slice(first - rows.start, end - rows.start)
-            self._waiting.append(tuple(band[name][part, self._base.columns] for name in self.names))
+            top = start + self._done * TILE
+            bottom = min(top + TILE, self._base.rows.stop)
+            end = min(stop, bottom)
+            for waiting, name in zip(self._waiting, self.names, strict=True):
+                part = band[name][first - rows.start : end - rows.start, self._base.columns]
+                waiting[first - top : end - top] = part
+            if end == bottom:
+                self._finish_row(bottom - top)
             first = end
-            if end == min(self._base.rows.stop, self._base.rows.start + (self._done + 1) * TILE):
-                self._finish_row()
 
-    def _finish_row(self) -> None:
-        change_m, sigma_m = (
-            np.concatenate([part[k] for part in self._waiting]) for k in range(len(self.names))
-        )
-        self._waiting.clear()
+    def _finish_row(self, height: int) -> None:
         for column in np.flatnonzero(self._level.has_tile[self._done]).tolist():
-            part = np.s_[:, column * TILE : (column + 1) * TILE]
-            change = np.where(change_m[part] < FILL / 2, change_m[part], np.float32(np.nan))
+            part = np.s_[:height, column * TILE : (column + 1) * TILE]
+            change_m, sigma_m = (waiting[part] for waiting in self._waiting)
             name = f"{self._done}_{column}"
-            self.tiles[name] = value_tile(f"{CELLS}/{name}", change, sigma_m[part])
+            self.tiles[name] = value_tile(f"{CELLS}/{name}", change_m < FILL / 2, change_m, sigma_m)
         self._done += 1
 
 
@@ -192,14 +194,15 @@ def write_means(folder: Path, epoch_file: str, overview: Overview) -> None:
             sums, cells = [_block_sums(values) for values in sums], cells * STEP**2
         count, change, random, shared = sums
         with np.errstate(invalid="ignore", divide="ignore"):
-            change_m = np.where(count > 0, change / count, np.float32(np.nan))
+            change_m = change / count
             sigma_m = np.sqrt(random / count**2 + shared / count)
         share = count / cells
         scripts = {}
         for row, column in level.tiles:
             name = f"{row}_{column}"
             scripts[name] = value_tile(
-                f"{number}/{name}", *(_part(values, row, column) for values in (change_m, sigma_m, share))
+                f"{number}/{name}",
+                *(_part(values, row, column) for values in (count > 0, change_m, sigma_m, share)),
             )
         by_level.append((target / str(number), scripts))
     for path, scripts in reversed(by_level):  # the finest last: then all are there
