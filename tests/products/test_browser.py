@@ -218,12 +218,13 @@ def test_page_loads_on_a_slow_connection(tab, served):
     assert first_paint_ms < 3000
     assert tab.run("light_ms") < 10_000
     assert 50_000 < size < 300_000
-    place = tab.run("[STATION.curves.scanner_m[0] + 300, STATION.curves.scanner_m[1] + 300]")
+    place = tab.run("STATION.outlines.areas[0].rings[0][0]")
     answer = f"stationCurves.reader(STATION.curves).place({json.dumps(place)})"
     tap_ms = tab.run(
-        f"(async () => {{ const t = performance.now(); await {answer}; return performance.now() - t; }})()"
+        f"(async () => {{ const t = performance.now(), answer = await {answer};"
+        " return answer && performance.now() - t; })()"
     )
-    assert 600 < tap_ms < 3000
+    assert 600 < tap_ms < 3000  # tiles of a place, at the same time
 
 
 def test_empty_page_raises_no_error(tab, tmp_path, folder):

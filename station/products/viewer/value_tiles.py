@@ -200,10 +200,8 @@ def write_means(folder: Path, epoch_file: str, overview: Overview) -> None:
         scripts = {}
         for row, column in level.tiles:
             name = f"{row}_{column}"
-            scripts[name] = value_tile(
-                f"{number}/{name}",
-                *(_part(values, row, column) for values in (count > 0, change_m, sigma_m, share)),
-            )
+            parts = (_part(values, row, column) for values in (change_m, sigma_m, share))
+            scripts[name] = value_tile(f"{number}/{name}", _part(count, row, column) > 0, *parts)
         by_level.append((target / str(number), scripts))
     for path, scripts in reversed(by_level):  # the finest last: then all are there
         _write_level(path, scripts)
