@@ -347,7 +347,7 @@ def _write(site: Site, epoch: epochs.Epoch) -> StoredResult:
     series = series_for(site)
     recorder = EpochRecorder(site, series, "1")
     path = epochs.write_epoch(series, epoch, on_rows=recorder.add).path
-    recorder.keep_sums(path)
+    recorder.keep(path)
     name = str(path.relative_to(series.folder))
     return StoredResult(epoch.start_s, "", name, 1, "good", "", "1", {}, "", "", recorder.overview)
 

@@ -156,7 +156,7 @@ def process(
     recorder = EpochRecorder(site, series, "" if epoch_file else version, with_preview=with_preview)
     if epoch_file is None:
         epoch_file = epochs.write_epoch(series, epoch, history.revision, recorder.add)
-        recorder.keep_sums(epoch_file.path)
+        recorder.keep(epoch_file.path)
     return StoredResult(
         start_utc_s=epoch.start_s,
         sha256=scan_sha256,

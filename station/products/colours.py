@@ -100,6 +100,7 @@ def shared_palette() -> Pixels:
         (105, 110, 118),
         (158, 60, 0),
         (203, 155, 125),
+        (176, 168, 188),  # hatching
     ]
     return (
         np.vstack([greys, *shaded, _from_hex(_LAJOLLA), _from_hex(_DAVOS), text_colours])

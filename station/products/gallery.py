@@ -1,4 +1,4 @@
-"""Map images of the recent epochs: which are kept, and drawing of the missing ones."""
+"""Maps of the recent epochs, as images and tiles of values: which are kept, and making the missing ones."""
 
 from __future__ import annotations
 
@@ -10,7 +10,6 @@ import time
 import zipfile
 import zlib
 from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from datetime import datetime, timedelta
 from pathlib import Path
@@ -25,15 +24,24 @@ from station.archive.epochs import EpochRef
 from station.archive.netcdf_layout import Series
 from station.errors import StoreError
 from station.products.colours import round_up
-from station.products.maps import Caption, change_map, encode_webp, points_map, sigma_map
+from station.products.maps import Caption, change_map, encode_webp
 from station.products.overview import BaseMap, Overview, base_map, read_overview
+from station.products.viewer.value_tiles import (
+    delete_cells,
+    delete_old_values,
+    has_values,
+    read_cells,
+    write_cells,
+    write_heights,
+    write_means,
+)
 from station.quantities import Floats, Grid
 
 KEEP_ALL_FOR = timedelta(days=2)  # before the newest epoch; then the last map of each day …
 KEEP_DAILY_FOR = timedelta(days=60)  # … and before that the last of each month
 DAY_S = 86_400.0
-MAX_DRAWN = 8  # per call: an archive older than the page is drawn over several calls
-ENCODER_THREADS = 2  # encoding takes most of the time
+MAX_CELL_MAPS = 60  # newest maps with tiles of cells; before them, of means only
+MAX_MADE = 8  # per call: the maps of an archive older than the page are made over several calls
 DELETE_GRACE_S = 3600.0  # an open page may still refer to a map that is no longer kept
 LIMIT_SIGMAS = 10.0
 
@@ -70,15 +78,15 @@ class MapImage:
     start: datetime
     file: str
     version: str  # of the reference
+    epoch_file: str
+    finest: int  # level of its tiles of values
 
 
 @dataclass(frozen=True)
 class Gallery:
-    """The map images of the page: change over time; sigma and points of the newest epoch."""
+    """The maps of the page: change over time."""
 
     change: list[MapImage]
-    sigma: str | None
-    points: str | None
     limit_m: float | None
     size: tuple[int, int]  # of a map [pixels]
 
@@ -90,41 +98,78 @@ def update_gallery(
     style: Style,
     progress: Callable[[], None],
 ) -> Gallery:
-    """Draw the missing maps, newest first, delete those no longer kept, and return the gallery.
+    """Make the missing maps, newest first, delete those no longer kept, and return the gallery.
 
     `measured` are the epochs that have a reference, in time order. Raises StoreError if something cannot be
     read or written.
     """
     if not measured:
-        return Gallery([], None, None, style.limit_m, (0, 0))
+        return Gallery([], style.limit_m, (0, 0))
     limit_m = style.limit_m or _fixed_limit(series, folder, measured[0])
     style_json = json.dumps([style.station, style.width_px, limit_m, __version__])
     tag = hashlib.sha256(style_json.encode()).hexdigest()[:8]
-    maps_folder = folder / "maps"
     retained = [
         measured[index]
         for index in retention_indices(np.array([item.start.timestamp() for item in measured]))
     ]
-    drawn_count, images = 0, []
-    for item in reversed(retained):
-        epoch = item.epoch
-        name = f"{Path(epoch.epoch_file).stem}_{tag}.webp"
-        is_last = item is measured[-1]
-        if not all(_is_whole(maps_folder / file) for file in _file_names(name, is_last=is_last)):
-            if drawn_count == MAX_DRAWN:
+    made_count, images, bases = 0, list[MapImage](), dict[str, BaseMap]()
+    for age, item in enumerate(reversed(retained)):
+        epoch_file = item.epoch.epoch_file
+        image = folder / "maps" / f"{Path(epoch_file).stem}_{tag}.webp"
+        if item.version not in bases:
+            bases[item.version] = cached_base_map(series, folder, item.version, style.width_px)
+            write_heights(series, folder, bases[item.version])
+        base = bases[item.version]
+        with_cells = base.factor > 1 and age < MAX_CELL_MAPS
+        missing = [
+            not _is_whole(image),
+            not has_values(folder, epoch_file, base, cells=False),
+            with_cells and not has_values(folder, epoch_file, base, cells=True),
+        ]
+        if any(missing):
+            if made_count == MAX_MADE:
                 continue
-            caption = Caption(style.station, f"{epoch.start:%Y-%m-%d %H:%M} UTC", item.verdict)
-            overview = item.overview or read_overview(
-                epoch, cached_base_map(series, folder, item.version, style.width_px), points=is_last
-            )
-            _draw(overview, maps_folder, caption, style.width_px, limit_m, name, is_last=is_last)
-            drawn_count += 1
+            _make(item, folder, image, base, missing, style, limit_m)
+            made_count += 1
             progress()
-        images.append(MapImage(epoch.start, f"maps/{name}", item.version))
+        if not with_cells:
+            delete_cells(folder, epoch_file, base)
+        images.append(
+            MapImage(
+                item.start,
+                f"maps/{image.name}",
+                item.version,
+                epoch_file,
+                int(base.factor > 1 and not with_cells),
+            )
+        )
     images.reverse()
-    _, sigma, points = _file_names(Path(images[-1].file).name, is_last=True)
-    _delete_old(maps_folder, {Path(item.file).name for item in images} | {sigma, points})
-    return Gallery(images, f"maps/{sigma}", f"maps/{points}", limit_m, _size(folder / images[-1].file))
+    _delete_old(folder / "maps", {Path(item.file).name for item in images})
+    delete_old_values(folder, [item.epoch_file for item in images], bases)
+    return Gallery(images, limit_m, _size(folder / images[-1].file))
+
+
+def _make(
+    item: MeasuredEpoch,
+    folder: Path,
+    image: Path,
+    base: BaseMap,
+    missing: Sequence[bool],
+    style: Style,
+    limit_m: float,
+) -> None:
+    """Make what is missing of the map of an epoch: its image, the tiles of means, and those of cells."""
+    overview = item.overview
+    if any(missing[:2]):
+        overview = overview or read_overview(item.epoch, base)
+        if missing[0]:
+            caption = Caption(style.station, f"{item.start:%Y-%m-%d %H:%M} UTC", item.verdict)
+            picture = change_map(overview, caption, limit_m, style.width_px, "the reference")
+            replace_if_changed(image, encode_webp(picture))
+        if missing[1]:
+            write_means(folder, item.epoch.epoch_file, overview)
+    if missing[2]:
+        write_cells(folder, item.epoch.epoch_file, read_cells(item.epoch, base))
 
 
 def _is_whole(path: Path) -> bool:
@@ -147,12 +192,6 @@ def _size(path: Path) -> tuple[int, int]:
         raise StoreError(f"{path}: damaged, drawn again with the next scan: {error}") from error
 
 
-def _file_names(name: str, *, is_last: bool) -> tuple[str, ...]:
-    """Return the file names of an epoch: its change and, for the newest, its sigma and points."""
-    stem = name.removesuffix(".webp")
-    return (name, f"{stem}_sigma.webp", f"{stem}_points.webp") if is_last else (name,)
-
-
 def retention_indices(start_s: Floats) -> list[int]:
     """Return the indices of those of the times (n,) [s], ascending, that are kept: fewer the older they are.
 
@@ -167,28 +206,6 @@ def retention_indices(start_s: Floats) -> list[int]:
         index = np.flatnonzero(selected)
         groups.append(index[np.diff(period[index], append=np.inf) != 0])
     return [int(index) for index in np.sort(np.concatenate(groups))]
-
-
-def _draw(
-    overview: Overview,
-    maps_folder: Path,
-    caption: Caption,
-    width_px: int,
-    limit_m: float,
-    name: str,
-    *,
-    is_last: bool,
-) -> None:
-    file_names = _file_names(name, is_last=is_last)
-    drawings: list[Callable[[], Image.Image]] = [
-        lambda: change_map(overview, caption, limit_m, width_px, "the reference"),
-        lambda: sigma_map(overview, caption, limit_m, width_px),
-        lambda: points_map(overview, caption, width_px),
-    ]
-    with ThreadPoolExecutor(ENCODER_THREADS) as pool:
-        pictures = pool.map(lambda draw: encode_webp(draw()), drawings[: len(file_names)])
-        for file, picture in zip(file_names, pictures, strict=True):
-            replace_if_changed(maps_folder / file, picture)
 
 
 def replace_if_changed(path: Path, content: bytes) -> None:

@@ -22,6 +22,7 @@ from station.products.overview import BaseMap, Overview
 from station.quantities import Bools
 
 ASSETS = Path(__file__).parent / "assets"
+UNSEEN = "not observed"  # in the legend
 MAX_BYTES = 150_000  # of a map: ten seconds at 128 kbit/s
 LOSSLESS = 100  # in the shared palette
 # Quality of WebP and scale of the image; the first that is small enough is used.
@@ -30,6 +31,7 @@ SAMPLE_ROWS, SAMPLE_STEP = 32, 12  # bands from which the file size is estimated
 SIZE_TOLERANCE = 0.15  # … to within this share
 MAX_ASPECT = 1.1  # largest height of a map, in widths of the image
 PAPER, INK, FAINT = (250, 250, 248), (30, 33, 38), (105, 110, 118)
+HATCH, HATCH_PX = (176, 168, 188), 8  # lines on ground that was not observed, and their distance
 UNOBSERVED_GREY, OBSERVED_GREY = (
     (216.0, 40.0),
     (128.0, 84.0),
@@ -48,7 +50,7 @@ class Caption:
 def change_map(
     overview: Overview, caption: Caption, limit_m: float, width_px: int, since: str
 ) -> Image.Image:
-    """Return a map of change: coloured where significant at 95 %, grey where not, pale where not observed."""
+    """Return a map of change: coloured where significant at 95 %, grey where not, hatched where not seen."""
     scale = change_scale(limit_m, since)
     observed, significant = overview.observed, overview.is_significant
     light = np.nan_to_num(overview.base.hillshade, nan=0.63)[..., None]
@@ -58,7 +60,7 @@ def change_map(
     grey = int(OBSERVED_GREY[0] + 0.63 * OBSERVED_GREY[1])
     legend = (
         ("not significant (95 %)", (grey,) * 3),
-        ("not observed", (int(UNOBSERVED_GREY[0] + 0.63 * UNOBSERVED_GREY[1]),) * 3),
+        (UNSEEN, (int(UNOBSERVED_GREY[0] + 0.63 * UNOBSERVED_GREY[1]),) * 3),
     )
     subtitle = "nothing observed"
     if observed.any():
@@ -191,7 +193,8 @@ def _compose(
     margin, inner, box, height_px = _layout(ny, nx, width_px)
     corner, size = box[:2], (box[2] - box[0], box[3] - box[1])
     resampling = Image.Resampling.NEAREST if size[0] >= nx else Image.Resampling.BOX
-    map_image = Image.fromarray(painted).resize(size, resampling)
+    unseen = np.isfinite(overview.base.hillshade) & ~overview.observed
+    map_image = _hatch(Image.fromarray(painted).resize(size, resampling), unseen)
     picture = Image.new("RGB", (width_px, height_px), PAPER)
     picture.paste(map_image, corner)
     draw = ImageDraw.Draw(picture)
@@ -201,6 +204,15 @@ def _compose(
     _legend(draw, legend, (margin + round(inner * 0.64), box[3] + round(22 * unit)), unit)
     _draw_north_and_scale(picture, box, overview.base.grid.cell_m * nx / size[0], unit)
     return picture
+
+
+def _hatch(map_image: Image.Image, unseen: Bools) -> Image.Image:
+    """Return a map with lines where nothing was observed: bright ground alone would look the same."""
+    width, height = map_image.size
+    lines = (np.add.outer(np.arange(height), np.arange(width)) % HATCH_PX) == 0
+    pixels = np.array(map_image)
+    pixels[lines & np.asarray(Image.fromarray(unseen).resize(map_image.size))] = HATCH
+    return Image.fromarray(pixels)
 
 
 def _draw_header(
@@ -251,6 +263,9 @@ def _legend(
     side, small = round(18 * unit), font(19 * unit)
     for text, colour in legend:
         draw.rectangle((x_min, top, x_min + side, top + side), fill=colour, outline=(150, 152, 156))
+        for offset in range(0, side + 1, HATCH_PX) if text == UNSEEN else ():
+            draw.line((x_min, top + offset, x_min + offset, top), HATCH)
+            draw.line((x_min + offset, top + side, x_min + side, top + offset), HATCH)
         draw.text((x_min + round(1.5 * side), top + side // 2), text, INK, small, anchor="lm")
         top += round(30 * unit)
 

@@ -45,6 +45,8 @@ class Overview:
     change_m: Floats32  # NaN where not observed
     sigma_m: Floats32
     points: Floats32 | None = None  # per cell, NaN where not observed; None if not requested
+    count: Floats32 | None = None  # cells observed; None for a difference of two epochs
+    random_m2: Floats32 | None = None  # random variance of the mean
 
     @property
     def observed(self) -> Bools:
@@ -116,12 +118,13 @@ class OverviewBuilder:
         count, total, sigma_m2, random_m2, *points = self.sums.totals
         with np.errstate(invalid="ignore", divide="ignore"):
             shared_m2 = np.maximum(sigma_m2 - random_m2, 0) / count
-            change_m, sigma_m = total / count, np.sqrt(random_m2 / count**2 + shared_m2)
+            random_m2 = random_m2 / count**2
+            change_m, sigma_m = total / count, np.sqrt(random_m2 + shared_m2)
         cells = self._base.factor**2
-        mean_points = [
-            np.where(point_sum > 0, point_sum / cells, np.nan).astype(np.float32) for point_sum in points
-        ]
-        return Overview(self._base, change_m, sigma_m, *mean_points)
+        mean_points = None
+        if points:
+            mean_points = np.where(points[0] > 0, points[0] / cells, np.nan).astype(np.float32)
+        return Overview(self._base, change_m, sigma_m, mean_points, count, random_m2)
 
 
 def difference_overview(epoch: EpochRef, other: EpochRef, base: BaseMap, series: Series) -> Overview:

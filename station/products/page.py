@@ -30,6 +30,8 @@ from station.products.gallery import (
 from station.products.maps import ASSETS, map_box
 from station.products.overview import Overview
 from station.products.viewer.block_curves import CurveEpoch, curve_tiers, update_curves
+from station.products.viewer.overlays import area_outlines, browser_scales, event_outlines
+from station.products.viewer.value_tiles import describe_levels, value_codes
 from station.products.web.page_areas import newest_value, usable_area_series
 from station.products.web.page_health import (
     calibration_by_range,
@@ -42,10 +44,19 @@ from station.products.web.page_text import PAGE_TEXT, format_number, format_utc,
 from station.quantities import Floats
 from station.science.geometry.robust_statistics import NORMAL_95
 
-STATIC = {  # the parts of each file; a single style sheet is a single round trip
-    "page.css": ("uplot.css", "page.css"),
+STATIC = {  # the parts of each file; what the first words do not need is loaded by page.js after them
+    "page.css": ("page.css",),
+    "explore.css": ("uplot.css", "explore.css"),
     "page.js": ("page.js",),
-    "explore.js": ("tiles.js", "covariance.js", "curves.js", "map.js", "explore.js"),
+    "explore.js": (
+        "tiles.js",
+        "covariance.js",
+        "curves.js",
+        "map.js",
+        "values.js",
+        "layers.js",
+        "explore.js",
+    ),
     "uplot.js": ("uplot.js",),
     "icon.svg": ("icon.svg",),
 }
@@ -90,7 +101,7 @@ def write_page(
     table = read_epoch_table(series) if series.path.is_file() else None
     all_areas = usable_area_series(series, table) if table is not None else []
     areas = all_areas[:MAX_AREAS]
-    gallery, curves = Gallery([], None, None, None, (0, 0)), None
+    gallery, curves = Gallery([], None, (0, 0)), None
     if table is not None:
         style = Style(context.name or series.station_id, width_px, limit_m)
         measured = _measured_epochs(series, table, context.overviews)
@@ -104,10 +115,20 @@ def write_page(
         "station": series.station_id,
         "text": script_text(context.language),
         "maps": [
-            {"time_s": image.start.timestamp(), "file": image.file, "version": image.version}
+            {
+                "time_s": image.start.timestamp(),
+                "file": image.file,
+                "version": image.version,
+                "values": Path(image.epoch_file).stem,
+                "finest": image.finest,
+            }
             for image in gallery.change
         ],
         "frames": _frames(series, folder, gallery, width_px),
+        "values": value_codes(),
+        "scales": browser_scales(gallery.limit_m) if gallery.limit_m else {},
+        "picture_px": gallery.size[0],
+        "outlines": {"areas": area_outlines(series), "events": event_outlines(series, MAX_EVENTS)},
         "curves": curves,
         "area_time_s": _json_numbers(areas[0].start_s[_decimate(len(areas[0].start_s))], 0) if areas else [],
         "areas": [_area_curve(area) for area in areas],
@@ -200,7 +221,8 @@ def _frames(series: Series, folder: Path, gallery: Gallery, width_px: int) -> di
         grid = base.grid
         extent = {"west": grid.west_m, "east": grid.west_m + grid.nx * grid.cell_m, "north": grid.north_m}
         extent["south"] = grid.north_m - grid.ny * grid.cell_m
-        frames[version] = {"box": [round(share, 6) for share in map_box(base, width_px)], "extent": extent}
+        box = [round(share, 6) for share in map_box(base, width_px)]
+        frames[version] = {"box": box, "extent": extent, "levels": describe_levels(base)}
     return frames
 
 

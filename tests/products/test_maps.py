@@ -16,7 +16,16 @@ from station.archive.series import index
 from station.archive.series.virtual import build_series
 from station.products import maps
 from station.products.colours import change_scale, points_scale, round_up, sigma_scale
-from station.products.maps import MAX_BYTES, PAPER, Caption, change_map, encode_webp, points_map, sigma_map
+from station.products.maps import (
+    HATCH,
+    MAX_BYTES,
+    PAPER,
+    Caption,
+    change_map,
+    encode_webp,
+    points_map,
+    sigma_map,
+)
 from station.products.overview import OverviewBuilder, base_map, difference_overview, read_overview
 from station.quantities import ChangeErrors, Grid, SharedParameters
 from station.queries.aggregates import Aggregates
@@ -32,12 +41,12 @@ def last(series):
     return index.list_epochs(series)[-1]
 
 
-def cell_colour(picture, row, column):
-    """The colour at the centre of a cell of the map."""
+def cell_colour(picture, row, column, shift_px=0):
+    """The colour at the centre of a cell of the map, or some pixels east of it."""
     cell_px = (WIDTH - 2 * round(24 * WIDTH / 1200)) / 58
     x = round(24 * WIDTH / 1200) + (column + 0.5) * cell_px
     y = round(92 * WIDTH / 1200) + (row + 0.5) * cell_px
-    return np.array(picture.getpixel((int(x), int(y))), dtype=int)
+    return np.array(picture.getpixel((int(x) + shift_px, int(y))), dtype=int)
 
 
 def test_each_cell_has_the_colour_of_its_change(series, last, small):
@@ -51,13 +60,16 @@ def test_each_cell_has_the_colour_of_its_change(series, last, small):
     assert red > blue + 60
     still = np.argwhere(overview.observed & ~overview.is_significant)
     unobserved = np.argwhere(~overview.observed)
-    for cells, darkest, palest in ((still, 100, 215), (unobserved, 200, 255)):
+    for cells, darkest, palest, lines in ((still, 100, 215, 0), (unobserved, 200, 255, 1)):
         for row, column in cells[:: len(cells) // 15]:
             if row > 38 and column < 25:
                 continue  # under the legend
-            colour = cell_colour(picture, row, column)
-            assert np.ptp(colour) <= 3  # grey: change that is not significant has no colour
-            assert darkest < colour[0] <= palest
+            colours = [cell_colour(picture, row, column, shift_px) for shift_px in range(-4, 4)]
+            hatched = [np.array_equal(colour, HATCH) for colour in colours]
+            assert sum(hatched) == lines  # so that bright ground is not taken for ground not seen
+            for colour in (colour for colour, is_line in zip(colours, hatched, strict=True) if not is_line):
+                assert np.ptp(colour) <= 3  # grey: change that is not significant has no colour
+                assert darkest < colour[0] <= palest
     assert picture.getpixel((1, 1)) == PAPER
 
 

@@ -120,11 +120,18 @@ def write_events(series: Series, events: Iterable[tuple[Event, shapely.Geometry]
 
 def read_events(folder: Path) -> list[Event]:
     """Return the events of a store, the oldest first; [] without a table, StoreError if it is damaged."""
+    return [event for event, _ in read_outlines(folder)]
+
+
+def read_outlines(folder: Path) -> list[tuple[Event, shapely.Geometry]]:
+    """Return the events of a store and their outlines on the map; as `read_events`."""
     path = folder / FILE_NAME
     if not path.is_file():
         return []
     try:
         features = json.loads(path.read_text(encoding="utf-8"))["features"]
-        return [Event(**feature["properties"]) for feature in features]
-    except (OSError, ValueError, KeyError, TypeError) as error:
+        shapes = [shapely.from_geojson(json.dumps(feature["geometry"])) for feature in features]
+        events = [Event(**feature["properties"]) for feature in features]
+        return list(zip(events, shapes, strict=True))
+    except (OSError, ValueError, KeyError, TypeError, shapely.errors.ShapelyError) as error:
         raise StoreError(f"{path}: damaged, cannot be read: {error}: the service builds it again") from error

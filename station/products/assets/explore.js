@@ -6,7 +6,7 @@
   if (!image || !data.curves || !("DecompressionStream" in window)) return;
   const page = window.stationPage, about = data.curves, reader = stationCurves.reader(about);
   const fill = (template, values) => template.replace(/\{(\w+)\}/g, (_, key) => values[key]);
-  const number = page.formatNumber, HALF_95 = 1.959964, SNAP_PX = 14;
+  const number = page.formatNumber, HALF_95 = 1.959964, SNAP_PX = 14, PLAY_MS = 800;
   const colour = (name) => getComputedStyle(document.documentElement).getPropertyValue(name).trim();
 
   // ---- elements
@@ -51,20 +51,29 @@
   tools.append(...buttons, command("+", text.zoom_in, () => map.zoom(1.5)), command("−", text.zoom_out, () => map.zoom(1 / 1.5)),
     command("⤢", text.whole_map, () => map.home()), form);
   const figure = image.closest("figure");
-  const key = make("canvas", { id: "map-key", "aria-hidden": "true" });  // the caption says it in words
-  figure.prepend(tools, hint, frame, key);
+  const key = make("div", { id: "map-key" });
+  let shown = data.maps.length - 1;
+  const layers = stationLayers(data, text, () => shown, () => map.draw());
+  const { row: layerRow, sinceRow, playButton } = layerControls();
+  figure.prepend(tools, hint, frame, key, layerRow);
+  image.loading = "eager";  // a hidden picture would never be loaded
   image.parentElement.hidden = true;  // the picture itself is drawn on the canvas
-  byId("slider-row").after(panel);
+  byId("slider-row").append(playButton);
+  byId("slider-row").after(sinceRow, panel);
 
   // ---- what is drawn
 
   const extent = data.frames[data.maps.at(-1).version].extent;
-  let places = [], polygon = [], closed = false, shown = data.maps.length - 1;
+  let places = [], polygon = [], closed = false;
 
   const map = stationMap(canvas, extent, (context, now) => {
+    context.clearRect(0, 0, now.width, now.height);
+    if (layers.isPicture(now)) drawPicture(context, now); else layers.draw(context, now);
+    context.globalCompositeOperation = "destination-over";
     context.fillStyle = colour("--card");
     context.fillRect(0, 0, now.width, now.height);
-    drawPicture(context, now);
+    context.globalCompositeOperation = "source-over";
+    drawOutlines(context, now);
     if (polygon.length) drawShape(context, now, polygon, closed);
     if (map.box()) {
       const [a, b] = map.box();
@@ -85,21 +94,118 @@
       height * image.naturalHeight, x0, y0, x1 - x0, y1 - y0);
   }
 
-  // The colour bar and the legend, which are below the ground in the picture.
+  // The colour bar and the legend in words.
+  let keyShown = "";
   function drawKey() {
-    const frameOf = data.frames[data.maps[shown].version];
-    if (!frameOf || !image.complete || !image.naturalWidth) return;
-    const [, top, , height] = frameOf.box, from = Math.round((top + height) * image.naturalHeight) + 2;
-    key.width = image.naturalWidth;
-    key.height = image.naturalHeight - from;
-    key.getContext("2d").drawImage(image, 0, -from);
+    const { layer, contours } = layers.state, scale = data.scales[stationValues.LAYERS[layer].scale];
+    const since = layers.before() ? `${page.utc(layers.before().time_s)} UTC` : text.the_reference;
+    const every_m = contours ? layers.every_m() : 0, now = [layer, since, every_m, layers.isComparable()].join();
+    if (now === keyShown) return;
+    keyShown = now;
+    byId("map-caption").hidden = layer !== "change" || layers.before() !== null;  // it speaks of the picture
+    const bar = make("canvas", { width: 256, height: 1 }), context = bar.getContext("2d");
+    layers.scales[stationValues.LAYERS[layer].scale].table.forEach((rgb, i) => {
+      context.fillStyle = `rgb(${rgb.join()})`;
+      context.fillRect(i, 0, 1, 1);
+    });
+    bar.setAttribute("aria-hidden", "true");
+    const { position } = layers.scales[stationValues.LAYERS[layer].scale];
+    const ticks = scale.ticks.map((tick) => {
+      const mark = make("span", { textContent: String(Number(tick.toPrecision(3))).replace("-", "−") });
+      mark.style.left = `${100 * position(tick)}%`;
+      return mark;
+    });
+    const entry = (name) => make("span", { className: `swatch ${name}`, textContent: text[`key_${name}`] });
+    key.replaceChildren(
+      make("p", { textContent: fill(text[`key_${layer}`], { since }) }), make("div", { className: "bar" }, bar, ...ticks),
+      make("p", {}, ...(layer === "change" ? [entry("grey")] : []), entry("unseen"),
+        ...(every_m ? [make("span", { className: "swatch contour", textContent: fill(text.key_contour, { every: every_m }) })] : [])),
+      ...(layers.before() ? [make("p", { className: "note", textContent: layers.isComparable() ? text.pair_sigma : text.pair_reference })] : []));
   }
 
-  function drawShape(context, now, corners, isClosed) {
+  // ---- layers, and the scan that the change is counted from
+
+  function layerControls() {
+    const choice = make("select", { id: "layer" }, ...Object.keys(stationValues.LAYERS).map((name) =>
+      make("option", { value: name, textContent: text[`layer_${name}`] })));
+    const box = (name, checked, act) => {
+      const input = make("input", { type: "checkbox", id: `show-${name}`, checked });
+      input.addEventListener("change", () => { act(input.checked); update(); });
+      return make("label", {}, input, ` ${text[`show_${name}`]}`);
+    };
+    const update = () => { map.draw(); link(); };
+    choice.addEventListener("change", () => { layers.state.layer = choice.value; update(); });
+    const row = make("div", { id: "map-layers" }, make("label", {}, `${text.layer} `, choice),
+      box("outlines", true, (on) => { outlined = on; }), box("contours", false, (on) => { layers.state.contours = on; }));
+    const since = make("input", { type: "range", id: "since", min: -1, max: data.maps.length - 1, value: -1 });
+    const output = make("output", { id: "since-time" });
+    const sinceRow = make("div", { className: "slider", hidden: data.maps.length < 2 }, make("label", { htmlFor: "since", textContent: text.since }), since, output);
+    const showSince = () => {
+      layers.state.since = Number(since.value);
+      const words = layers.before() ? `${page.utc(layers.before().time_s)} UTC` : text.the_reference;
+      output.textContent = words;
+      since.setAttribute("aria-valuetext", words);
+    };
+    since.addEventListener("input", () => { showSince(); update(); showValues(); });
+    showSince();
+    layers.choose = (layer, index) => {
+      layers.state.layer = choice.value = layer;
+      since.value = index;
+      showSince();
+      map.draw();
+    };
+    const playButton = make("button", { type: "button", textContent: text.play });
+    let timer = 0;
+    const stop = () => { clearInterval(timer); timer = 0; playButton.textContent = text.play; };
+    playButton.addEventListener("click", () => {
+      if (timer) { stop(); return; }
+      playButton.textContent = text.pause;
+      if (shown === data.maps.length - 1) page.showTime(data.maps[0].time_s);
+      timer = setInterval(() => {
+        if (shown === data.maps.length - 1) stop(); else page.showTime(data.maps[shown + 1].time_s);
+      }, PLAY_MS);
+    });
+    return { row, sinceRow, playButton };
+  }
+
+  let outlined = true;
+  function drawOutlines(context, now) {
+    drawKey();
+    if (!outlined) return;
+    const draw = (rings, name, dash = []) => {
+      if (!rings.length) return;
+      context.setLineDash(dash);
+      for (const ring of rings) drawShape(context, now, ring, true, 1.2);
+      context.setLineDash([]);
+      const end = rings[0].reduce((a, b) => b[1] > a[1] === !dash.length ? b : a), [x, y] = now.toPixel(end);
+      label(context, name, x + 4, dash.length ? y + 15 : y - 5);  // areas above, events below
+    };
+    for (const area of data.outlines.areas) draw(area.rings, area.name);
+    for (const event of data.outlines.events) draw(event.rings, text[`event_${event.kind}`] || event.kind, [5, 4]);
+  }
+
+  // A row of the table of events shows the event: its change, from the scan before it to its last, and its curve.
+  for (const event of data.outlines.events) {
+    const row = document.querySelector(`tr[data-event="${CSS.escape(event.id)}"]`);
+    if (!row || !event.rings.length) continue;
+    const button = command(text.event_show, text.event_show, () => {
+      const at = (utc) => data.maps.findLastIndex((m) => m.time_s <= Date.parse(utc) / 1000);
+      page.showTime(Date.parse(event.end) / 1000);
+      layers.choose("change", Math.max(at(event.after), -1));
+      const ring = event.rings[0], middle = [0, 1].map((k) => ring.reduce((sum, p) => sum + p[k], 0) / ring.length);
+      const side_m = Math.max(...[0, 1].map((k) => Math.max(...ring.map((p) => p[k])) - Math.min(...ring.map((p) => p[k]))));
+      map.centre(middle, 3 * side_m / canvas.clientWidth);
+      askArea(ring.slice(0, -1));
+      byId("map").scrollIntoView();
+    });
+    row.cells[0].append(" ", button);
+  }
+
+  function drawShape(context, now, corners, isClosed, width = 2.5) {
     context.beginPath();
     corners.forEach((corner, i) => context[i ? "lineTo" : "moveTo"](...now.toPixel(corner)));
     if (isClosed) context.closePath();
-    stroke(context, "#000", 2.5);
+    stroke(context, "#000", width);
     if (!isClosed) for (const corner of corners) {
       const [x, y] = now.toPixel(corner);
       context.fillRect(x - 3, y - 3, 6, 6);
@@ -161,8 +267,15 @@
   }
 
   const grouped = (value, digits = 0) => number(value, digits).replace(/\B(?=(\d{3})+(?!\d))/g, "\u202f");
-  map.on.hover = (position) => {
-    hover.textContent = position ? `${grouped(position[0])} E, ${grouped(position[1])} N` : "";
+  let hovered = 0;
+  map.on.hover = async (position) => {
+    const mine = ++hovered, words = position ? `${grouped(position[0])} E, ${grouped(position[1])} N` : "";
+    hover.textContent = words;
+    if (!position || map.isMoving() || layers.isPicture(map.now())) return;
+    const at = await layers.at(position);
+    if (mine !== hovered || !at) return;
+    const height = Number.isFinite(at.height) ? `, ${grouped(at.height, 1)} m` : "";
+    hover.textContent = `${words}${height}: ${at.isObserved ? withHalf(at.change, at.sigma, 3, "m") : text.key_unseen}`;
   };
 
   // ---- tools
@@ -286,19 +399,27 @@
     const at = known.filter((p) => p.time_s <= until_s).at(-1) || known[0];
     list.replaceChildren();
     if (!at) { list.append(make("p", { textContent: text.not_observed })); return; }
+    const from = layers.before() && known.filter((p) => p.time_s <= layers.before().time_s + 1).at(-1);
+    if (from) {
+      const change = withHalf(at.change - from.change, Math.hypot(at.sigma, from.sigma), 3, "m");
+      list.append(make("div", {}, make("dt", { textContent: fill(text.since_scan, { time: page.utc(from.time_s) }) }), make("dd", { textContent: change, title: text.pair_sigma })));
+    }
     for (const [name, value] of current.rows(at)) list.append(make("div", {}, make("dt", { textContent: name }), make("dd", { textContent: value })));
     list.append(make("div", {}, make("dt", { textContent: "UTC" }), make("dd", { textContent: page.utc(at.time_s) })));
   }
 
   // ---- links
 
+  const minute = (shownMap) => `${new Date(shownMap.time_s * 1000).toISOString().slice(0, 16)}Z`;
   const point = (position) => position.map((x) => x.toFixed(1)).join(",");
   function link() {
     const parts = [];
     if (polygon.length && closed) parts.push(`area=${polygon.map(point).join(";")}`);
     if (places.length) parts.push(`at=${point(places[0])}`);
     if (places.length > 1) parts.push(`minus=${point(places[1])}`);
-    if (shown < data.maps.length - 1) parts.push(`time=${new Date(data.maps[shown].time_s * 1000).toISOString().slice(0, 16)}Z`);
+    if (layers.state.layer !== "change") parts.push(`layer=${layers.state.layer}`);
+    if (layers.before()) parts.push(`since=${minute(layers.before())}`);
+    if (shown < data.maps.length - 1) parts.push(`time=${minute(data.maps[shown])}`);
     history.replaceState(null, "", parts.length ? `#${parts.join("&")}` : location.pathname + location.search);
     const share = panel.querySelector(".share");
     if (share) share.href = location.hash;
@@ -309,6 +430,8 @@
     const read = (words) => words.split(",").map(Number);
     const isPoint = (p) => p.length === 2 && p.every(Number.isFinite);
     if (hash.get("time")) page.showTime(Date.parse(hash.get("time")) / 1000);
+    const since_s = Date.parse(hash.get("since")) / 1000, layer = hash.get("layer");
+    layers.choose(layer in stationValues.LAYERS ? layer : "change", data.maps.findLastIndex((m) => m.time_s <= since_s + 59));
     const area = hash.get("area")?.split(";").map(read), at = hash.get("at") && read(hash.get("at"));
     const other = hash.get("minus") && read(hash.get("minus"));
     if (area && area.length > 2 && area.every(isPoint)) askArea(area);
@@ -322,8 +445,7 @@
     showValues();
     if (current) link();
   });
-  image.addEventListener("load", () => { map.draw(); drawKey(); });
-  drawKey();
+  image.addEventListener("load", () => map.draw());
   addEventListener("hashchange", follow);
   choose("place");
   follow();

@@ -2,11 +2,13 @@
 function stationMap(canvas, extent, redraw) {
   const context = canvas.getContext("2d");
   const view = { east: 0, north: 0, scale: 1 };  // map coordinates of the middle; metres per pixel of the page
-  const MAX_ZOOM = 40, HOLD_MS = 500, CLICK_PX = 6;
+  const MAX_ZOOM = 200, HOLD_MS = 500, CLICK_PX = 6;
   let width = 0, height = 0, frame = 0, fitted = 1;
 
   const toPixel = ([east, north]) => [width / 2 + (east - view.east) / view.scale, height / 2 - (north - view.north) / view.scale];
   const toMap = (x, y) => [view.east + (x - width / 2) * view.scale, view.north - (y - height / 2) * view.scale];
+
+  const now = () => ({ width, height, view, toPixel, toMap });
 
   function draw() {
     if (frame) return;
@@ -14,7 +16,7 @@ function stationMap(canvas, extent, redraw) {
       frame = 0;
       const ratio = devicePixelRatio || 1;
       context.setTransform(ratio, 0, 0, ratio, 0, 0);
-      redraw(context, { width, height, view, toPixel, toMap });
+      redraw(context, now());
     });
   }
 
@@ -135,5 +137,5 @@ function stationMap(canvas, extent, redraw) {
   });
   new ResizeObserver(resize).observe(canvas);
 
-  return { draw, home, zoom, centre, on, view, box: () => box && box.map((p) => toMap(...p)) };
+  return { draw, home, zoom, centre, on, view, now, isMoving: () => pointers.size > 0, box: () => box && box.map((p) => toMap(...p)) };
 }

@@ -229,7 +229,15 @@
     curve(health, text.js_pressure, t, [{ values: h.air_pressure, digits: 1 }]);
     curve(health, text.js_seconds, t, [{ values: h.seconds, digits: 1 }]);
   }
-  addEventListener("DOMContentLoaded", draw);  // once the last script is loaded; status light and map do not wait for it
+
+  // What the first words do not need comes after them: on a slow connection they would wait for it.
+  function load(name) {
+    const script = Object.assign(document.createElement("script"), { src: name, async: false });
+    document.head.append(script);
+    return new Promise((resolve) => { script.onload = resolve; });
+  }
+  document.head.append(Object.assign(document.createElement("link"), { rel: "stylesheet", href: "explore.css" }));
+  addEventListener("DOMContentLoaded", () => { load("uplot.js").then(draw); load("explore.js"); });
   matchMedia("(prefers-color-scheme: dark)").addEventListener("change", draw);
   window.stationPage = { curve, flush, formatNumber, utc, showTime: (time_s) => showTime(time_s) };
   let width = innerWidth;

@@ -9,8 +9,8 @@ const stationTiles = (() => {
     return new Uint8Array(await new Response(stream).arrayBuffer());
   }
 
-  window.STATION_TILE = (name, head, data) => {
-    const entry = waiting.get(name);
+  window.STATION_TILE = (_, head, data) => {
+    const entry = waiting.get(document.currentScript.dataset.tile);
     if (entry) inflate(data).then((bytes) => entry.resolve({ head, bytes }), entry.reject);
   };
 
@@ -26,7 +26,8 @@ const stationTiles = (() => {
     const tile = new Promise((resolve, reject) => {
       waiting.set(name, { resolve, reject });
       const script = document.createElement("script");
-      script.src = `${name}.js?${version}`;
+      script.src = version ? `${name}.js?${version}` : `${name}.js`;
+      script.dataset.tile = name;
       script.onload = () => script.remove();
       script.onerror = () => { script.remove(); resolve(null); };
       document.head.append(script);

@@ -26,6 +26,8 @@ from station.archive.derived.boxes import BOXES, read_entry
 from station.archive.derived.computed_rasters import CHANGE, RANDOM
 from station.archive.epochs import EpochRef
 from station.archive.netcdf_layout import Series
+from station.errors import StoreError
+from station.products.viewer.near_blocks import sigma_ratio
 from station.products.viewer.tiles import (
     Array,
     TileFolder,
@@ -52,7 +54,7 @@ MAX_BASE = 24  # epochs whose covariance is averaged
 MAX_CHANGE = 2**21  # code of a change of 1 km; a difference of two has 3 bytes
 CODE_BYTES = {"change": 3, "random": 2, "systematic": 2, "coverage": 1}  # of a value, by name
 DTYPES = {"change": np.int32, "random": np.uint16, "systematic": np.uint16, "coverage": np.uint8}
-FORMAT = 1
+FORMAT = 2
 
 
 @dataclass(frozen=True)
@@ -194,6 +196,25 @@ class _Tiles:
         size = self._queries.blocks_per_box
         return np.asarray(row // size * -(-self.surface.known.shape[1] // size) + column // size)
 
+    @cached_property
+    def _near_ratio(self) -> Floats:
+        """Return the systematic sigma (n,) of each block in sigmas of its middle, once for a reference."""
+        path, jacobian = self._cache / "near.bin", self.surface.jacobian
+        with suppress(OSError, ValueError):
+            ratio = np.fromfile(path)
+            if len(ratio) == np.count_nonzero(self.surface.known):
+                return ratio
+        shared = self._newest_blocks.shared
+        if jacobian is None or shared is None:
+            return np.ones(np.count_nonzero(self.surface.known))
+        offset_m = self.surface.observation.offset_m
+        block_m = self._queries.cells * self._series.grid.cell_m
+        ratio = sigma_ratio(jacobian, shared, (offset_m[0], offset_m[1]), block_m)
+        with suppress(StoreError, OSError):
+            path.parent.mkdir(parents=True, exist_ok=True)
+            replace_file(path, ratio.tobytes())
+        return ratio
+
     def key(self, names: list[str]) -> str:
         """Return a text that changes with what a tier is made of."""
         return hashlib.sha256(json.dumps([FORMAT, self._version, *names]).encode()).hexdigest()
@@ -237,6 +258,7 @@ class _Tiles:
         systematic_m2 = np.zeros(blocks.count.shape)
         if blocks.jacobian is not None and blocks.shared is not None:
             systematic_m2[blocks.observed] = blocks.jacobian.variance(blocks.shared)
+            systematic_m2[self.surface.known] *= self._near_ratio**2
         full = self._queries.cells**2
         values = {
             "change": np.round(blocks.change_m / QUANTUM_M),

@@ -1,0 +1,46 @@
+"""Systematic sigma of blocks near the scanner, which span many lines: their errors average out."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from scipy import sparse
+
+from station.quantities import Floats, SharedParameters
+from station.science.analysis.calibration import SparseJacobian
+from station.science.uncertainty.jacobian import HeightJacobian
+from station.science.uncertainty.parameters import TILT_KNOT_RAD
+
+PLACES = 4  # along each side of a block
+MIN_SPAN = 0.5  # of a block, in knots, from which its places are told apart
+AT_ONCE = 1000  # blocks
+
+
+def sigma_ratio(
+    jacobian: HeightJacobian, shared: SharedParameters, offset_m: tuple[Floats, Floats], block_m: float
+) -> Floats:
+    """Return the systematic sigma of the mean of each block (n,), in sigmas of its middle.
+
+    `offset_m` are the eastward and northward distances of the middle from the scanner. Within a block only
+    the azimuth of its places matters: the other derivatives change linearly. Source: equations.md, 6.2.
+    """
+    east_m, north_m = offset_m
+    ratio = np.ones(len(jacobian))
+    near = np.flatnonzero(np.hypot(east_m, north_m) * TILT_KNOT_RAD * MIN_SPAN < block_m)
+    step_m = (np.arange(PLACES) + 0.5) / PLACES * block_m - block_m / 2
+    step_east_m, step_north_m = (steps.ravel() for steps in np.meshgrid(step_m, step_m))
+    for first in range(0, len(near), AT_ONCE):
+        chosen = near[first : first + AT_ONCE]
+        middle = east_m[chosen, None] + 1j * north_m[chosen, None]
+        turn_rad = np.angle((middle + step_east_m + 1j * step_north_m) / middle)
+        part = jacobian.take(np.repeat(chosen, PLACES**2))
+        last = np.nextafter(jacobian.params.knot_intervals, 0)
+        position = np.clip(part.knot_position - turn_rad.ravel() / TILT_KNOT_RAD, 0, last)
+        part = replace(part, knot_position=position)
+        index = np.arange(len(part))
+        entries = np.full(len(part), PLACES**-2.0), (index // PLACES**2, index)
+        weights = sparse.csr_array(entries, shape=(len(chosen), len(part)))
+        mean_m2 = SparseJacobian(part).sums(weights).variance(np.zeros(len(part)), shared)
+        ratio[chosen] = np.sqrt(mean_m2 / np.asarray(jacobian.take(chosen).variance(shared)))
+    return np.minimum(ratio, 1.0)
