@@ -23,7 +23,7 @@ from station.readers.scan import ScanHeader, suffixes
 from station.readers.sop import read_matrix
 from station.readers.weather_dialects import recognise_dialect
 from station.scan_names import start_in_name
-from station.scanners import SCANNERS
+from station.scanners import SCANNERS, missing_values
 from station.sections.inputs import ScansSection
 
 LOG_SUFFIX = "-incl.txt"
@@ -161,7 +161,7 @@ def _model_for(range_m: float) -> str:
     reaching = [
         name
         for name, values in SCANNERS.items()
-        if name.startswith("riegl-") and values["range_max_m"] >= range_m
+        if name.startswith("riegl-") and not missing_values(name) and values["range_max_m"] >= range_m
     ]
     return min(reaching, key=lambda name: SCANNERS[name]["range_max_m"], default="riegl-vz-6000")
 

@@ -10,7 +10,7 @@ from pydantic import AfterValidator, ConfigDict, Field, model_validator
 
 from station.quantities import Air, IntensityScale, Scanner
 from station.scan_names import ZONE_MARK
-from station.scanners import SCANNERS, scanner_model
+from station.scanners import SCANNERS, missing_values, scanner_model
 from station.section_types import (
     Arm,
     NotNegative,
@@ -99,14 +99,14 @@ class ScannerSection(Section):
             return values  # pydantic reports the types
         given = values.get("model", "riegl-vz-6000")
         model = scanner_model(given) or given
-        known = SCANNERS.get(model, {})
-        missing = set(SCANNERS["riegl-vz-6000"]) - set(values)
-        if not known and missing:
+        missing = ", ".join(key for key in missing_values(model) if key not in values)
+        if missing and model not in SCANNERS:
             raise ValueError(
-                f"unknown scanner {given!r}: choose from {', '.join(SCANNERS)},"
-                f" or give {', '.join(sorted(missing))}"
+                f"unknown scanner {given!r}: choose from {', '.join(SCANNERS)}, or give {missing}"
             )
-        return {**known, **values, "model": model}
+        if missing:
+            raise ValueError(f"not all of {model} is known: give {missing} of its data sheet")
+        return {**SCANNERS.get(model, {}), **values, "model": model}
 
     @property
     def instrument(self) -> Scanner:
