@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -23,6 +24,8 @@ from station.section_types import (
     require_time_pattern,
     without_required,
 )
+
+DAY_S = 86_400
 
 
 class ScansSection(Section):
@@ -61,8 +64,23 @@ class EpochSection(Section):
     """Several files that are one epoch: tiles of a scan, or scans from several positions."""
 
     name: Annotated[str, AfterValidator(require_epoch_name)]
+    window_s: Annotated[int, Field(ge=1, le=86_400)] | None = None
     files: Annotated[int, Field(ge=1, le=1000)] | None = None
     wait_s: NotNegative = 3600.0
+
+    @model_validator(mode="after")
+    def _windows_are_named(self) -> EpochSection:
+        if self.window_s is None:
+            return self
+        if DAY_S % self.window_s:
+            raise ValueError("window_s must divide a day: 600 for ten minutes, 10800 for three hours")
+        midnight = datetime(2025, 7, 15, tzinfo=UTC)
+        names = {
+            (midnight + timedelta(seconds=s)).strftime(self.name) for s in range(0, DAY_S, self.window_s)
+        }
+        if len(names) < DAY_S // self.window_s:
+            raise ValueError("epoch.name must tell all windows of a day apart, as %Y%m%d_%H%M does")
+        return self
 
 
 class RegistrationSection(Section):
