@@ -358,7 +358,7 @@ def test_irregular_files_are_set_aside(make_inbox, drop, journal, tmp_path):
     "name",
     [
         "a\nb.laz",
-        "a b.laz",
+        " a.laz",
         "\x1b[31m.laz",
         "ä.laz",
         os.fsdecode(b"\xff\xfe.laz"),
