@@ -84,7 +84,7 @@ def test_thousands_of_odd_names_delay_no_scan(make_site, monkeypatch, caplog):
     monkeypatch.setattr(inbox_module, "MAX_REJECTED", 20)
     site = make_site(settle_s=0.0)
     for number in range(50):
-        (site.scans.inbox / f"odd name {number}.laz").touch()
+        (site.scans.inbox / f"odd?name {number}.laz").touch()
     (site.scans.inbox / "261121_010000.laz").write_text("scan")
     with Journal(site.station.data / "journal.sqlite") as journal:
         inbox = Inbox(site, journal, (".laz",))
