@@ -108,7 +108,7 @@ class Site(SiteFile):
                 "scans": {"frame", "name", "zone", "columns", "convert", "point_time", "intensity"}
                 | {"timeout_s"},
                 "service": {"memory_gb"},
-                "epoch": {"name"},
+                "epoch": {"name", "window_s"},
                 "registration": True,
                 **dict.fromkeys(
                     ("scanner", "sop", "map", "grid", "inclination", "weather", "air", "adjustment",

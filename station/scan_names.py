@@ -96,7 +96,15 @@ def _field_expression(field: str) -> str:
 
 
 @lru_cache(maxsize=1 << 16)
-def epoch_name(start: datetime, pattern: str) -> str:
-    """Return the name of the epoch to which a scan belongs: its start, in the zone of the pattern."""
+def epoch_name(start: datetime, pattern: str, window_s: int | None = None) -> str:
+    """Return the name of the epoch to which a scan belongs: its start, in the zone of the pattern.
+
+    With `window_s` it is the start of the window, counted from midnight, in which the scan began.
+    """
     pattern, _, zone = pattern.partition(ZONE_MARK)
-    return start.astimezone(ZoneInfo(zone) if zone else UTC).strftime(pattern)
+    local = start.astimezone(ZoneInfo(zone) if zone else UTC)
+    if window_s is not None:
+        second_of_day = local.hour * 3600 + local.minute * 60 + local.second
+        hours, rest_s = divmod(second_of_day // window_s * window_s, 3600)
+        local = local.replace(hour=hours, minute=rest_s // 60, second=rest_s % 60)
+    return local.strftime(pattern)

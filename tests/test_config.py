@@ -11,6 +11,7 @@ from pydantic import ValidationError
 
 from station.config import SCHEMA_NAME, read_site, site_schema, write_site
 from station.errors import ConfigError
+from station.scanners import KEYS, SCANNERS, missing_values
 from station.sections.inputs import ScannerSection
 
 GOOD = """
@@ -269,3 +270,21 @@ def test_a_scanner_that_is_not_in_the_table_is_described_as_the_manual_says():
     del values["range_max_m"]
     with pytest.raises(ValidationError, match=r"unknown scanner 'my-scanner'.* or give range_max_m"):
         ScannerSection(**values)
+
+
+def test_a_scanner_of_which_some_values_are_known_needs_only_the_others_which_the_manual_names():
+    given = {"beam_divergence_mrad": 0.27, "range_sigma_m": 0.005, "range_max_m": 2500.0}
+    scanner = ScannerSection(model="VZ-2000i", **given)
+    assert (scanner.model, scanner.wavelength_um, scanner.range_max_m) == ("riegl-vz-2000i", 1.55, 2500.0)
+    fault = "not all of riegl-vz-2000i is known: give beam_divergence_mrad, range_sigma_m, range_max_m"
+    with pytest.raises(ValidationError, match=fault):
+        ScannerSection(model="VZ-2000i")
+    manual = (Path(__file__).parents[1] / "docs" / "how-to" / "your-own-files.md").read_text()
+    rows = re.findall(r"^\| (`(?:riegl|leica|optech|livox)-.*?) \| (.*?) \|$", manual, re.MULTILINE)
+    described = {}
+    for models, keys in rows:
+        named = set(re.findall("`(.*?)`", keys))
+        described |= dict.fromkeys(
+            re.findall("`(.*?)`", models), set(KEYS) - named if "all but" in keys else named
+        )
+    assert described == {name: set(missing_values(name)) for name in SCANNERS if missing_values(name)}

@@ -90,12 +90,24 @@ def test_instrument_values_equal_those_of_manuals_and_published_code():
     assert imager["angle_resolution_deg"] / 12**0.5 == pytest.approx(0.004, rel=0.01)
 
 
+def test_beams_stated_at_half_maximum_are_converted():
+    """Leica P30/P40: 0.23 mrad, 3.5 mm; BLK360: 0.4 mrad, 2.25 mm. Half of a Gaussian: .5887 of 1/e²."""
+    for name, mrad, diameter_m in (("scanstation-p40", 0.23, 0.0035), ("blk360", 0.4, 0.00225)):
+        values = SCANNERS[f"leica-{name}"]
+        expected = [mrad / 0.5887, diameter_m / 0.5887]
+        actual = [values["beam_divergence_mrad"], values["exit_diameter_m"]]
+        assert actual == pytest.approx(expected, rel=0.01)
+
+
 @pytest.mark.parametrize(
     ("name", "model"),
     [
         ("VZ-6000", "riegl-vz-6000"), ("Riegl VZ 6000", "riegl-vz-6000"), ("RIEGL_VZ-400i", "riegl-vz-400i"),
         ("vz400", "riegl-vz-400"), ("Livox Mid-70", "livox-mid-70"), ("VZ-9000", None), ("", None),
         ("Z+F IMAGER 5016", "zf-imager-5016"), ("imager 5016", "zf-imager-5016"),
+        ("Zoller+Fröhlich 5016", "zf-imager-5016"), ("Leica ScanStation P40", "leica-scanstation-p40"),
+        ("P40", "leica-scanstation-p40"), ("BLK360", "leica-blk360"), ("Z420i", "riegl-lms-z420i"),
+        ("Teledyne Optech ILRIS 3D", "optech-ilris-3d"), ("VZ-2000i", "riegl-vz-2000i"),
     ],
 )  # fmt: skip
 def test_scanners_are_known_by_the_names_that_people_write(name, model):

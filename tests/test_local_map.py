@@ -24,6 +24,13 @@ from station.service.store_repair import require_same_map
 
 BOUNDS = "bounds_m = { west = -5000.0, south = -5000.0, east = 5000.0, north = 5000.0 }"
 SOP = '[[sop]]\nfrom = 2025-07-14T23:00:00Z\nfile = "sop.dat"\n'
+REGISTRATION = """[registration]
+suffix = ".dat"
+into = "{into}"
+use = "given"
+sigma_m = 0.01
+sigma_deg = 0.001
+"""
 TABLE = r"(?ms)^\[\[?{}\]?\].*?(?=^\[|\Z)"
 
 
@@ -108,3 +115,61 @@ def test_a_later_sop_needs_a_new_folder(processed):
         ConfigError, match=r"is of a map without an .* new folder and process the scans again"
     ):
         require_same_map(read_site(path))
+
+
+@pytest.mark.integration
+def test_matrices_place_scans_on_the_map_that_is_the_frame_of_the_first(folder, tmp_path):
+    """Turned scans with their matrices are measured as those that were not turned, to 0.25 mm of a point."""
+    angle_rad = np.radians(3.0)
+    turn = np.eye(4)
+    turn[:2, :2] = [[np.cos(angle_rad), -np.sin(angle_rad)], [np.sin(angle_rad), np.cos(angle_rad)]]
+    turn[:3, 3] = 0.5, -0.25, 0.125
+    text = re.sub(TABLE.format("inclination"), "", (folder / "site.toml").read_text())
+    section = REGISTRATION.format(into="scanner")
+    series = []
+    for name, more, matrix in (("still", "", np.eye(4)), ("turned", section, turn)):
+        inbox = tmp_path / name / "inbox"
+        inbox.mkdir(parents=True)
+        (inbox.parent / "site.toml").write_text(f"{text}\n{more}")
+        back = np.linalg.inv(matrix)
+        for scan in sorted((folder / "inbox").glob("*.laz"))[:2]:
+            points = laspy.read(scan)
+            points.x, points.y, points.z = (
+                back[:3, :3] @ np.stack([points.x, points.y, points.z]) + back[:3, 3:]
+            )
+            points.write(inbox / scan.name)
+            if more:
+                np.savetxt(inbox / f"{scan.stem}.dat", matrix, fmt="%.12f")
+        command = [
+            sys.executable,
+            "-m",
+            "station",
+            "process",
+            inbox.parent / "site.toml",
+            *inbox.glob("*.laz"),
+        ]
+        subprocess.run(command, check=True, capture_output=True, timeout=300)
+        series.append(station.open(inbox.parent / "data"))
+    still, turned = series
+    same = (still["point_count"] == turned["point_count"]).to_numpy()
+    assert same.mean() > 0.99
+    difference_m = (turned["elevation"] - still["elevation"]).to_numpy()[same]
+    assert np.isfinite(difference_m).any()
+    assert np.nanmax(np.abs(difference_m)) < 0.005
+
+
+def test_what_a_registration_without_an_sop_needs(folder):
+    text = (folder / "site.toml").read_text()
+
+    def read(into, mode):
+        path = folder / "registered.toml"
+        path.write_text(f"{text.replace('absolute', mode)}\n{REGISTRATION.format(into=into)}")
+        return read_site(path)
+
+    assert read("scanner", "relative").registration.into == "scanner"
+    with pytest.raises(ConfigError, match=r"one of the matrices will do"):
+        read("project", "relative")
+    with pytest.raises(
+        ConfigError, match=r'the frame of the registration: set inclination\.mode = "relative"'
+    ):
+        read("scanner", "absolute")

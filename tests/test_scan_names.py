@@ -15,7 +15,7 @@ from station.scan_names import (
     scan_stem,
     start_in_name,
 )
-from station.sections.inputs import ScansSection
+from station.sections.inputs import EpochSection, ScansSection
 
 START = datetime(2025, 7, 15, 9, 0, 5, tzinfo=UTC)
 
@@ -107,3 +107,34 @@ def test_epochs_are_those_of_the_zone():
     late = datetime(2025, 7, 14, 22, 30, tzinfo=UTC)
     assert epoch_name(late, "%Y-%m-%d@Europe/Vienna") == "2025-07-15"
     assert epoch_name(late, "%Y-%m-%d@UTC") == "2025-07-14"
+
+
+@pytest.mark.parametrize(
+    ("name", "pattern", "window_s", "expected"),
+    [
+        ("250715_095959.laz", "%Y%m%d_%H%M", 600, "20250715_0950"),
+        ("250715_100000.laz", "%Y%m%d_%H%M", 600, "20250715_1000"),
+        ("250715_235959.laz", "%Y%m%d_%H", 3 * 3600, "20250715_21"),
+        ("250715_000000.laz", "%Y-%m-%d", 86_400, "2025-07-15"),
+        ("250715_101730.laz", "%Y%m%d_%H%M%S", 15, "20250715_101730"),
+        ("250715_215900.laz", "%Y%m%d_%H@Europe/Vienna", 4 * 3600, "20250715_20"),  # 23:59 there
+        ("250715_220100.laz", "%Y%m%d_%H@Europe/Vienna", 4 * 3600, "20250716_00"),
+    ],
+)
+def test_windows_of_an_epoch_are_counted_from_midnight(name, pattern, window_s, expected):
+    start = start_in_name(name, "%y%m%d_%H%M%S")
+    assert epoch_name(start, pattern, window_s) == expected
+    assert start_in_name(expected, pattern) <= start
+
+
+@pytest.mark.parametrize(
+    ("values", "fault"),
+    [
+        ({"name": "%Y%m%d_%H%M", "window_s": 700}, "must divide a day"),
+        ({"name": "%Y%m%d_%H", "window_s": 600}, "tell all windows of a day apart"),
+        ({"name": "%Y%m%d_%H", "window_s": 0}, "greater than or equal to 1"),
+    ],
+)
+def test_windows_that_cannot_be_are_refused(values, fault):
+    with pytest.raises(ValidationError, match=fault):
+        EpochSection(**values)

@@ -22,6 +22,7 @@ from station.simulation.station import simulate
 pytestmark = pytest.mark.integration
 
 TILES = 3
+DAY = "2025-07-15 hut"  # names with spaces are read like others
 COMPARED = ("point_count", "elevation", "elevation_change", "elevation_change_uncertainty")
 CELL_M, SIZE_M, COUNT = 0.5, 10.0, 20_000
 SITE = """
@@ -30,7 +31,7 @@ id = "positions"
 data = "data"
 [scans]
 inbox = "inbox"
-name = "%Y-%m-%d/ScanPos*"
+name = "%Y-%m-%d hut/ScanPos*"
 settle_s = 0
 [epoch]
 name = "%Y-%m-%d"
@@ -62,10 +63,10 @@ def tiled(folder, *, method="joint"):
     """Return a simulated station whose scans wait as tiles, each with a third of the lines, in a folder."""
     tiny_station.build(folder, method=method, hours=4)
     text = (folder / "site.toml").read_text()
-    text = re.sub(r'name = "%y%m%d_%H%M%S".*', 'name = "%Y-%m-%d/*_%H%M%S_*"', text)
+    text = re.sub(r'name = "%y%m%d_%H%M%S".*', 'name = "%Y-%m-%d hut/*_%H%M%S_*"', text)
     text += '\n[epoch]\nname = "%y%m%d_%H%M%S"\nfiles = 3\nwait_s = 3600\n'
     (folder / "site.toml").write_text(text)
-    day = folder / tiny_station.PENDING / "2025-07-15"
+    day = folder / tiny_station.PENDING / DAY
     day.mkdir()
     for path in sorted((folder / tiny_station.PENDING).glob("*.laz")):
         whole = laspy.read(path)
@@ -80,8 +81,8 @@ def tiled(folder, *, method="joint"):
 
 def deliver(folder):
     """Move all tiles into the inbox; return them."""
-    day = folder / "inbox" / "2025-07-15"
-    (folder / tiny_station.PENDING / "2025-07-15").rename(day)
+    day = folder / "inbox" / DAY
+    (folder / tiny_station.PENDING / DAY).rename(day)
     return sorted(day.glob("*.laz"))
 
 
@@ -126,8 +127,8 @@ def test_live_epochs_of_a_killed_service_are_those_of_one_run(tmp_path):
     expected = tiled(tmp_path / "expected")
     assert station("process", expected / "site.toml", *deliver(expected)).returncode == 0
     live, random = tiled(tmp_path / "live"), np.random.default_rng(5)
-    pending = live / tiny_station.PENDING / "2025-07-15"
-    day = live / "inbox" / "2025-07-15"
+    pending = live / tiny_station.PENDING / DAY
+    day = live / "inbox" / DAY
     day.mkdir()
     arrivals = sorted(path for path in pending.iterdir() if path.suffix == ".laz")
     for log in pending.glob("*.txt"):
@@ -202,7 +203,7 @@ def test_scan_positions_are_placed_by_their_sops(tmp_path, into):
     """
     random = np.random.default_rng(3)
     sops = {"first": sop(30.0, -4.0, -3.0, 2.0), "second": sop(-75.0, 14.0, 12.0, 1.5)}
-    day = tmp_path / "inbox" / "2025-07-15"
+    day = tmp_path / "inbox" / DAY
     day.mkdir(parents=True)
     on_map = []
     for number, (name, matrix) in enumerate(sops.items(), start=1):
@@ -253,7 +254,7 @@ def test_a_corrupt_tile_sets_its_epoch_aside_and_no_other(tmp_path):
     tiles[3].unlink()
     result = station("process", folder / "site.toml", *tiles[:3], *tiles[4:])
     assert result.returncode == 3, result.stdout + result.stderr
-    assert f"250715_000000: set aside: 2025-07-15/{tiles[1].name}: cut off or corrupt" in result.stdout
+    assert f"250715_000000: set aside: {DAY}/{tiles[1].name}: cut off or corrupt" in result.stdout
     assert "250715_010000: degraded (2 of 3 files of the epoch" in result.stdout
     assert "250715_020000: degraded (log of 250715_000000, the scan of the SOP, not usable" in result.stdout
     assert (folder / "data" / "set_aside" / "250715_000000.txt").is_file()

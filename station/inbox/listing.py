@@ -17,8 +17,8 @@ from station.config import Site
 from station.errors import NotReadyError
 from station.scan_names import SEPARATOR, epoch_name, folder_depth, scan_id, start_in_name
 
-# Names that need no quotes in a log line or a shell, short enough for `<name>.txt` to be a valid file name.
-_SAFE_PART = r"[A-Za-z0-9][A-Za-z0-9._,+=@~()-]{0,99}"
+# Names without control characters or wildcards, short enough for `<name>.txt` to be a valid file name.
+_SAFE_PART = r"[A-Za-z0-9](?:[A-Za-z0-9._,+=@~() -]{0,98}[A-Za-z0-9._,+=@~()-])?"
 _SAFE_NAME = re.compile(rf"{_SAFE_PART}(/{_SAFE_PART})*")
 _FILE_TYPES = {
     stat.S_IFLNK: "a link",
@@ -147,7 +147,7 @@ class ScanListing:
             file_type = _FILE_TYPES.get(stat.S_IFMT(mode), "something else")
             return f"is {file_type}: only regular files are read; copy the scan itself into the inbox"
         if not _SAFE_NAME.fullmatch(name):
-            return "the name has spaces, control or other special characters, or is too long: rename it"
+            return "the name has special characters, a space at its end, or is too long: rename it"
         if self._site.epoch is not None and start_in_name(name, self._site.scans.pattern) is None:
             return (
                 f"the name does not match scans.name = {self._site.scans.name!r}, which tells the epoch that"
@@ -159,7 +159,9 @@ class ScanListing:
 def name_in_journal(site: Site, name: str) -> str:
     """Return the name under which a file is in the journal: its own, or that of its epoch."""
     start = start_in_name(name, site.scans.pattern) if site.epoch else None
-    return name if start is None else epoch_name(start, site.row_pattern)
+    if start is None or site.epoch is None:
+        return name
+    return epoch_name(start, site.row_pattern, site.epoch.window_s)
 
 
 def _list_files(folder: Path, depth: int, prefix: str = "") -> Iterator[tuple[str, os.stat_result]]:

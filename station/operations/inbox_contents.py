@@ -23,6 +23,7 @@ MANUAL = "docs/how-to/your-own-files.md"
 PATTERNS = (
     "%y%m%d_%H%M%S", "%Y%m%d_%H%M%S", "%Y%m%dT%H%M%SZ", "%Y%m%d%H%M%S", "%Y-%m-%d_%H-%M-%S",
     "%Y-%m-%dT%H-%M-%S", "%Y_%m_%d_%H_%M_%S", "%Y%m%d_%H%M", "%Y-%m-%d_%H-%M",
+    "%y%m%d %H%M%S", "%Y%m%d %H%M%S", "%Y-%m-%d %H-%M-%S", "%Y-%m-%d %H.%M.%S", "%Y-%m-%d %H-%M",
 )  # fmt: skip
 FOLDER_PATTERNS = ("%Y-%m-%d", "%Y%m%d", "%Y_%m_%d", "%y%m%d")
 CONVERTED = {

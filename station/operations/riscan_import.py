@@ -12,7 +12,7 @@ from station.config import SCHEMA_NAME, site_schema
 from station.errors import ConfigError
 from station.quantities import Floats
 from station.readers.formats.riscan import Project, ScanPosition, read_project
-from station.scanners import SCANNERS, scanner_model
+from station.scanners import SCANNERS, missing_values, scanner_model
 from station.science.geometry import pose
 
 DEFAULT_EXTENT_M = 100.0  # of the grid, if the project does not tell how far its scans reach
@@ -100,11 +100,11 @@ def site_text(
 def _scanner_lines(project: Project) -> list[str]:
     name = next((position.instrument for position in project.positions if position.instrument), "")
     model = scanner_model(name) if project.positions else "riegl-vz-6000"
-    if model is not None:
-        return ["[scanner]", f'model = "{model}"              # check', ""]
-    keys = [f"{key} = {value:g}" for key, value in SCANNERS["riegl-vz-400i"].items()]
-    note = "# check: not in the table of scanners: these are the values of a VZ-400i"
-    return ["[scanner]", f'model = "{name or "unknown"}"', note, *keys, ""]
+    lines = ["[scanner]", f'model = "{model or name or "unknown"}"              # check']
+    missing = missing_values(model or "")
+    if missing:
+        lines += ["# check: of its data sheet; these are the values of a VZ-400i"]
+    return [*lines, *(f"{key} = {SCANNERS['riegl-vz-400i'][key]:g}" for key in missing), ""]
 
 
 def _sop_lines(project: Project) -> list[str]:

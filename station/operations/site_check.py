@@ -19,7 +19,7 @@ from station.inbox.journal_reader import JournalReader
 from station.inbox.listing import start_from_name
 from station.inbox.lock import is_locked
 from station.monitoring.preconditions import EARLIEST_S
-from station.operations.inbox_contents import inbox_findings
+from station.operations.inbox_contents import MANUAL, inbox_findings
 from station.operations.site_plausibility import (
     LevelAndMessage,
     alarm_findings,
@@ -35,7 +35,8 @@ from station.processing.integrity import check_store
 from station.processing.scan_air import pressure_fault
 from station.processing.scan_tasks import dry_run
 from station.processing.scanner_pose import map_position, scanner_height_m, scanner_to_map
-from station.processing.scans.scan_files import inbox_scans
+from station.processing.scans.open_scans import open_files
+from station.processing.scans.scan_files import inbox_scans, scan_file
 from station.processing.site_files import load_areas, polygon_cells, series_for
 from station.processing.workers import isolation
 from station.readers.flags import read_flags
@@ -68,6 +69,7 @@ def site_findings(site_path: Path) -> list[Finding]:
         *_clock(),
         *_weather(site),
         *_inclination(site),
+        *_unused_inclination(site),
         *_newest_scan(site),
     ]
 
@@ -125,7 +127,9 @@ def _finding(level: str, what: str, message: str) -> Finding:
 def _local_map(site: Site) -> Iterator[Finding]:
     """Yield where a map without an SOP is, and a warning if nothing makes it level."""
     message = "no [[sop]]: the map is local, with its origin at the scanner and east along its x axis"
-    if site.inclination is None:
+    if site.registration is not None:
+        yield _finding("ok", "map", f"{message}; it is the frame into which the registration leads")
+    elif site.inclination is None:
         level = "it is as level as the scanner, because there is no [inclination]"
         yield _finding("warning", "map", f"{message}; {level}")
     else:
@@ -283,6 +287,26 @@ def _inclination(site: Site) -> Iterator[Finding]:
         yield from _named("inclination", double_tilt_findings(sop.file.name, expected, log_deg))
     elif math.degrees(site.instrument.inclination_range_rad) > max(map(abs, expected)):
         yield from _named("inclination", [tilt_findings(sop.file.name, expected, log_deg)])
+
+
+def _unused_inclination(site: Site) -> Iterator[Finding]:
+    """Yield a warning if the points of the newest scan carry roll and pitch, which nobody asked to use."""
+    scans = _scans(site)
+    if site.inclination is not None or site.scans.frame == "map" or not scans:
+        return
+    service = site.service
+    with suppress(StationError):  # a finding on the scan
+        if isolation.TaskRunner().run(
+            carries_inclination, site, scans[-1], memory_gb=service.memory_gb, timeout_s=site.scans.timeout_s
+        ):
+            message = "the points carry roll and pitch, which are not used: [inclination] wait_s = 0 would"
+            yield _finding("warning", "inclination", f"{message}, see {MANUAL}")
+
+
+def carries_inclination(site: Site, path: Path, _progress: object) -> bool:
+    """Return True if the points of a scan carry roll and pitch; runs in a worker process."""
+    with open_files(site, [scan_file(site, path)]) as reader:
+        return reader.header.has_inclination
 
 
 def _newest_height_m(site: Site) -> float | None:

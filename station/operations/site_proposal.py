@@ -8,7 +8,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from pyproj import CRS
 from pyproj.exceptions import CRSError
 
 from station.errors import ConfigError, StationError
@@ -23,7 +22,8 @@ from station.readers.scan import ScanHeader, suffixes
 from station.readers.sop import read_matrix
 from station.readers.weather_dialects import recognise_dialect
 from station.scan_names import start_in_name
-from station.scanners import SCANNERS
+from station.scanners import SCANNERS, missing_values
+from station.science.geometry.pose import horizontal_crs
 from station.sections.inputs import ScansSection
 
 LOG_SUFFIX = "-incl.txt"
@@ -161,7 +161,7 @@ def _model_for(range_m: float) -> str:
     reaching = [
         name
         for name, values in SCANNERS.items()
-        if name.startswith("riegl-") and values["range_max_m"] >= range_m
+        if name.startswith("riegl-") and not missing_values(name) and values["range_max_m"] >= range_m
     ]
     return min(reaching, key=lambda name: SCANNERS[name]["range_max_m"], default="riegl-vz-6000")
 
@@ -186,9 +186,9 @@ def _map_frame_lines(header: ScanHeader) -> list[str]:
 
 
 def _code(header: ScanHeader) -> str:
-    """Return the EPSG code of the CRS that a scan declares, else one that `station check` refuses."""
+    """Return the EPSG code of the map that a scan declares, else one that `station check` refuses."""
     try:
-        code = CRS.from_user_input(header.crs_wkt).to_epsg() if header.crs_wkt else None
+        code = horizontal_crs(header.crs_wkt).to_epsg() if header.crs_wkt else None
     except CRSError:
         code = None
     return f"EPSG:{code or '…'}"

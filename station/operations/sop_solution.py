@@ -15,7 +15,7 @@ from station.products.exports.transformations import covariance_text
 from station.quantities import Floats, Scanner
 from station.readers.sop import read_matrix
 from station.readers.tie_features import read_tie_features
-from station.scanners import SCANNERS, scanner_model
+from station.scanners import SCANNERS, missing_values, scanner_model
 from station.science.geometry import pose
 from station.science.geometry.registration import POSE, Features, Registration, solve
 from station.science.uncertainty.point_covariance import shot_covariance
@@ -78,8 +78,9 @@ class SopSolution:
 def scanner_by_model(model: str) -> Scanner:
     """Return a scanner by its model; raise ConfigError if the model is unknown."""
     known = scanner_model(model)
-    if known is None:
-        raise ConfigError(f"--scanner {model}: unknown; choose one of {', '.join(SCANNERS)}")
+    if known is None or missing_values(known):
+        complete = ", ".join(name for name in SCANNERS if not missing_values(name))
+        raise ConfigError(f"--scanner {model}: unknown; choose one of {complete}")
     return ScannerSection.model_validate({"model": known}).instrument
 
 

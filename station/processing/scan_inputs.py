@@ -388,13 +388,13 @@ def _find_tilt_offset(
     sop = position.sop
     if site.inclination is None:
         return None
-    if site.inclination.mode == "absolute" or sop is None:
+    if site.inclination.mode == "absolute":
         return NO_CYCLIC_ERROR
-    if sop.scan is None and waiting_before:
+    if (sop is None or sop.scan is None) and waiting_before:
         raise NotReadyError(
             f"waits for {waiting_before}: the first scan under an SOP defines its tilt offset"
         )
-    if sop.scan is not None and sop.scan not in {position.scan, scan_stem(position.scan)}:
+    if sop is not None and sop.scan not in {None, position.scan, scan_stem(position.scan)}:
         try:
             log, track = _load_earlier_log(site, sop)
             problem = "not found" if log is None else ""

@@ -82,14 +82,14 @@ def scanner_to_map(site: Site, sop: SopSection | None, matrix: Floats | None = N
     return pose.scanner_to_map_directly(matrix, site.map.crs, radius_m)
 
 
-def registered_matrix(site: Site, sop: SopSection, path: Path) -> Floats:
-    """Return the matrix (4, 4) from scanner to project that a registration file gives.
+def registered_matrix(site: Site, sop: SopSection | None, path: Path) -> Floats:
+    """Return the matrix (4, 4) from scanner to project, or to a local map, that a registration file gives.
 
     Raises ConfigError if it holds none.
     """
     matrix = read_matrix(path)
     into_scanner = site.registration is not None and site.registration.into == "scanner"
-    return np.asarray(read_matrix(sop.file) @ matrix) if into_scanner else matrix
+    return np.asarray(read_matrix(sop.file) @ matrix) if into_scanner and sop is not None else matrix
 
 
 def _degrees(origin: Origin) -> tuple[float, float, float]:

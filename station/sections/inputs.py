@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -10,7 +11,7 @@ from pydantic import AfterValidator, ConfigDict, Field, model_validator
 
 from station.quantities import Air, IntensityScale, Scanner
 from station.scan_names import ZONE_MARK
-from station.scanners import SCANNERS, scanner_model
+from station.scanners import SCANNERS, missing_values, scanner_model
 from station.section_types import (
     Arm,
     NotNegative,
@@ -23,6 +24,8 @@ from station.section_types import (
     require_time_pattern,
     without_required,
 )
+
+DAY_S = 86_400
 
 
 class ScansSection(Section):
@@ -61,8 +64,23 @@ class EpochSection(Section):
     """Several files that are one epoch: tiles of a scan, or scans from several positions."""
 
     name: Annotated[str, AfterValidator(require_epoch_name)]
+    window_s: Annotated[int, Field(ge=1, le=86_400)] | None = None
     files: Annotated[int, Field(ge=1, le=1000)] | None = None
     wait_s: NotNegative = 3600.0
+
+    @model_validator(mode="after")
+    def _windows_are_named(self) -> EpochSection:
+        if self.window_s is None:
+            return self
+        if DAY_S % self.window_s:
+            raise ValueError("window_s must divide a day: 600 for ten minutes, 10800 for three hours")
+        midnight = datetime(2025, 7, 15, tzinfo=UTC)
+        names = {
+            (midnight + timedelta(seconds=s)).strftime(self.name) for s in range(0, DAY_S, self.window_s)
+        }
+        if len(names) < DAY_S // self.window_s:
+            raise ValueError("epoch.name must tell all windows of a day apart, as %Y%m%d_%H%M does")
+        return self
 
 
 class RegistrationSection(Section):
@@ -99,14 +117,14 @@ class ScannerSection(Section):
             return values  # pydantic reports the types
         given = values.get("model", "riegl-vz-6000")
         model = scanner_model(given) or given
-        known = SCANNERS.get(model, {})
-        missing = set(SCANNERS["riegl-vz-6000"]) - set(values)
-        if not known and missing:
+        missing = ", ".join(key for key in missing_values(model) if key not in values)
+        if missing and model not in SCANNERS:
             raise ValueError(
-                f"unknown scanner {given!r}: choose from {', '.join(SCANNERS)},"
-                f" or give {', '.join(sorted(missing))}"
+                f"unknown scanner {given!r}: choose from {', '.join(SCANNERS)}, or give {missing}"
             )
-        return {**known, **values, "model": model}
+        if missing:
+            raise ValueError(f"not all of {model} is known: give {missing} of its data sheet")
+        return {**SCANNERS.get(model, {}), **values, "model": model}
 
     @property
     def instrument(self) -> Scanner:

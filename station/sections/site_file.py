@@ -103,9 +103,12 @@ class SiteFile(Section):
                 "map.crs needs an [[sop]], which transforms the points to that map; without both, the map is"
                 " local, with its origin at the scanner"
             )
-        if self.registration is not None:
-            raise ValueError("registration needs an [[sop]], which says where the scanner stands in general")
-        if self.inclination is not None and self.inclination.mode == "relative":
+        if self.registration is not None and self.registration.into == "project":
             raise ValueError(
-                'without an [[sop]] the log makes the map level: set inclination.mode = "absolute"'
+                'registration.into = "project" needs an [[sop]], which says where the scanner stands in'
+                ' general: one of the matrices will do. Without one, they lead into = "scanner"'
             )
+        levels, mode = self.registration is None, "absolute" if self.registration is None else "relative"
+        if self.inclination is not None and self.inclination.mode != mode:
+            map_is = "the log makes the map level" if levels else "the map is the frame of the registration"
+            raise ValueError(f'without an [[sop]] {map_is}: set inclination.mode = "{mode}"')

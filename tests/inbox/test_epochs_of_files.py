@@ -93,6 +93,7 @@ def test_links_odd_names_and_folders_like_scans_are_rejected_one_by_one(poll, dr
     drop(f"{DAY}/a.laz")
     (tmp_path / "inbox" / DAY / "link.laz").symlink_to(tmp_path / "inbox" / DAY / "a.laz")
     (tmp_path / "inbox" / DAY / "folder.laz").mkdir()
+    drop("21 November /a.laz")
     drop("21 November/a.laz")
     drop("november/b.laz")
     state = poll("files = 1")
@@ -100,7 +101,8 @@ def test_links_odd_names_and_folders_like_scans_are_rejected_one_by_one(poll, dr
     reasons = {row.name: row.reason for row in journal.rows(State.SET_ASIDE)}
     assert "is a link" in reasons[f"{DAY}/link.laz"]
     assert "is a folder" in reasons[f"{DAY}/folder.laz"]
-    assert "has spaces" in reasons["21 Novembera.laz"]
+    assert "a space at its end" in reasons["21 November a.laz"]
+    assert "does not match scans.name" in reasons["21 November/a.laz"]
     assert "does not match scans.name = '%Y-%m-%d/*'" in reasons["november/b.laz"]
     assert "link.laz: is a link" in (tmp_path / "data/set_aside" / DAY / "link.laz.txt").read_text()
 
@@ -222,3 +224,12 @@ def test_copies_and_names_do_not_change_the_content(drop):
 def test_impossible_patterns_are_refused(read, name, more, message):
     with pytest.raises(ConfigError, match=message):
         read(name, more)
+
+
+def test_files_of_the_same_ten_minutes_are_one_epoch(read, drop):
+    site = read("%y%m%d_%H%M%S", '[epoch]\nname = "%Y%m%d_%H%M"\nwindow_s = 600\n')
+    names = ["261121_085959.laz", "261121_090000.laz", "261121_090959.laz", "261121_091000.laz"]
+    for name in names:
+        drop(name)
+    scans = ScanListing(site, site.scans.inbox, (".laz",)).scans
+    assert scans == {"20261121_0850": names[:1], "20261121_0900": names[1:3], "20261121_0910": names[3:]}

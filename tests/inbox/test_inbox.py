@@ -84,7 +84,7 @@ def test_thousands_of_odd_names_delay_no_scan(make_site, monkeypatch, caplog):
     monkeypatch.setattr(inbox_module, "MAX_REJECTED", 20)
     site = make_site(settle_s=0.0)
     for number in range(50):
-        (site.scans.inbox / f"odd name {number}.laz").touch()
+        (site.scans.inbox / f"odd?name {number}.laz").touch()
     (site.scans.inbox / "261121_010000.laz").write_text("scan")
     with Journal(site.station.data / "journal.sqlite") as journal:
         inbox = Inbox(site, journal, (".laz",))
@@ -358,7 +358,7 @@ def test_irregular_files_are_set_aside(make_inbox, drop, journal, tmp_path):
     "name",
     [
         "a\nb.laz",
-        "a b.laz",
+        " a.laz",
         "\x1b[31m.laz",
         "ä.laz",
         os.fsdecode(b"\xff\xfe.laz"),

@@ -77,6 +77,7 @@ def test_files_with_the_same_start_may_be_one_epoch(findings, make_site):
         ("ScanPos012_250715_090000.laz", "*%y%m%d_%H%M%S"),
         ("hut_2025-07-15_09-00-00.laz", "*%Y-%m-%d_%H-%M-%S"),
         ("20250715_0900_scan.laz", "*%Y%m%d_%H%M*"),
+        ("Hut scan 2025-07-15 09-00-00.laz", "*%Y-%m-%d %H-%M-%S"),
     ],
 )
 def test_a_pattern_for_other_names_is_proposed(findings, name, pattern):

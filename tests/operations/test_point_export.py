@@ -1,5 +1,6 @@
 """Exported clouds lie where the station measured: their own gridding gives the stored change."""
 
+import os
 import subprocess
 import sys
 
@@ -9,6 +10,7 @@ import numpy as np
 import pytest
 from scipy.interpolate import RegularGridInterpolator
 from support import tiny_station
+from support.programs import readers_python, run, tool
 
 import station
 from station.config import read_site
@@ -17,6 +19,18 @@ from station.operations.point_export import export_points
 from station.products.area_tables import Span
 
 pytestmark = pytest.mark.integration
+M3C2 = """
+import sys
+import numpy as np
+import py4dgeo
+first, second, places, radius_m, out = sys.argv[1:]
+places = np.loadtxt(places, ndmin=2)
+up = np.tile([[0.0, 0.0, 1.0]], (len(places), 1))
+clouds = py4dgeo.read_from_las(first), py4dgeo.read_from_las(second)
+m3c2 = py4dgeo.M3C2(epochs=clouds, corepoints=places, corepoint_normals=up,
+                    cyl_radius=float(radius_m), max_distance=50.0)
+np.savetxt(out, m3c2.run()[0])
+"""
 
 
 @pytest.fixture(scope="module")
@@ -80,6 +94,54 @@ def test_an_octree_has_the_points_of_the_cloud(processed, tmp_path):
     rows = [np.stack([np.asarray(cloud[name], float) for name in fields]) for cloud in (expected, points)]
     ordered = [row[:, np.lexsort(row[::-1])] for row in rows]
     np.testing.assert_array_equal(*ordered)
+
+
+def test_laszip_and_cloudcompare_read_the_points_that_were_written(processed, tmp_path):
+    """LASzip is what PDAL and CloudCompare decode LAZ with; Debian's CloudCompare has no LAS, but PLY."""
+    pytest.importorskip("laszip")
+    plyfile, program = pytest.importorskip("plyfile"), tool("CloudCompare")
+    (path,) = export_points(read_site(processed / "site.toml"), None, tmp_path)
+    expected = laspy.read(path, laz_backend=laspy.LazBackend.Lazrs)
+    actual = laspy.read(path, laz_backend=laspy.LazBackend.Laszip)
+    assert len(actual.points) > 1000
+    for name in expected.point_format.dimension_names:
+        np.testing.assert_array_equal(actual[name], expected[name], name)
+    columns = [*np.asarray(actual.xyz).T, np.asarray(actual["elevation_change"])]
+    records = np.rec.fromarrays(columns, names=["x", "y", "z", "scalar_elevation_change"])
+    plyfile.PlyData([plyfile.PlyElement.describe(np.asarray(records), "vertex")]).write(
+        str(tmp_path / "a.ply")
+    )
+    subprocess.run(
+        [program, "-SILENT", "-NO_TIMESTAMP", "-AUTO_SAVE", "OFF", "-C_EXPORT_FMT", "ASC", "-PREC", "4",
+         "-O", "-GLOBAL_SHIFT", "AUTO", tmp_path / "a.ply", "-SAVE_CLOUDS", "FILE", tmp_path / "a.asc"],
+        check=True, capture_output=True, timeout=120, env={**os.environ, "QT_QPA_PLATFORM": "offscreen"},
+    )  # fmt: skip
+    opened = np.loadtxt(tmp_path / "a.asc")
+    np.testing.assert_allclose(opened[:, :3], actual.xyz, rtol=0, atol=0.001)  # CloudCompare has floats
+    np.testing.assert_allclose(opened[:, 3], columns[3], rtol=0, atol=0.0001, equal_nan=True)
+
+
+def test_m3c2_of_py4dgeo_finds_the_stored_change(processed, tmp_path):
+    """Vertical M3C2 in a cylinder as wide as a cell, between clouds of two hours: within the stored sigma."""
+    site = read_site(processed / "site.toml")
+    grid, epochs = site.grid_cells, station.open(processed / "data")
+    first, *_, second = export_points(site, Span.parse(None, None), tmp_path)
+    change_m = (epochs["elevation"].isel(time=-1) - epochs["elevation"].isel(time=0)).to_numpy()
+    enough = (epochs["point_count"].isel(time=[0, -1]) >= 5).all("time").to_numpy() & np.isfinite(change_m)
+    row, column = np.nonzero(enough)
+    height_m = epochs["elevation"].isel(time=0).to_numpy()[enough]
+    np.savetxt(tmp_path / "places", np.column_stack([grid.x_m[column], grid.y_m[row], height_m]))
+    arguments = first, second, tmp_path / "places", grid.cell_m / 2, tmp_path / "distances"
+    run(readers_python(), "-c", M3C2, *map(str, arguments))
+    distance_m = np.loadtxt(tmp_path / "distances")
+    found = np.isfinite(distance_m)
+    assert found.sum() > 20
+    sigma_m = np.hypot(
+        *epochs["elevation_change_random_uncertainty"].isel(time=[0, -1]).to_numpy()[:, enough]
+    )
+    z = (distance_m - change_m[enough])[found] / sigma_m[found]
+    assert abs(np.median(z)) < 0.4
+    assert 0.2 < 1.4826 * np.median(np.abs(z)) < 1.5
 
 
 def test_a_span_without_epochs_and_a_missing_scan_are_told(processed, tmp_path):

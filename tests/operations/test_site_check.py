@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import shutil
 import time
 from dataclasses import replace
@@ -217,3 +218,18 @@ def test_scan_without_brightness_is_a_warning_that_says_what_it_costs(folder):
     assert (finding["level"], finding["what"]) == ("warning", "brightness")
     assert "recognised by slope only" in finding["message"]
     assert "scans.intensity" in finding["message"]
+
+
+def test_tilt_in_the_points_that_nobody_uses_is_told(folder):
+    path = folder / "site.toml"
+    path.write_text(re.sub(r"(?ms)^\[inclination\].*?(?=^\[)", "", path.read_text()))
+    site = read_site(path)
+    assert list(site_check._unused_inclination(site)) == []
+    scan = max(site.scans.inbox.glob("*.laz"))
+    las = laspy.read(scan)
+    las.add_extra_dims([laspy.ExtraBytesParams(name, "f4") for name in ("Roll", "Pitch")])
+    las.Roll[:] = las.Pitch[:] = 0.5
+    las.write(scan)
+    (finding,) = site_check._unused_inclination(site)
+    assert (finding["level"], finding["what"]) == ("warning", "inclination")
+    assert "[inclination] wait_s = 0 would" in finding["message"]

@@ -3,6 +3,7 @@
 import shutil
 import subprocess
 import sys
+from types import SimpleNamespace
 
 import laspy
 import numpy as np
@@ -12,7 +13,7 @@ from support import tiny_station
 
 from station.config import read_site
 from station.errors import ConfigError
-from station.operations.site_proposal import propose_site
+from station.operations.site_proposal import _code, propose_site
 from station.processing.scans.scan_files import inbox_scans
 from station.readers.weather import read_weather
 
@@ -126,3 +127,19 @@ def test_inclination_in_the_points_is_used(source, tmp_path):
         las.write(scan)
     site = read_site(propose_site(source, tmp_path / "site")[0])
     assert (site.inclination.wait_s, site.inclination.mode) == (0.0, "absolute")
+
+
+@pytest.mark.parametrize(
+    ("wkt", "code"),
+    [
+        (
+            CRS("EPSG:2193+7839").to_wkt(),
+            "EPSG:2193",
+        ),  # a map with heights, as LAS files of New Zealand declare
+        (CRS("EPSG:32632").to_wkt(), "EPSG:32632"),
+        ("no CRS", "EPSG:…"),
+        ("", "EPSG:…"),
+    ],
+)
+def test_the_map_of_a_scan_is_named_without_its_heights(wkt, code):
+    assert _code(SimpleNamespace(crs_wkt=wkt)) == code

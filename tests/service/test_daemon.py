@@ -253,7 +253,7 @@ def test_bad_scans_and_bugs_do_not_stop_the_service(write_site, start):
     assert report["counts"] == {"waiting": 0, "stored": 1, "set_aside": 4, "later": 1}
     assert {scan["scan"]: scan["reason"].split(":")[0] for scan in report["set_aside"]} == {
         "261120_bad.laz": "cut off",
-        "a\\nb.laz": "the name has spaces, control or other special characters, or is too long",
+        "a\\nb.laz": "the name has special characters, a space at its end, or is too long",
         "link.laz": "is a link",
         "pipe.laz": "is a pipe",
     }

@@ -30,18 +30,19 @@ def is_given(site: Site) -> bool:
 def registration(site: Site, position: PositionScan, warnings: list[str]) -> ScannerToMap | None:
     """Return the transformation to the map by the registration of a scan, None without one.
 
-    What is wrong with it is appended to `warnings`: the SOP places the scan then.
+    What is wrong with it is appended to `warnings`: the SOP places the scan then, if there is one.
     """
-    if site.registration is None or position.sop is None:
+    if site.registration is None or site.scans.frame == "map":
         return None
+    fallback = "placed by the SOP" if position.sop else "taken as it is"
     if position.matrix is None:
-        warnings.append("registration missing: placed by the SOP")
+        warnings.append(f"registration missing: {fallback}")
         return None
     try:
         matrix = registered_matrix(site, position.sop, position.matrix)
         return scanner_to_map(site, position.sop, matrix)
     except ConfigError as error:
-        warnings.append(f"registration unusable: placed by the SOP: {error}")
+        warnings.append(f"registration unusable: {fallback}: {error}")
         return None
 
 

@@ -1,6 +1,7 @@
 """Scans in RIEGL's database format (RDBX), read with RIEGL's library, which each user installs.
 
-Source: RIEGL, RDB library, Python bindings: rdb_open, select, attributes of points.
+Source: RIEGL, RDB library, Python bindings: rdb_open, select, attributes of points, statistics, as
+pylidar-tls-canopy (riegl_io.py) calls them.
 """
 
 from __future__ import annotations
