@@ -37,6 +37,8 @@ LOG_KEYS = {
     "scan": "name of the scan file",
     "verdict": "what became of the scan: good, degraded, unusable, set_aside, later, same, gone",
     "reason": "why, in a sentence",
+    "hook": "failed for this epoch, with the reason",
+    "epoch": "file of the epoch that the hook was run for",
     "mirror": "failed, with the reason; renewed, when a fault is gone",
     "points": "points read",
     "discarded_pct": "share of the points that are not the last return, withheld, or classified as noise [%]",

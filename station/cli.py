@@ -36,8 +36,8 @@ app = typer.Typer(
 COMMANDS = (
     check.init, check.check, process.process, retry.retry, reprocess.reprocess, run.run, run.status,
     simulate.simulate, simulate.demo, products.areas, products.trend, products.events, products.plot,
-    exports.export, products.serve, products.index, calibrate.calibrate, sensitivity.sensitivity,
-    papers.papers,
+    exports.export, run.publish, products.serve, products.index, calibrate.calibrate,
+    sensitivity.sensitivity, papers.papers,
 )  # fmt: skip
 for command in COMMANDS:
     app.command()(command)

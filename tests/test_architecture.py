@@ -47,8 +47,9 @@ def imported_modules(tree):
 
 def test_only_known_entries_at_the_top_level():
     expected = {
-        "station", "config", "systemd", "tests", "benchmarks", "docs", "pyproject.toml", "mkdocs.yml",
-        "requirements.lock", "README.md", "CHANGELOG.md", "CONTRIBUTING.md", "CITATION.cff", "LICENSE",
+        "station", "config", "systemd", "tests", "benchmarks", "docs", "pyproject.toml",
+        "mkdocs.yml", "requirements.lock", "README.md", "CHANGELOG.md", "CONTRIBUTING.md",
+        "CITATION.cff", "LICENSE",
     }  # fmt: skip
     generated = {"build", "dist", "site", "station-demo"}  # left by the README's and the docs' commands
     actual = {path.name for path in ROOT.iterdir() if not path.name.startswith(".")} - generated

@@ -1,4 +1,4 @@
-"""`station run` and `station status`."""
+"""`station run`, `station status` and `station publish`."""
 
 from __future__ import annotations
 
@@ -29,3 +29,15 @@ def status(site: SiteArgument, *, json_: Json = False) -> None:
 
     current = read_status(read_site(site))
     print(json.dumps(current, indent=2) if json_ else format_status(current))
+
+
+def publish(site: SiteArgument) -> None:
+    """Send what is new to the targets of [publish], run its hook and send its heartbeat.
+
+    Run every minute by a timer, beside the service. Exits with 1 if a target could not be reached; it gets
+    its files next time.
+    """
+    from station.config import read_site
+    from station.service.publication.run import publish_once
+
+    sys.exit(publish_once(read_site(site), print))

@@ -33,7 +33,7 @@ def target_urls(names: tuple[str, ...]) -> dict[str, str]:
     folder = os.environ.get("CREDENTIALS_DIRECTORY")
     if names and not folder:
         raise ConfigError(
-            f"alarms: no URL for {', '.join(names)}: $CREDENTIALS_DIRECTORY is not set. systemd sets it by"
+            f"no URL for {', '.join(names)}: $CREDENTIALS_DIRECTORY is not set. systemd sets it by"
             " LoadCredential= lines; by hand, set it to a folder with one file per name that contains its URL"
         )
     urls, faults = {}, []
@@ -42,7 +42,7 @@ def target_urls(names: tuple[str, ...]) -> dict[str, str]:
         try:
             urls[name] = path.read_text(encoding="utf-8").strip()
         except (OSError, UnicodeDecodeError) as error:
-            faults.append(f"alarms: target {name}: no URL in {path}: {error}")
+            faults.append(f"target {name}: no URL in {path}: {error}")
     if faults:
         raise ConfigError("\n".join(faults))
     return urls

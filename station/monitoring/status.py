@@ -92,6 +92,7 @@ def _queue_status(site: Site, journal: JournalReader, entries: list[Entry]) -> S
         *site.input_faults,
         weather_fault(site),
         *(_renewal_fault(site, name) for name in RENEWALS),
+        *_publish_faults(site),
         pause_reason(site.station.data),
     )
     return {
@@ -114,6 +115,19 @@ def _renewal_fault(site: Site, name: str) -> str:
     except (OSError, ValueError):
         return ""
     return fault and f"{RENEWALS[name]} not up to date: {fault}"
+
+
+def publish_folder(site: Site) -> Path:
+    """Return the folder of `station publish`; its file `faults` has a line for all that failed last time."""
+    return site.station.data / "publish"
+
+
+def _publish_faults(site: Site) -> list[str]:
+    try:
+        text = (publish_folder(site) / "faults").read_text(encoding="utf-8") if site.publish else ""
+    except (OSError, ValueError):
+        return []
+    return [f"not published: {line}" for line in text.splitlines()]
 
 
 def _service_state(data: Path) -> str:

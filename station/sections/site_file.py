@@ -21,6 +21,7 @@ from station.sections.inputs import (
     SopSection,
     WeatherSection,
 )
+from station.sections.publish import PublishSection
 from station.sections.results import (
     AdjustmentSection,
     AlarmsSection,
@@ -63,6 +64,7 @@ class SiteFile(Section):
     service: ServiceSection = ServiceSection()
     products: ProductsSection = ProductsSection()
     mirror: MirrorSection | None = None
+    publish: PublishSection | None = None
     alarms: AlarmsSection | None = None
 
     @model_validator(mode="after")

@@ -68,6 +68,19 @@ def test_alarms_have_their_own_unit_and_timer(analyze, service_unit):
     assert limit_s > 2 * SEND_TIMEOUT_S + 60  # alarms, then the digest
 
 
+def test_publishing_can_write_to_its_own_folder_only(analyze, service_unit):
+    service, timer = (service_unit.with_name(f"station-publish@.{kind}") for kind in ("service", "timer"))
+    result = analyze("verify", str(service), str(timer))
+    assert (result.returncode, result.stderr) == (0, "")
+    report = analyze("security", "--offline=yes", str(service)).stdout
+    assert float(re.search(r"Overall exposure level for \S+: ([\d.]+)", report).group(1)) <= 1.5
+    text = service.read_text()
+    assert re.findall(r"^(?:StateDirectory|ReadWritePaths|ProtectSystem)=.*", text, re.MULTILINE) == [
+        "StateDirectory=station/%i/publish",
+        "ProtectSystem=strict",
+    ]
+
+
 def test_metrics_drop_in_opens_only_the_loopback(analyze, service_unit, tmp_path):
     (tmp_path / "station@.service.d").mkdir()
     copied_unit = shutil.copy(service_unit, tmp_path)
