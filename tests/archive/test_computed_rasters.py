@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from datetime import UTC, datetime
+from xml.etree import ElementTree as ET
 
 import h5py
 import netCDF4
@@ -149,3 +150,13 @@ def test_the_elevation_without_its_reference_is_refused(mixed):
         assert np.isfinite(ds.elevation[0, 20, 20])  # an old file has it
         with pytest.raises(StoreError, match=r"reference_1\.nc is missing"):
             ds.elevation[1, 20, 20].load()
+
+
+def test_ncml_leaves_out_what_some_files_lack(mixed, tmp_path):
+    """netCDF-Java 5.3 reads as zero what a file of a joined dataset lacks: tried on these files."""
+    selection = select(mixed, Span.parse(None, None))
+    parts = split(selection, tmp_path / "series.ncml", ".ncml", None)
+    (path,) = FORMATS["ncml"].write(selection, parts, lambda _: None, lambda _: None)
+    root = ET.parse(path).getroot()  # noqa: S314 - just written
+    removed = {child.get("name") for child in root if child.tag.endswith("remove")}
+    assert removed == {*NAMES, "elevation_outside_reference", "shared_parameter_redundancy"}
