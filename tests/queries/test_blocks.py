@@ -121,9 +121,7 @@ def test_a_block_of_an_epoch_has_the_sigma_of_the_mean_of_its_cells(base, index)
         exact_m = station.variance(base.folder, mask, index) ** 0.5
         assert exact_m > 1.3 * RANDOM_M / np.sqrt(count)  # shared errors count
         assert block.elevation_change_uncertainty == pytest.approx(exact_m, rel=0.01)
-        assert block.elevation_change_random_uncertainty == pytest.approx(
-            RANDOM_M / np.sqrt(count), rel=0.02
-        )
+        assert block.elevation_change_random_uncertainty == pytest.approx(RANDOM_M / np.sqrt(count), rel=0.02)
     assert np.isnan(blocks.elevation_change[15, 3])
     assert blocks.coverage[15, 3].isnull()
 
