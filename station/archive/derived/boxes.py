@@ -1,8 +1,8 @@
 """`boxes.nc`, `daily.nc` and `blocks/`: change of blocks of cells over time with its σ, from the epochs.
 
 Ordinary files, which any program reads. They grow by one entry after the other: a new one is appended to a
-copy, which then replaces the file. `blocks/` has a file for each day, because those of a year are too large to
-copy. The name of such a file ends in a part of the hash of everything that it was computed from.
+copy, which then replaces the file. `blocks/` has a file for each day, because those of a year are too large
+to copy. The name of such a file ends in a part of the hash of everything that it was computed from.
 """
 
 from __future__ import annotations
@@ -221,8 +221,8 @@ def update_blocks(
 
     `compute` returns the rasters of the entry at an index; those already in the file are copied, unless it is
     damaged. `older` is the file to copy them from, if it has another name. Returns None and writes nothing
-    without entries. `progress` is called after each entry written. Raises StoreError if an epoch is damaged or
-    the file cannot be written; the old file remains.
+    without entries. `progress` is called after each entry written. Raises StoreError if an epoch is damaged
+    or the file cannot be written; the old file remains.
     """
     path = series.folder / block_file.name
     if not len(entries):

@@ -50,7 +50,7 @@ def write_ncml(
 ) -> Iterator[Path]:
     """Write NcML that joins the files of each part along time, with paths relative to it; yield the paths.
 
-    Variables that some of the files lack, of older versions, are left out: netCDF-Java would serve them as zero.
+    Variables that some of the files lack, of older versions, are left out: netCDF-Java serves them as zero.
     Raises StationError while a late scan or a revision lies within the time of another file.
     """
     require_whole_grid(selection)
