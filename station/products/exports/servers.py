@@ -86,7 +86,7 @@ def _differing_variables(paths: Collection[Path]) -> list[str]:
     for path in paths:
         with read_errors(path), netCDF4.Dataset(path) as file:
             shapes.append({(name, variable.shape[1:]) for name, variable in file.variables.items()})
-    return sorted({name for name, _ in set.union(*shapes) - set.intersection(*shapes)})
+    return sorted({name for name, _ in shapes[0].union(*shapes) - shapes[0].intersection(*shapes)})
 
 
 def write_erddap(
