@@ -12,9 +12,10 @@ from support.epochs import GRID, make_epoch
 
 import station
 from station.archive.compaction import compact
+from station.archive.derived import computed_rasters
 from station.archive.epochs import write_epoch
 from station.archive.raster_io import rounded
-from station.archive.reference_files import write_reference
+from station.archive.reference_files import mean_elevation, write_reference
 from station.archive.schema import BY_NAME, FILL
 from station.archive.series.index import list_epochs
 from station.archive.series.virtual import build_series
@@ -125,6 +126,20 @@ def test_an_export_of_old_and_new_epochs_has_the_values_of_the_series(mixed, tmp
     with station.open(mixed.folder) as ds, netCDF4.Dataset(path) as file:
         for name in NAMES:
             assert np.array_equal(np.ma.filled(file[name][:], np.nan), ds[name], equal_nan=True)
+
+
+def test_the_reference_is_read_once_for_all_epochs_of_an_export(mixed, tmp_path, monkeypatch):
+    windows = []
+
+    def recorded(*arguments):
+        windows.append(arguments)
+        return mean_elevation(*arguments)
+
+    monkeypatch.setattr(computed_rasters, "mean_elevation", recorded)
+    selection = select(mixed, Span.parse(None, None), variables="elevation")
+    parts = split(selection, tmp_path / "all.nc", ".nc", None)
+    list(FORMATS["netcdf"].write(selection, parts, lambda _: None, lambda _: None))
+    assert len(windows) == 1
 
 
 def test_boxes_of_an_old_and_of_a_new_epoch_of_the_same_values_are_equal(mixed):

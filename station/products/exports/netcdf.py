@@ -74,10 +74,16 @@ def _write_raster(contents: PartContents, spec: Variable, target: Any, advance: 
         return
     cells = int(np.prod(contents.shape[1:])) * len(contents.rasters)
     write = _deflate_block if target.chunks[0] == 1 else _write_block
-    for block in contents.blocks(target.chunks):
+    for block in sorted(contents.blocks(target.chunks), key=_place_first):
         values = contents.read(spec, block)
         write(target, block, values)
         advance(values.size / cells)
+
+
+def _place_first(block: Block) -> tuple[int, int, int]:
+    """Key of an order in which all epochs of a window follow each other: their reference is read once."""
+    times, rows, columns = block
+    return rows.start, columns.start, times.start
 
 
 def _deflate_block(target: Any, block: Block, values: Any) -> None:  # noqa: ANN401
