@@ -243,6 +243,11 @@ class _RepeatedBlocks(BlockQueries):
         super().__init__(series)
         newest = SeriesIndex(series)[-1]
         self._boxes, self._mean = super().boxes(newest), super().daily_mean([newest])
+        self._single = super().single(newest)
+
+    def single(self, epoch: epochs.EpochRef) -> Rasters:  # noqa: ARG002
+        """Return the blocks of the newest epoch."""
+        return self._single
 
     def boxes(self, epoch: epochs.EpochRef) -> Rasters:  # noqa: ARG002 - all epochs are alike
         """Return the boxes of the newest epoch."""

@@ -236,7 +236,7 @@ def _variables() -> str:
         ("`series.nc`", [row for row in VARIABLES if row.is_result]),
         ("`processing.nc`", [row for row in VARIABLES if not row.is_result]),
         ("`areas.nc`", AREA_VARIABLES),
-        ("`boxes.nc` and `daily.nc`", DAILY_VARIABLES),
+        ("`boxes.nc`, `blocks/` and `daily.nc`", DAILY_VARIABLES),
     ):
         rows = [
             (

@@ -42,6 +42,7 @@ class ProcessedStation:
                 assert old in text
                 text = text.replace(old, new)
             (folder / "other.toml").write_text(text)
+        self.folder = folder
         self.site = read_site(folder / ("other.toml" if changes else "site.toml"))
         scans = []
         for path in sorted(self.site.scans.inbox.glob("*.laz")):
@@ -156,6 +157,53 @@ def test_adjustment_is_as_accurate_as_manual_registration(calm):
     assert 0.8 < rms(error / sigma) < 1.25
     assert {result.verdict for result in calm.results} == {"good"}
     assert calm.series.adjustment.values.tolist() == ["joint"] * 3
+
+
+def test_boxes_in_their_file_are_calibrated_and_the_bound_is_above_their_error(calm):
+    """The bound is that of the files' comments, by which other programs average cells."""
+    with xr.open_dataset(calm.site.station.data / "boxes.nc") as boxes:
+        sigma_m = boxes.elevation_change_uncertainty.values
+        chosen = (boxes.coverage > 0.6).values
+    cells = xr.Dataset(
+        {
+            "error_m": calm.series.elevation_change.copy(data=calm.error()),
+            "systematic_m": calm.series.elevation_change_systematic_uncertainty,
+            "random_m2": calm.series.elevation_change_random_uncertainty**2,
+            "stable": calm.series.elevation_change.copy(
+                data=np.broadcast_to(1.0 * calm.stable, calm.error().shape)
+            ),
+        }
+    )
+    blocks = cells.coarsen(y=BOX, x=BOX, boundary="pad")
+    mean, count = blocks.mean(), blocks.count().error_m
+    bound_m = np.sqrt(mean.random_m2 / count + mean.systematic_m**2).values
+    chosen &= (mean.stable == 0).values
+    error_m, sigma_m, bound_m = (values[chosen] for values in (mean.error_m.values, sigma_m, bound_m))
+    assert 0.8 < rms(error_m / sigma_m) < 1.25
+    assert (bound_m > 0.99 * sigma_m).all()
+    assert 0.1 < rms(error_m / bound_m) < 0.9
+    assert np.mean(np.abs(error_m) < 2 * bound_m) > 0.99
+    assert np.median(bound_m / sigma_m) < 6
+
+
+def test_blocks_of_single_scans_are_calibrated(calm):
+    """Cells of 5 m, so that a block of 10 m is a cell of the truth."""
+    fine = ProcessedStation(calm.folder, ("cell_m = 10.0", "cell_m = 5.0"))
+    folder = fine.site.station.data
+    (path,) = folder.glob("blocks/*/*.nc")
+    with xr.open_dataset(path) as blocks:
+        error_m = blocks.elevation_change.values - fine.true_change
+        sigma_m = blocks.elevation_change_uncertainty.values
+        whole = (blocks.coverage == 1).values & ~fine.stable
+    z = error_m / sigma_m
+    assert np.count_nonzero(whole) > 10_000
+    assert 0.8 < np.std(np.clip(z[whole], -5, 5)) < 1.25
+    for epoch, row, column in np.argwhere(whole)[:: np.count_nonzero(whole) // 12]:
+        mask = np.zeros((2 * whole.shape[1], 2 * whole.shape[2]), bool)
+        mask[2 * row : 2 * row + 2, 2 * column : 2 * column + 2] = True
+        exact_m = np.sqrt(fine.aggregates.variance(mask / 4, fine.aggregates.find_epoch(int(epoch))))
+        ratio = sigma_m[epoch, row, column] / exact_m
+        assert 0.98 < ratio < 1.12  # near the scanner a block spans several scan lines, taken as one
 
 
 def test_uncertainty_of_cells_and_areas_is_calibrated(calm):

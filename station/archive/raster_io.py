@@ -46,7 +46,7 @@ def write_rasters(
         *_, height, width = chunk = datasets[0].get_create_plist().get_chunk()
         for top in range(0, ny, height):
             for dataset, values in zip(datasets, get_rows(slice(top, min(top + height, ny))), strict=True):
-                for first_column, deflated in _deflated_chunks((height, width), values):
+                for first_column, deflated in deflated_chunks((height, width), values):
                     dataset.write_direct_chunk((0, top, first_column)[-len(chunk) :], deflated)
 
 
@@ -61,8 +61,11 @@ def rounded(spec: Variable, values: Array) -> Array:
     return values.astype(spec.dtype, copy=False)
 
 
-def _deflated_chunks(chunk_shape: tuple[int, int], band: Array) -> Iterator[tuple[int, bytes]]:
-    """Yield first column and compressed bytes of each chunk with any value in a block of rows."""
+def deflated_chunks(chunk_shape: tuple[int, int], band: Array) -> Iterator[tuple[int, bytes]]:
+    """Yield first column and compressed bytes of each chunk with any value in a row of chunks.
+
+    `band` (r, c) has at most as many rows as a chunk, and fill values where there is none.
+    """
     width = chunk_shape[1]
     for first in range(0, band.shape[1], CHUNKS_PER_BLOCK * width):
         chunks = _split_chunks(band[:, first : first + CHUNKS_PER_BLOCK * width], chunk_shape)

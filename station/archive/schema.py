@@ -113,7 +113,8 @@ VARIABLES: tuple[Variable, ...] = (
         "f4",
         "uncertainty of the elevation change",
         "m",
-        comment=f"{_ONE_SIGMA}, two digits or more; {SAFE_BOUND}; boxes.nc and station.variance are exact",
+        comment=f"{_ONE_SIGMA}, two digits or more; {SAFE_BOUND}; boxes.nc, blocks/ and station.variance are"
+        " exact",
     ),
     Variable(
         "elevation_change_systematic_uncertainty",

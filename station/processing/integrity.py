@@ -15,7 +15,7 @@ import numpy as np
 
 from station.archive.areas import FILE_NAME as AREAS
 from station.archive.atomic_files import DAMAGED
-from station.archive.derived.boxes import BOXES, DAILY
+from station.archive.derived.boxes import BOXES, DAILY, block_files
 from station.archive.derived.event_table import FILE_NAME as EVENTS
 from station.archive.derived.fingerprints import is_intact as is_derived_intact
 from station.archive.derived.level_files import damaged_levels
@@ -279,6 +279,12 @@ def _check_derived(series: Series) -> list[tuple[str, str, str]]:
     paths += [path for path in derived if path.exists() and not is_derived_intact(path)]
     message = "damaged: the service restores it with the next scan"
     findings = [("fault", "file", f"{path.relative_to(series.folder)}: {message}") for path in paths]
+    message = "damaged: delete it, the service computes it again with the next scan"
+    findings += [
+        ("fault", "file", f"{path.relative_to(series.folder)}: {message}")
+        for path in sorted(block_files(series))
+        if not is_derived_intact(path)
+    ]
     message = "damaged: station reprocess computes it again"
     return findings + [
         ("fault", "file", f"{path.relative_to(series.folder)}: {message}") for path in damaged_levels(series)

@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from station.archive.derived.boxes import DAILY_BLOCK_M
+from station.archive.derived.boxes import BLOCK_M
 from station.archive.derived.computed_rasters import CHANGE, RANDOM, open_raster
 from station.archive.epochs import EpochRef
 from station.archive.netcdf_layout import CHUNK, Series
@@ -34,7 +34,7 @@ Sums = dict[str, Floats]  # (by, bx) by name
 
 def cells_per_block(grid: Grid) -> int:
     """Return the rows and columns of a block."""
-    return max(round(DAILY_BLOCK_M / grid.cell_m), 1)
+    return max(round(BLOCK_M / grid.cell_m), 1)
 
 
 class EpochSummer:

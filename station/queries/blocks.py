@@ -9,6 +9,7 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from itertools import combinations
 from typing import Any
 
@@ -17,11 +18,13 @@ from scipy import sparse
 
 from station.archive.derived.boxes import (
     BOX_M,
+    DAY_S,
     Entries,
     Rasters,
     box_file,
     daily_file,
     update_blocks,
+    update_days,
 )
 from station.archive.derived.computed_rasters import CHANGE, RANDOM, TOTAL
 from station.archive.epochs import EpochRef
@@ -37,7 +40,7 @@ from station.science.uncertainty.common_mode import cross_covariance
 from station.science.uncertainty.jacobian import HeightJacobian, height_jacobian
 from station.science.uncertainty.propagation import difference_to_reference
 
-DAY_S = 86_400.0
+CACHED_EPOCHS = 2  # whose blocks are in memory
 MIN_GRADIENT_BLOCKS = 0.5  # one sigma of the Gaussian
 
 
@@ -92,8 +95,23 @@ class BlockQueries:
     def __init__(self, series: Series) -> None:
         self._reader, self._series = EpochReader(series), series
         self._surfaces: dict[str, Sums] = {}  # by version of the reference
+        self.read = lru_cache(CACHED_EPOCHS)(self._read)
         self.cells = cells_per_block(series.grid)  # rows and columns of a block
         self.blocks_per_box = max(round(BOX_M / (self.cells * series.grid.cell_m)), 1)
+
+    def single(self, epoch: EpochRef) -> Rasters:
+        """Return the rasters of a file of `blocks/` of an epoch."""
+        blocks = self.read(epoch)
+        variance_m2 = blocks.random_m2.copy()
+        if blocks.jacobian is not None and blocks.shared is not None:
+            variance_m2[blocks.observed] += blocks.jacobian.variance(blocks.shared)
+        rasters = {
+            CHANGE: blocks.change_m,
+            TOTAL: np.sqrt(variance_m2),
+            RANDOM: np.sqrt(blocks.random_m2),
+            "coverage": blocks.count / self.cells**2,
+        }
+        return {name: np.where(blocks.observed, v, np.nan) for name, v in rasters.items()}
 
     def boxes(self, epoch: EpochRef) -> Rasters:
         """Return the rasters of `boxes.nc` of an epoch."""
@@ -154,7 +172,7 @@ class BlockQueries:
             "epoch_count": epoch_count
         }
 
-    def read(self, epoch: EpochRef) -> Blocks:
+    def _read(self, epoch: EpochRef) -> Blocks:
         """Return the blocks of an epoch."""
         epoch_cells = self._reader.read_shared(epoch)
         sums, surface = epoch_sums(self._series, epoch), self._reference_sums(epoch_cells.reference)
@@ -271,7 +289,7 @@ def _covariance_between(first: EpochCells, second: EpochCells) -> Floats | None:
 def update_boxes(
     series: Series, queries: BlockQueries, progress: Callable[[], None], keep: Collection[str] = ()
 ) -> None:
-    """Bring `boxes.nc` and `daily.nc` up to date with the epochs of `series.nc` that have a reference.
+    """Bring `boxes.nc`, `blocks/` and `daily.nc` up to date with the epochs that have a reference.
 
     A day is in `daily.nc` when a later day has begun; unusable epochs do not count. The sums of the epochs
     named in `keep` are kept, as those of the last day are. Raises as `update_blocks`.
@@ -282,11 +300,19 @@ def update_boxes(
     versions, usable = references_and_usable(series)
     measured = np.flatnonzero(versions != b"")
     start_s, end_s = index.start_s, 2 * index.time_s - index.start_s
+    entries = Entries(start_s[measured], end_s[measured], index.epoch_file[measured], versions[measured])
     update_blocks(
         series,
         box_file(series.grid, queries.cells * queries.blocks_per_box),
-        Entries(start_s[measured], end_s[measured], index.epoch_file[measured], versions[measured]),
+        entries,
         lambda entry: queries.boxes(index[int(measured[entry])]),
+        progress,
+    )
+    update_days(
+        series,
+        queries.cells,
+        entries,
+        lambda entry: queries.single(index[int(measured[entry])]),
         progress,
     )
     days = list(_closed_days(start_s // DAY_S, measured, usable, versions))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from functools import lru_cache, partial
@@ -72,6 +72,8 @@ class EventQueries:
         self._series, self._queries, self._scans_per_year = series, queries, YEAR_S / expected_every_s
         self._index = SeriesIndex(series)
         self._usable = self._usable_epochs()
+        epoch_files = self._index.epoch_file[[position for position, _ in self._usable]]
+        self._names = [name.decode() for name in epoch_files.tolist()]  # once: they are in many keys
         self._reader = EpochReader(series)
         self._shared = lru_cache(CACHED_EPOCHS)(self._read_shared)
         self._levels = lru_cache(HISTORY + 2)(self._read_levels)
@@ -126,7 +128,7 @@ class EventQueries:
         for track in tracks:
             if track.is_open(newest):
                 needed.update(self._window(track.first))
-        return {self._index[self._usable[number][0]].epoch_file for number in needed if number >= 0}
+        return {self._names[number] for number in needed if number >= 0}
 
     def _detections(self, progress: Callable[[], None]) -> Iterator[tuple[int, list[Region]]]:
         for scan in range(len(self._usable)):
@@ -136,21 +138,21 @@ class EventQueries:
             texts = self._remember(self._key("regions", window), partial(self._search, window, progress))
             yield scan, [Region(decode_blocks(blocks, self.grid.shape), *values) for blocks, *values in texts]
 
-    def _window(self, scan: int) -> list[int]:
+    def _window(self, scan: int) -> range:
         """Return the scans up to this one that are compared: as long as the reference is the same."""
         version = self._usable[scan][1]
         first = max(scan - HISTORY - 1, 0)
         while self._usable[first][1] != version:
             first += 1
-        return list(range(first, scan + 1))
+        return range(first, scan + 1)
 
     def _remember(self, key: str, compute: Callable[[], Any]) -> Any:  # noqa: ANN401 - anything JSON can hold
         if key not in self._used:
             self._used[key] = self._found[key] if key in self._found else compute()
         return self._used[key]
 
-    def _key(self, kind: str, scans: list[int], *texts: str) -> str:
-        names = [self._index.epoch_file[self._usable[scan][0]].decode() for scan in scans]
+    def _key(self, kind: str, scans: Sequence[int], *texts: str) -> str:
+        names = [self._names[scan] for scan in scans]
         parts = [kind, f"{self._scans_per_year:.6g}", self._usable[scans[-1]][1], *names, *texts]
         return hashlib.sha256("\n".join(parts).encode()).hexdigest()[:32]
 
@@ -170,7 +172,7 @@ class EventQueries:
     def _read_shared(self, scan: int) -> EpochCells:
         return self._reader.read_shared(self._index[self._usable[scan][0]])
 
-    def _search(self, window: list[int], progress: Callable[[], None]) -> list[list[Any]]:
+    def _search(self, window: range, progress: Callable[[], None]) -> list[list[Any]]:
         """Return the regions that the two newest scans of a window show: encoded blocks, and the rest."""
         *history, first, second = window
         before = history[-BEFORE:]
@@ -289,7 +291,7 @@ class EventQueries:
         key = self._key("volume", [*before, *after], *texts)
         return _Volume(*self._remember(key, lambda: self._measure(track, others, before, after)))
 
-    def _measure(self, track: Track, others: Bools, before: list[int], after: list[int]) -> list[float]:
+    def _measure(self, track: Track, others: Bools, before: range, after: list[int]) -> list[float]:
         """Return the volume of an event and its σ [m³], from the scans before and after it.
 
         A widespread event counts in full, another one less what its surroundings did. Blocks within it that

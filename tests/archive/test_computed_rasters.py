@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from datetime import UTC, datetime
+from xml.etree import ElementTree as ET
 
 import h5py
 import netCDF4
@@ -11,9 +12,10 @@ from support.epochs import GRID, make_epoch
 
 import station
 from station.archive.compaction import compact
+from station.archive.derived import computed_rasters
 from station.archive.epochs import write_epoch
 from station.archive.raster_io import rounded
-from station.archive.reference_files import write_reference
+from station.archive.reference_files import mean_elevation, write_reference
 from station.archive.schema import BY_NAME, FILL
 from station.archive.series.index import list_epochs
 from station.archive.series.virtual import build_series
@@ -126,6 +128,20 @@ def test_an_export_of_old_and_new_epochs_has_the_values_of_the_series(mixed, tmp
             assert np.array_equal(np.ma.filled(file[name][:], np.nan), ds[name], equal_nan=True)
 
 
+def test_the_reference_is_read_once_for_all_epochs_of_an_export(mixed, tmp_path, monkeypatch):
+    windows = []
+
+    def recorded(*arguments):
+        windows.append(arguments)
+        return mean_elevation(*arguments)
+
+    monkeypatch.setattr(computed_rasters, "mean_elevation", recorded)
+    selection = select(mixed, Span.parse(None, None), variables="elevation")
+    parts = split(selection, tmp_path / "all.nc", ".nc", None)
+    list(FORMATS["netcdf"].write(selection, parts, lambda _: None, lambda _: None))
+    assert len(windows) == 1
+
+
 def test_boxes_of_an_old_and_of_a_new_epoch_of_the_same_values_are_equal(mixed):
     epoch, _ = sloping_epoch(1)  # in an old file in the series
     old = BlockQueries(mixed).boxes(list_epochs(mixed)[0])
@@ -149,3 +165,13 @@ def test_the_elevation_without_its_reference_is_refused(mixed):
         assert np.isfinite(ds.elevation[0, 20, 20])  # an old file has it
         with pytest.raises(StoreError, match=r"reference_1\.nc is missing"):
             ds.elevation[1, 20, 20].load()
+
+
+def test_ncml_leaves_out_what_some_files_lack(mixed, tmp_path):
+    """netCDF-Java 5.3 reads as zero what a file of a joined dataset lacks: tried on these files."""
+    selection = select(mixed, Span.parse(None, None))
+    parts = split(selection, tmp_path / "series.ncml", ".ncml", None)
+    (path,) = FORMATS["ncml"].write(selection, parts, lambda _: None, lambda _: None)
+    root = ET.parse(path).getroot()  # noqa: S314 - just written
+    removed = {child.get("name") for child in root if child.tag.endswith("remove")}
+    assert removed == {*NAMES, "elevation_outside_reference", "shared_parameter_redundancy"}

@@ -1,6 +1,7 @@
-"""`boxes.nc` and `daily.nc`: σ of blocks against the propagation over all their cells, and how they grow."""
+"""Files of blocks: σ against the propagation over all their cells, and how the files grow."""
 
 import shutil
+from contextlib import ExitStack
 from dataclasses import replace
 
 import numpy as np
@@ -100,11 +101,37 @@ def test_boxes_have_the_sigma_of_the_mean_of_their_cells(base, index):
             )
 
 
+def days(series):
+    """Return the files in `blocks/` and what they contain."""
+    paths = sorted((series.folder / "blocks").glob("*/*.nc"))
+    with ExitStack() as stack:
+        return paths, [stack.enter_context(xr.open_dataset(path)).load() for path in paths]
+
+
+@pytest.mark.parametrize("index", [0, 4])
+def test_a_block_of_an_epoch_has_the_sigma_of_the_mean_of_its_cells(base, index):
+    blocks = xr.concat(days(base)[1], "time", data_vars="minimal", join="exact").isel(time=index)
+    changes = station.open(base.folder).elevation_change[index].values
+    assert (blocks.x[1] - blocks.x[0], blocks.y[0] - blocks.y[1]) == (10, 10)
+    for row, column in ((0, 0), (3, 4), (10, 20), (17, 25), (11, 12)):
+        mask, block = box_mask(row, column, 5), blocks.isel(y=row, x=column)
+        assert block.elevation_change == pytest.approx(np.nanmean(changes[mask]), abs=1e-4)
+        count = np.isfinite(changes[mask]).sum()
+        assert block.coverage == pytest.approx(count / 25, abs=1e-3)
+        exact_m = station.variance(base.folder, mask, index) ** 0.5
+        assert exact_m > 1.3 * RANDOM_M / np.sqrt(count)  # shared errors count
+        assert block.elevation_change_uncertainty == pytest.approx(exact_m, rel=0.01)
+        assert block.elevation_change_random_uncertainty == pytest.approx(RANDOM_M / np.sqrt(count), rel=0.02)
+    assert np.isnan(blocks.elevation_change[15, 3])
+    assert blocks.coverage[15, 3].isnull()
+
+
 def test_times_are_those_of_the_series(base):
     boxes, daily = read(base, "boxes.nc"), read(base, "daily.nc")
     with station.open(base.folder) as ds:
         assert (boxes.time == ds.time).all()
         assert (boxes.time_bnds.values == ds.time_bnds.values).all()
+        assert np.concatenate([day.time for day in days(base)[1]]).tolist() == ds.time.values.tolist()
     assert (daily.time.values == np.array(["2025-11-21T12"], "M8[ns]")).all()  # the next day is not over
     assert daily.time_bnds.values[0, 1] == np.datetime64("2025-11-22")
 
@@ -138,10 +165,9 @@ def test_a_daily_mean_has_the_sigma_of_three_epochs(base):
 
 def test_only_new_epochs_are_computed_and_the_result_is_that_of_a_new_file(stored, monkeypatch):
     computed = []
-    original = BlockQueries.boxes
-    monkeypatch.setattr(
-        BlockQueries, "boxes", lambda self, epoch: computed.append(epoch.epoch_file) or original(self, epoch)
-    )
+    for name in ("boxes", "single"):
+        monkeypatch.setattr(BlockQueries, name, recorded(getattr(BlockQueries, name), computed))
+    old_days = days(stored)[0]
     update_boxes(stored, BlockQueries(stored), lambda: None)
     assert computed == []
     added = [epochs.write_epoch(stored, make_epoch(hour)).path.name for hour in (49, 3)]  # the second is late
@@ -149,16 +175,52 @@ def test_only_new_epochs_are_computed_and_the_result_is_that_of_a_new_file(store
     build_series(stored)
     licensed = replace(stored, metadata=(("license", "CC-BY-4.0"),))
     update_boxes(licensed, BlockQueries(licensed), lambda: None)
-    assert sorted(computed) == sorted([*added, replaced])
+    assert sorted(computed) == sorted(2 * [*added, replaced])
+    new_days, contents = days(stored)
+    assert [path.name[4:12] for path in new_days] == ["20251121", "20251122", "20251123"]
+    assert len(old_days) == 2
+    assert set(old_days) & set(new_days) == {old_days[1]}
+    assert [len(day.time) for day in contents] == [4, 2, 1]
     grown = [read(stored, name) for name in ("boxes.nc", "daily.nc")]
     assert grown[0].attrs["license"] == "CC-BY-4.0"
     assert grown[0].sources.values.tolist() == [epoch.epoch_file for epoch in SeriesIndex(stored)]
     assert grown[1].epoch_count.max(("y", "x")).values.tolist() == [3, 2]  # unusable epochs do not count
     for name in ("boxes.nc", "daily.nc"):
         (stored.folder / name).unlink()
+    shutil.rmtree(stored.folder / "blocks")
     update_boxes(stored, BlockQueries(stored), lambda: None)
     for name, old in zip(("boxes.nc", "daily.nc"), grown, strict=True):
         xr.testing.assert_equal(read(stored, name), old)
+    paths, rebuilt = days(stored)
+    assert paths == new_days
+    for day, old in zip(rebuilt, contents, strict=True):
+        xr.testing.assert_equal(day, old)
+
+
+def recorded(method, computed):
+    def compute(self, epoch):
+        computed.append(epoch.epoch_file)
+        return method(self, epoch)
+
+    return compute
+
+
+def test_a_damaged_file_of_a_day_is_not_copied_from(stored):
+    """The first day gets a late epoch; the file of the second day stays as it is until it is deleted."""
+    paths, _ = days(stored)
+    for path in paths:
+        content = bytearray(path.read_bytes())
+        content[len(content) // 2] ^= 1
+        path.write_bytes(content)
+    epochs.write_epoch(stored, make_epoch(3))
+    build_series(stored)
+    update_boxes(stored, BlockQueries(stored), lambda: None)
+    new_paths = sorted((stored.folder / "blocks").glob("*/*.nc"))
+    assert [is_intact(path) for path in new_paths] == [True, False]
+    new_paths[1].unlink()
+    update_boxes(stored, BlockQueries(stored), lambda: None)
+    assert [is_intact(path) for path in days(stored)[0]] == [True, True]
+    assert len(list((stored.folder / "blocks/2025").iterdir())) == 4  # with their fingerprints
 
 
 def keep(series, epoch, rows_at_once=7):

@@ -1,15 +1,20 @@
-"""`boxes.nc` and `daily.nc`: change of blocks of cells over time with its σ, computed from the epochs.
+"""`boxes.nc`, `daily.nc` and `blocks/`: change of blocks of cells over time with its σ, from the epochs.
 
 Ordinary files, which any program reads. They grow by one entry after the other: a new one is appended to a
-copy, which then replaces the file.
+copy, which then replaces the file. `blocks/` has a file for each day, because those of a year are too large
+to copy. The name of such a file ends in a part of the hash of everything that it was computed from.
 """
 
 from __future__ import annotations
 
+import hashlib
 import shutil
 from collections.abc import Callable, Mapping
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from dataclasses import dataclass, replace
+from datetime import UTC, datetime
+from functools import partial
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +24,7 @@ import numpy as np
 
 from station.archive.atomic_files import atomic_write
 from station.archive.chunk_codec import read_column
-from station.archive.derived.fingerprints import is_intact, write_fingerprints
+from station.archive.derived.fingerprints import fingerprints_path, is_intact, write_fingerprints
 from station.archive.discovery import time_coverage
 from station.archive.netcdf_layout import (
     TIMES_PER_CHUNK,
@@ -37,8 +42,10 @@ from station.quantities import Floats, Grid
 Array = np.ndarray[Any, Any]
 Rasters = Mapping[str, Array]
 
-BOXES, DAILY = "boxes.nc", "daily.nc"
-BOX_M, DAILY_BLOCK_M = 100.0, 10.0
+BOXES, DAILY, BLOCKS = "boxes.nc", "daily.nc", "blocks"
+BOX_M, BLOCK_M = 100.0, 10.0
+DAY_S = 86_400.0
+KEY_DIGITS = 8  # of the hash in the name of a file of a day
 _SOURCES = Variable("sources", TEXT, "S1", "name of the epoch file, or SHA-256 of the names of several")
 _KEYS = (_SOURCES, BY_NAME["reference_version"])
 
@@ -47,7 +54,7 @@ _KEYS = (_SOURCES, BY_NAME["reference_version"])
 class BlockFile:
     """A file of blocks of cells."""
 
-    name: str
+    name: str  # relative to the data folder
     title: str
     time: str  # what the time is
     grid: Grid  # of the blocks
@@ -66,6 +73,11 @@ class Entries:
     def __len__(self) -> int:
         """Return the number of entries."""
         return len(self.start_s)
+
+    def __getitem__(self, chosen: slice) -> Entries:
+        """Return some of the entries."""
+        columns = (self.start_s, self.end_s, self.sources, self.reference_version)
+        return Entries(*(column[chosen] for column in columns))
 
     @property
     def keys(self) -> Array:
@@ -133,6 +145,15 @@ def box_file(grid: Grid, cells: int) -> BlockFile:
     return BlockFile(BOXES, title, "middle of the scan", _coarse(grid, cells), BOX_VARIABLES)
 
 
+def day_file(series: Series, cells: int, entries: Entries) -> BlockFile:
+    """Return the description of a file in `blocks/`: blocks of `cells` × `cells`, the epochs of a day."""
+    day = f"{datetime.fromtimestamp(entries.start_s[0], UTC):%Y%m%d}"
+    key = hashlib.sha256(entries.keys.tobytes()).hexdigest()[:KEY_DIGITS]
+    return replace(
+        box_file(series.grid, cells), name=f"{BLOCKS}/{day[:4]}/{series.station_id}_{day}_{key}.nc"
+    )
+
+
 def daily_file(grid: Grid, cells: int) -> BlockFile:
     """Return the description of `daily.nc`: daily means of blocks of `cells` × `cells`."""
     title = "Daily mean elevation change of blocks of cells"
@@ -144,26 +165,73 @@ def _coarse(grid: Grid, cells: int) -> Grid:
     return Grid(grid.west_m, grid.north_m, grid.cell_m * cells, -(-grid.nx // cells), -(-grid.ny // cells))
 
 
+def update_days(
+    series: Series,
+    cells: int,
+    entries: Entries,
+    compute: Callable[[int], Rasters],
+    progress: Callable[[], None],
+) -> None:
+    """Bring the files of `blocks/` up to date with the epochs, which are in order of time.
+
+    Files of days that did not change are not opened. Otherwise as `update_blocks`.
+    """
+    if not len(entries):
+        return
+    existing, current = block_files(series), set()
+    by_day = {_day_of(path): path for path in existing}
+    changes = np.flatnonzero(np.diff(entries.start_s // DAY_S)) + 1
+    for first, end in pairwise([0, *changes.tolist(), len(entries)]):
+        of_day = entries[first:end]
+        block_file = day_file(series, cells, of_day)
+        path = series.folder / block_file.name
+        current.add(path)
+        if not (path in existing and fingerprints_path(path).is_file()):
+            older = by_day.get(_day_of(path))
+            update_blocks(series, block_file, of_day, partial(_shifted, compute, first), progress, older)
+    for path in existing - current:
+        for file in (path, fingerprints_path(path)):
+            with suppress(OSError):
+                file.unlink()
+
+
+def _shifted(compute: Callable[[int], Rasters], first: int, index: int) -> Rasters:
+    return compute(first + index)
+
+
+def _day_of(path: Path) -> str:
+    """Return the name of a file of a day without the hash."""
+    return path.stem.rpartition("_")[0]
+
+
+def block_files(series: Series) -> set[Path]:
+    """Return the files of `blocks/`."""
+    return set((series.folder / BLOCKS).glob(f"*/{series.station_id}_*.nc"))
+
+
 def update_blocks(
     series: Series,
     block_file: BlockFile,
     entries: Entries,
     compute: Callable[[int], Rasters],
     progress: Callable[[], None],
+    older: Path | None = None,
 ) -> Path | None:
     """Bring a file of blocks up to date with its entries and return its path.
 
     `compute` returns the rasters of the entry at an index; those already in the file are copied, unless it is
-    damaged. Returns None and writes nothing without entries. `progress` is called after each entry written.
-    Raises StoreError if an epoch is damaged or the file cannot be written; the old file remains.
+    damaged. `older` is the file to copy them from, if it has another name. Returns None and writes nothing
+    without entries. `progress` is called after each entry written. Raises StoreError if an epoch is damaged
+    or the file cannot be written; the old file remains.
     """
     path = series.folder / block_file.name
     if not len(entries):
         return None
+    known = older or path
     blocks = replace(series, grid=block_file.grid)
     wanted = entries.keys
-    stored = _stored_keys(path, blocks) if is_intact(path) else wanted[:0]
-    if np.array_equal(stored, wanted):
+    stored = _stored_keys(known, blocks) if is_intact(known) else wanted[:0]
+    if known == path and np.array_equal(stored, wanted):
         return path
     is_kept = 0 < len(stored) <= len(wanted)  # a file cannot become shorter
     unchanged = np.zeros(len(wanted), np.bool_)
@@ -172,8 +240,8 @@ def update_blocks(
     position = {key: index for index, key in enumerate(stored.tolist())}
     with atomic_write(path) as tmp_path, ExitStack() as stack:
         if is_kept:
-            shutil.copyfile(path, tmp_path)
-        old = stack.enter_context(netCDF4.Dataset(path)) if position else None
+            shutil.copyfile(known, tmp_path)
+        old = stack.enter_context(netCDF4.Dataset(known)) if position else None
         with netCDF4.Dataset(tmp_path, "r+" if is_kept else "w") as file:
             if is_kept:
                 write_global_attrs(file, blocks, _title(blocks, block_file))

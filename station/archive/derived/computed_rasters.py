@@ -80,9 +80,17 @@ class ReferenceSurfaces:
     def __init__(self, series: Series) -> None:
         self._series = series
         self._references: dict[str, Reference] = {}
+        self._last: tuple[object, Array] | None = None  # window and its heights: epochs share them
 
     def height_m(self, version: str, rows: slice, columns: slice) -> Array:
         """Return the mean height of cells in a window of the grid [m]; raise StoreError without the file."""
+        window = version, rows.start, rows.stop, columns.start, columns.stop
+        last = self._last
+        if last is None or last[0] != window:
+            last = self._last = window, self._read(version, rows, columns)
+        return last[1]
+
+    def _read(self, version: str, rows: slice, columns: slice) -> Array:
         if version not in self._references:
             reference = open_reference(self._series, version)
             if reference is None:

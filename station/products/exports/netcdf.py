@@ -13,6 +13,7 @@ import numpy as np
 
 from station.archive.atomic_files import atomic_write
 from station.archive.compaction import METADATA_BLOCK_BYTES
+from station.archive.raster_io import deflated_chunks
 from station.archive.schema import Variable
 from station.archive.series.epoch_reader import LIBVER_COMPAT, copy_chunks, has_same_encoding
 from station.products.exports.contents import Advance, Block, PartContents, fill_value
@@ -72,10 +73,27 @@ def _write_raster(contents: PartContents, spec: Variable, target: Any, advance: 
             advance(source.count / len(contents.rasters))
         return
     cells = int(np.prod(contents.shape[1:])) * len(contents.rasters)
-    for block in contents.blocks(target.chunks):
+    write = _deflate_block if target.chunks[0] == 1 else _write_block
+    for block in sorted(contents.blocks(target.chunks), key=_place_first):
         values = contents.read(spec, block)
-        _write_block(target, block, values)
+        write(target, block, values)
         advance(values.size / cells)
+
+
+def _place_first(block: Block) -> tuple[int, int, int]:
+    """Key of an order in which all epochs of a window follow each other: their reference is read once."""
+    times, rows, columns = block
+    return rows.start, columns.start, times.start
+
+
+def _deflate_block(target: Any, block: Block, values: Any) -> None:  # noqa: ANN401
+    """Do as `_write_block` for chunks of one epoch each, without the slower filters of HDF5."""
+    times, rows, columns = block
+    height, width = target.chunks[1:]
+    for epoch, raster in zip(range(times.start, times.stop), values, strict=True):
+        for top in range(0, len(raster), height):
+            for left, deflated in deflated_chunks((height, width), raster[top : top + height]):
+                target.id.write_direct_chunk((epoch, rows.start + top, columns.start + left), deflated)
 
 
 def _write_block(target: Any, block: Block, values: Any) -> None:  # noqa: ANN401

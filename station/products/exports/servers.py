@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterator
 from pathlib import Path
 from xml.etree import ElementTree as ET
+
+import netCDF4
 
 from station.archive.discovery import descriptive_attributes, extent
 from station.archive.epochs import epochs_in_file
 from station.archive.netcdf_layout import CONVENTIONS, Series
+from station.archive.read_errors import read_errors
 from station.archive.schema import BY_NAME
 from station.archive.series.epoch_reader import contiguous_runs
 from station.errors import StationError
@@ -47,6 +50,7 @@ def write_ncml(
 ) -> Iterator[Path]:
     """Write NcML that joins the files of each part along time, with paths relative to it; yield the paths.
 
+    Variables that some of the files lack, of older versions, are left out: netCDF-Java serves them as zero.
     Raises StationError while a late scan or a revision lies within the time of another file.
     """
     require_whole_grid(selection)
@@ -61,8 +65,11 @@ def _ncml(selection: Selection, part: Part) -> ET.Element:
     for name, value in _global_attributes(selection.series).items():
         kind = "String" if isinstance(value, str) else "double"
         ET.SubElement(root, "attribute", name=name, type=kind, value=str(value))
+    runs = list(contiguous_runs(part.epochs))
+    for name in _differing_variables({source for source, *_ in runs}):
+        ET.SubElement(root, "remove", name=name, type="variable")
     joined = ET.SubElement(root, "aggregation", dimName="time", type="joinExisting")
-    for source, _, _, count in contiguous_runs(part.epochs):
+    for source, _, _, count in runs:
         if len(epochs_in_file(source)) != count:
             raise StationError(
                 f"{source}: only a part of its epochs is valid or within the span: try again after the next"
@@ -71,6 +78,15 @@ def _ncml(selection: Selection, part: Part) -> ET.Element:
         location = os.path.relpath(source.resolve(), part.path.parent.resolve())
         ET.SubElement(joined, "netcdf", location=location, ncoords=str(count))
     return root
+
+
+def _differing_variables(paths: Collection[Path]) -> list[str]:
+    """Return the names of variables that not all files have with the same dimensions."""
+    shapes: list[set[tuple[str, tuple[int, ...]]]] = []
+    for path in paths:
+        with read_errors(path), netCDF4.Dataset(path) as file:
+            shapes.append({(name, variable.shape[1:]) for name, variable in file.variables.items()})
+    return sorted({name for name, _ in shapes[0].union(*shapes) - shapes[0].intersection(*shapes)})
 
 
 def write_erddap(

@@ -22,7 +22,7 @@ from pathlib import Path
 import numpy as np
 from scipy import sparse
 
-from station.archive.derived.boxes import BOXES, read_entry
+from station.archive.derived.boxes import BOXES, DAY_S, read_entry
 from station.archive.derived.computed_rasters import CHANGE, RANDOM
 from station.archive.epochs import EpochRef
 from station.archive.netcdf_layout import Series
@@ -38,7 +38,7 @@ from station.products.viewer.tiles import (
 )
 from station.quantities import Bools, Floats, Ints, SharedParameters
 from station.queries.block_sums import Sums
-from station.queries.blocks import DAY_S, BlockQueries, SurfaceBlocks
+from station.queries.blocks import BlockQueries, SurfaceBlocks
 from station.science.analysis.calibration import SparseJacobian
 from station.science.uncertainty.jacobian import HeightJacobian
 
