@@ -73,8 +73,8 @@ class Run:
     """Scans of one verdict without a gap between them, through a day [min]."""
 
     verdict: str
-    begin_min: float
-    length_min: float
+    begin_min: int
+    length_min: int
 
 
 @dataclass(frozen=True)
@@ -205,9 +205,9 @@ def _runs(start_min: Floats, verdicts: list[str], every_min: float) -> list[Run]
         end = min(begin + 0.9 * every_min, DAY_MIN)  # a narrow gap shows where the verdict changes
         last = runs[-1] if runs else None
         if last and last.verdict == verdict and begin <= last.begin_min + last.length_min + every_min * 0.6:
-            runs[-1] = Run(verdict, last.begin_min, round(end - last.begin_min, 1))
+            runs[-1] = Run(verdict, last.begin_min, round(end - last.begin_min))
         else:
-            runs.append(Run(verdict, round(begin, 1), round(end - begin, 1)))
+            runs.append(Run(verdict, round(begin), max(round(end - begin), 1)))
     return runs
 
 
