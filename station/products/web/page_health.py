@@ -32,7 +32,7 @@ RECENT_SCANS = 24  # scans used for it
 READ_EVERY_S = 21_600.0  # of their stable ground, as reading costs half of a decoding on a large grid
 READ_SCANS = 1  # per page: older scans are read over several pages
 MIN_CELLS = 20  # of stable ground, for a distance to be judged
-DAYS, DAY_S, DAY_MIN = 14, 86_400.0, 1440.0
+DAYS, DAY_S, DAY_MIN = 10, 86_400.0, 1440.0
 MAX_LOG = 20
 MAX_REFERENCES = 5
 REASONS = {  # explanations in page.*.json by what a reason contains; the first that matches counts
@@ -73,8 +73,8 @@ class Run:
     """Scans of one verdict without a gap between them, through a day [min]."""
 
     verdict: str
-    begin_min: float
-    length_min: float
+    begin_min: int
+    length_min: int
 
 
 @dataclass(frozen=True)
@@ -205,9 +205,9 @@ def _runs(start_min: Floats, verdicts: list[str], every_min: float) -> list[Run]
         end = min(begin + 0.9 * every_min, DAY_MIN)  # a narrow gap shows where the verdict changes
         last = runs[-1] if runs else None
         if last and last.verdict == verdict and begin <= last.begin_min + last.length_min + every_min * 0.6:
-            runs[-1] = Run(verdict, last.begin_min, round(end - last.begin_min, 1))
+            runs[-1] = Run(verdict, last.begin_min, round(end - last.begin_min))
         else:
-            runs.append(Run(verdict, round(begin, 1), round(end - begin, 1)))
+            runs.append(Run(verdict, round(begin), max(round(end - begin), 1)))
     return runs
 
 

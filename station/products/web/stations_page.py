@@ -54,4 +54,5 @@ def render_stations(entries: list[StationRow], language: str) -> tuple[str, str,
     body = json.dumps(data, ensure_ascii=True, separators=(",", ":"))
     script = f"window.STATIONS_DATA={body};\n{(ASSETS / SCRIPT).read_text(encoding='utf-8')}"
     html = environment().get_template("stations.html").render(entries=entries, t=text, language=language)
-    return html, script, (ASSETS / "page.css").read_text(encoding="utf-8")
+    style = "".join((ASSETS / name).read_text(encoding="utf-8") for name in ("page.css", "stations.css"))
+    return html, script, style
