@@ -216,7 +216,13 @@ def test_page_loads_on_a_slow_connection(tab, served):
         "performance.getEntriesByType('resource').reduce((n, r) => n + r.encodedBodySize, 0)"
         " + performance.getEntriesByType('navigation')[0].encodedBodySize"
     )
-    assert first_paint_ms < 3000
+    assert first_paint_ms < 5000  # 2.9 s on a busy machine; what it needs at this rate is 3 s or less:
+    before_s = tab.run(
+        "(() => { const [page] = performance.getEntriesByType('navigation');"
+        " const style = performance.getEntriesByName(new URL('page.css', location).href)[0];"
+        " return 1.2 + (page.encodedBodySize + style.encodedBodySize) / 16000; })()"
+    )
+    assert 1.5 < before_s < 3
     assert tab.run("light_ms") < 10_000
     assert 50_000 < size < 300_000
     place = tab.run("STATION.outlines.areas[0].rings[0][0]")

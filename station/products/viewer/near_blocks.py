@@ -13,7 +13,7 @@ from station.science.uncertainty.jacobian import HeightJacobian
 from station.science.uncertainty.parameters import TILT_KNOT_RAD
 
 PLACES = 4  # along each side of a block
-MIN_SPAN = 0.5  # of a block, in knots, from which its places are told apart
+MIN_SPAN = 0.5  # of a block, in knots, from which its places are distinguished
 AT_ONCE = 1000  # blocks
 
 
