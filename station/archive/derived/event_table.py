@@ -10,11 +10,11 @@ from __future__ import annotations
 import base64
 import json
 import zlib
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from contextlib import suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 import shapely
@@ -29,6 +29,9 @@ from station.quantities import Bools, Grid
 FILE_NAME, FOUND_NAME = "events.geojson", ".event_regions.json"
 FORMAT = 1  # of the kept regions
 CLASSES = ("loss", "gain", "paired", "melt_front", "snowfall")
+
+
+T = TypeVar("T")
 
 
 @dataclass(frozen=True)
@@ -120,11 +123,22 @@ def write_events(series: Series, events: Iterable[tuple[Event, shapely.Geometry]
 
 def read_events(folder: Path) -> list[Event]:
     """Return the events of a store, the oldest first; [] without a table, StoreError if it is damaged."""
+    return _read_features(folder, lambda feature: Event(**feature["properties"]))
+
+
+def read_outlines(folder: Path) -> dict[str, shapely.Geometry]:
+    """Return the outline of each event of a store by its id; StoreError if the table is damaged."""
+    features = _read_features(
+        folder, lambda feature: (feature["id"], shapely.from_geojson(json.dumps(feature["geometry"])))
+    )
+    return dict(features)
+
+
+def _read_features(folder: Path, convert: Callable[[Any], T]) -> list[T]:
     path = folder / FILE_NAME
     if not path.is_file():
         return []
     try:
-        features = json.loads(path.read_text(encoding="utf-8"))["features"]
-        return [Event(**feature["properties"]) for feature in features]
+        return [convert(feature) for feature in json.loads(path.read_text(encoding="utf-8"))["features"]]
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise StoreError(f"{path}: damaged, cannot be read: {error}: the service builds it again") from error
