@@ -83,13 +83,13 @@ class ClassFilter:
     def missing_rate(self) -> tuple[float, float]:
         """What the rates of the cells lack of the mean rate of the last day [m/d], and its variance [m²/d²].
 
-        It is the height that the class gained at once, as by snowfall, and what the cells lag behind its
-        course. Snow that drifts lies in the same places all day. A lag differs from cell to cell by as much
-        as it is, and the course itself may lag by as much. Source: equations.md, 6.12.
+        It is the height that the class gained at once, as by snowfall. What the cells lag behind its course
+        is in the variance. Snow that drifts lies in the same places all day. A lag differs from cell to cell
+        by as much as it is, and the course itself may lag by as much. Source: equations.md, 6.12.
         """
         _, height_m, scatter_m2 = self._surges
         lag_m_d = self._lag_m_d(self.course.mean_rate_m_d)
-        return float(height_m.sum()) + lag_m_d, float(np.sqrt(scatter_m2).sum() ** 2) + 2 * lag_m_d**2
+        return float(height_m.sum()), float(np.sqrt(scatter_m2).sum() ** 2) + 2 * lag_m_d**2
 
     def _lag_m_d(self, mean_rate_m_d: float) -> float:
         """Return what the rates of the cells lack of the mean rate of the class; 0 if that is not known."""
