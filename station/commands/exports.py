@@ -19,11 +19,13 @@ if TYPE_CHECKING:
     from station.products.area_tables import Span
 
 
-class PointFormat(StrEnum):
-    """Of `station export points`."""
+class FileFormat(StrEnum):
+    """Of the files of `station export points` and `station export levels`."""
 
     laz = "laz"
     copc = "copc"
+    geotiff = "geotiff"
+    netcdf = "netcdf"
 
 
 class ExportFormat(StrEnum):
@@ -50,6 +52,12 @@ OF_EPOCHS = {
     ExportFormat.transformations,
     ExportFormat.levels,
 }  # the others are of the series
+
+
+FILE_FORMATS = {  # the first is the default
+    ExportFormat.points: (FileFormat.laz, FileFormat.copc),
+    ExportFormat.levels: (FileFormat.geotiff, FileFormat.netcdf),
+}
 
 
 @dataclass(frozen=True)
@@ -106,9 +114,13 @@ def export(
             metavar="URL", help="References: address of the data folder; default here.", show_default=False
         ),
     ] = None,
-    point_format: Annotated[
-        PointFormat | None,
-        typer.Option("--format", help="Points: of the files; default laz.", show_default=False),
+    file_format: Annotated[
+        FileFormat | None,
+        typer.Option(
+            "--format",
+            help="Points: laz (default) or copc. Levels: geotiff (default) or netcdf.",
+            show_default=False,
+        ),
     ] = None,
 ) -> None:
     """Write files to pass on, or for tools that cannot read the series.
@@ -120,16 +132,15 @@ def export(
     QGIS styles, a STAC catalogue of these, or scans and areas as CSV.
     points: the scans of these epochs as LAZ or COPC, corrected, on the map, each point with change, sigma and
     quality of its cell. transformations: how the scanner had moved at these epochs, as 4 x 4 matrices, and
-    their covariance. levels: level and rate of each cell as GeoTIFF, of the newest day that is over, or of
-    the days and months of a span.
+    their covariance. levels: level and rate of each cell as GeoTIFF, or as NetCDF with all days in one file,
+    of the newest day that is over, or of the days and months of a span.
     """
     from station.config import read_site
     from station.products.area_tables import Span
     from station.products.export import export as write_files
 
     settings, span = read_site(site), Span.parse(first, last)
-    if point_format is not None and kind is not ExportFormat.points:
-        raise typer.BadParameter(f"--format is for points, not for {kind.value}")
+    chosen_format = _file_format(kind, file_format)
     if kind not in OF_EPOCHS:
         options = SeriesOptions(every and every.value, area, variables, chunks, url)
         for path in _export_series(settings, kind.value, out, span, options):
@@ -147,14 +158,33 @@ def export(
             span if first or last else None,
             out,
             progress_bar("writing"),
-            (point_format or PointFormat.laz).value,
+            chosen_format,
         ):
+            print(path)
+        return
+    if kind is ExportFormat.levels:
+        from station.archive.series.index import series_in
+        from station.products.exports.levels import export_levels
+
+        series = series_in(settings.station.data)
+        for path in export_levels(series, span if first or last else None, out, chosen_format):
             print(path)
         return
     for path in write_files(
         settings, kind.value, span if first or last else None, out, progress_bar("writing")
     ):
         print(path)
+
+
+def _file_format(kind: ExportFormat, file_format: FileFormat | None) -> str:
+    """Return the format of the files of a kind, by default the first; '' if there is no choice."""
+    formats = FILE_FORMATS.get(kind, ())
+    if file_format is None:
+        return formats[0].value if formats else ""
+    if file_format not in formats:
+        names = " or ".join(formats) if formats else "no --format"
+        raise typer.BadParameter(f"--format: {kind.value} has {names}, not {file_format.value}")
+    return file_format.value
 
 
 def _export_series(

@@ -111,6 +111,10 @@ def events(
     first: FromOption = None,
     last: ToOption = None,
     table: CsvOption = None,
+    geoparquet: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE", help="Write GeoParquet with the outlines instead.", show_default=False),
+    ] = None,
 ) -> None:
     """Print where and when the surface changed, anywhere on the grid.
 
@@ -119,9 +123,17 @@ def events(
     """
     from station.config import read_site
     from station.products.area_tables import Span
-    from station.products.event_tables import as_csv, as_text, select_events
+    from station.products.event_tables import as_csv, as_text, select_events, write_geoparquet
 
-    found = select_events(read_site(site), Span.parse(first, last), kind.value if kind else None)
+    if table is not None and geoparquet is not None:
+        raise typer.BadParameter("--csv and --geoparquet: choose one")
+    settings = read_site(site)
+    found = select_events(settings, Span.parse(first, last), kind.value if kind else None)
+    if geoparquet is not None:
+        from station.archive.series.index import series_in
+
+        write_geoparquet(series_in(settings.station.data), found, geoparquet)
+        return
     print_or_write(as_text(found) if table is None else as_csv(found), table)
 
 

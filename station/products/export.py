@@ -10,7 +10,6 @@ from pathlib import Path
 
 import numpy as np
 
-from station.archive.derived.level_files import level_files
 from station.archive.epochs import EpochRef
 from station.archive.netcdf_layout import Series
 from station.archive.reference_files import valid_versions
@@ -21,7 +20,7 @@ from station.products.area_tables import REFERENCE, Span, area_records, as_csv
 from station.products.epoch_table import EpochTable, csv_times, read_epoch_table
 from station.products.exports.transformations import write_transformations
 from station.products.gallery import default_limit, replace_if_changed
-from station.products.geotiff import export_geotiff, export_levels
+from station.products.geotiff import export_geotiff
 from station.products.stac import write_stac
 
 Track = Callable[[list[EpochRef]], Iterable[EpochRef]]
@@ -30,13 +29,10 @@ Track = Callable[[list[EpochRef]], Iterable[EpochRef]]
 def export(site: Site, kind: str, span: Span | None, folder: Path, track: Track = iter) -> list[Path]:
     """Write the epochs of a span, by default the newest, as `kind` into a folder; return the files written.
 
-    `kind` is geotiff, csv (scans and areas; by default of all epochs), stac, transformations or levels (of
-    days and months that began in the span; by default of the newest day). Raises StationError if there is
-    nothing to write or a library is missing.
+    `kind` is geotiff, csv (scans and areas; by default of all epochs), stac or transformations. Raises
+    StationError if there is nothing to write or a library is missing.
     """
     series = series_in(site.station.data)
-    if kind == "levels":
-        return [path for source in _levels(series, span) for path in export_levels(series, source, folder)]
     table = read_epoch_table(series)
     if kind == "csv":
         versions_by_scan = _versions_by_scan(series)
@@ -53,22 +49,6 @@ def export(site: Site, kind: str, span: Span | None, folder: Path, track: Track 
     if kind == "stac":
         return write_stac(site, series, chosen, folder, limit_m, track)
     return [path for epoch in track(chosen) for path in export_geotiff(series, epoch, folder, limit_m)]
-
-
-def _levels(series: Series, span: Span | None) -> list[Path]:
-    """Return the files of levels of days and months that began in a span; without one, of the newest day."""
-    begun = {}
-    for path in level_files(series):
-        name = path.stem.split("_")[-2]
-        stamp = "%Y%m%d" if len(name) == len("20261121") else "%Y%m"
-        begun[path] = datetime.strptime(name, stamp).replace(tzinfo=UTC), stamp
-    days = [path for path, (_, stamp) in begun.items() if stamp == "%Y%m%d"]
-    chosen = days[-1:] if span is None else [path for path, (start, _) in begun.items() if start in span]
-    if not chosen:
-        raise StationError(
-            "no day of levels in this span: products.levels = true keeps them, when a day is over"
-        )
-    return chosen
 
 
 def _versions_by_scan(series: Series) -> dict[str, list[str]]:

@@ -11,7 +11,6 @@ import numpy as np
 
 from station._version import __version__
 from station.archive.atomic_files import atomic_write
-from station.archive.derived.level_files import LEVEL_VARIABLES, level_raster
 from station.archive.epochs import EpochRef
 from station.archive.netcdf_layout import Series
 from station.errors import StationError
@@ -44,20 +43,6 @@ def export_geotiff(series: Series, epoch: EpochRef, folder: Path, limit_m: float
         write_cog(path, series, values, description, tags)
         scale = change_scale(limit_m, "the reference") if kind == "change" else sigma_scale(limit_m)
         replace_if_changed(path.with_suffix(".qml"), _qgis_style(scale).encode())
-        paths.append(path)
-    return paths
-
-
-def export_levels(series: Series, source: Path, folder: Path) -> list[Path]:
-    """Write the variables of a file of levels into a folder, one GeoTIFF for each; return them.
-
-    Raises StationError if rasterio is not installed, StoreError if a file is damaged or cannot be written.
-    """
-    paths = []
-    for spec in LEVEL_VARIABLES:
-        path = folder / f"{source.stem.rpartition('_')[0]}_{spec.name}.tif"
-        tags = {"station": series.station_id, "source": source.name, "software": f"station {__version__}"}
-        write_cog(path, series, level_raster(source, spec.name)[:], spec.long_name, tags, spec.units or "1")
         paths.append(path)
     return paths
 

@@ -180,8 +180,9 @@ class LevelFilter:
         variances[0] += self._reference_m2[band]
         variances[1] += self._common_share * systematic_m2
         sigmas = np.sqrt(variances)
+        missing_m_d = np.array([ground.missing_rate[0] for ground in self._classes])[self._class[band]]
         coverage = self._seen[band] / max(self._epoch_count, 1)
-        values = (state.level_m, *sigmas[:2], state.rate_m_d, *sigmas[2:], coverage)
+        values = (state.level_m, *sigmas[:2], state.rate_m_d + missing_m_d, *sigmas[2:], coverage)
         never = np.isnan(state.level_m)
         return {name: np.where(never, np.nan, v) for name, v in zip(LEVEL_NAMES, values, strict=True)}
 

@@ -41,7 +41,7 @@ from station.queries.blocks import BlockQueries
 from station.queries.epoch_cells import EpochReader, bounding_box
 from station.queries.level_filter import DAY_S, LevelFilter
 
-FORMAT = 1  # of the filter: another one computes all files again
+FORMAT = 2  # of the filter: another one computes all files again
 RECENT_DAYS = 3  # whose states are kept, besides those of the last days of months
 Progress = Callable[[], None]
 

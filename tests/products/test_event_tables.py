@@ -2,6 +2,7 @@
 
 import csv
 import io
+import json
 from dataclasses import replace
 from datetime import UTC, datetime
 
@@ -14,7 +15,7 @@ from station.archive.netcdf_layout import Series
 from station.config import read_site
 from station.errors import StoreError
 from station.monitoring.alarm_rules import evaluate_rules
-from station.products.event_tables import as_csv, as_text
+from station.products.event_tables import as_csv, as_text, write_geoparquet
 from station.products.page import PageContext, write_page
 from station.quantities import Grid
 
@@ -54,6 +55,26 @@ def test_csv_has_all_columns_and_text_has_intervals():
     assert "+1234" in line
     assert "±196" in line  # 1.96 times 100
     assert as_text([]) == "no events"
+
+
+def test_geoparquet_has_outlines_times_and_the_coordinate_system(tmp_path):
+    """Against the specification, version 1.1.0; geopandas 1.1 reads the file with the same content."""
+    parquet = pytest.importorskip("pyarrow.parquet")
+    store(tmp_path)
+    series = Series(tmp_path, "hef", GRID, "EPSG:32632")
+    write_geoparquet(series, [SLIDE, SNOW], tmp_path / "events.parquet")
+    table = parquet.read_table(tmp_path / "events.parquet")
+    geo = json.loads(table.schema.metadata[b"geo"])
+    column = geo["columns"][geo["primary_column"]]
+    assert (geo["version"], column["encoding"], column["geometry_types"]) == ("1.1.0", "WKB", ["Polygon"])
+    assert column["crs"]["id"] == {"authority": "EPSG", "code": 32632}
+    assert column["bbox"] == [632_090, 5_185_890, 632_120, 5_185_920]
+    first, second = table.to_pylist()
+    assert shapely.from_wkb(first["geometry"]).area == 900
+    assert first["begin"] == datetime(2025, 7, 15, 15, 7, 28, tzinfo=UTC)
+    assert (first["volume_m3"], second["partner"], second["balance_m3"]) == (1234.5, None, None)
+    write_geoparquet(series, [], tmp_path / "none.parquet")
+    assert parquet.read_table(tmp_path / "none.parquet").num_rows == 0
 
 
 def test_the_page_lists_events(tmp_path):

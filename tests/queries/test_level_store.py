@@ -1,12 +1,13 @@
 """Levels as files: the same bits live, late, interrupted and rebuilt, and only what changed is written."""
 
 from dataclasses import replace
-from types import SimpleNamespace
 
 import netCDF4
 import numpy as np
 import pytest
+import xarray as xr
 from support.epochs import random_epoch
+from support.programs import findings
 
 import station
 from station.archive.derived.level_files import LEVEL_NAMES, damaged_levels, level_files
@@ -16,7 +17,7 @@ from station.archive.reference_files import write_reference
 from station.archive.series.virtual import build_series
 from station.errors import StationError
 from station.products.area_tables import Span
-from station.products.export import export
+from station.products.exports.levels import export_levels
 from station.quantities import Grid, Reference
 from station.queries.levels import update_levels
 
@@ -168,14 +169,34 @@ def test_files_are_what_cf_wants(rebuilt):
 
 def test_export_as_geotiff(rebuilt, tmp_path):
     rasterio = pytest.importorskip("rasterio")
-    site = SimpleNamespace(station=SimpleNamespace(data=rebuilt.folder))
-    paths = export(site, "levels", None, tmp_path)
+    paths = export_levels(rebuilt, None, tmp_path, "geotiff")
     assert {path.name for path in paths} == {f"hef_20251202_{name}.tif" for name in LEVEL_NAMES}
     newest = station.levels(rebuilt.folder, EVERYWHERE).isel(time=-2)
     with rasterio.open(tmp_path / "hef_20251202_rate.tif") as raster:
         assert raster.units == ("m d-1",)
         assert np.array_equal(raster.read(1), newest.rate.values, equal_nan=True)
-    months = export(site, "levels", Span.parse("2025-11-01", "2025-11-02"), tmp_path)
+    months = export_levels(rebuilt, Span.parse("2025-11-01", "2025-11-02"), tmp_path, "geotiff")
     assert {path.name for path in months} == {f"hef_202511_{name}.tif" for name in LEVEL_NAMES}
     with pytest.raises(StationError, match="no day of levels"):
-        export(site, "levels", Span.parse("2024-11-01", "2024-11-02"), tmp_path)
+        export_levels(rebuilt, Span.parse("2024-11-01", "2024-11-02"), tmp_path, "geotiff")
+
+
+def test_export_as_netcdf_has_all_days_with_the_stored_values(rebuilt, tmp_path):
+    paths = export_levels(rebuilt, Span.parse("2025-11-01", "2025-12-03"), tmp_path, "netcdf")
+    assert [path.name for path in paths] == ["hef_levels_20251127-20251202.nc", "hef_levels_202511.nc"]
+    expected = station.levels(rebuilt.folder, EVERYWHERE).isel(time=slice(-1))
+    with xr.open_dataset(paths[0]) as days, xr.open_dataset(paths[1]) as months:
+        assert np.array_equal(days.time, expected.time)
+        for name in LEVEL_NAMES:
+            assert np.array_equal(days[name], expected[name], equal_nan=True), name
+        assert days.epoch_count.values.tolist() == [2] * 6
+        assert days.time_bnds.values[0, 0] == np.datetime64("2025-11-27T03:00")
+        assert (days.attrs["time_coverage_start"], months.sizes["time"]) == ("2025-11-27T03:00:00Z", 1)
+        assert "mean since" in months.rate.comment
+
+
+@pytest.mark.integration
+def test_compliance_checker_accepts_levels(rebuilt, tmp_path):
+    exported = export_levels(rebuilt, Span.parse("2025-11-01", "2025-12-03"), tmp_path, "netcdf")
+    stored = [next(rebuilt.folder.glob(f"levels/*/hef_{name}_*.nc")) for name in ("20251202", "202511")]
+    assert findings(tmp_path / "report.json", *stored, *exported) == []

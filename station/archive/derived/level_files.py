@@ -23,6 +23,7 @@ from station.archive.raster_io import Array, LazyRaster, rounded, write_rasters
 from station.archive.schema import BY_NAME, FILL, RASTER, Variable
 
 FOLDER, STATE_FOLDER = "levels", ".levels"
+DAY_DIGITS = len("20261121")
 KEY_DIGITS = 8  # of the hash in the name of a file
 KEY_ATTRIBUTE = "sources_sha256"
 _ONE_SIGMA = "one standard deviation of a single cell"
@@ -66,6 +67,10 @@ LEVEL_VARIABLES = (
     ),
 )
 LEVEL_NAMES = tuple(variable.name for variable in LEVEL_VARIABLES)
+RATE_COMMENTS = {
+    "day": "over the last day, with its snowfall, without steps such as avalanches",
+    "month": "mean since the end of the month before, steps included",
+}
 EPOCH_COUNT = Variable("epoch_count", ("time",), "f8", "number of epochs of the period", "1")
 
 
@@ -84,7 +89,7 @@ class LevelPeriod:
     @property
     def noun(self) -> str:
         """What it is: a day or a month."""
-        return "day" if len(self.name) == len("20261121") else "month"
+        return "day" if len(self.name) == DAY_DIGITS else "month"
 
 
 def level_path(series: Series, period: LevelPeriod) -> Path:
@@ -96,6 +101,11 @@ def level_path(series: Series, period: LevelPeriod) -> Path:
 def level_files(series: Series) -> list[Path]:
     """Return all files of levels, in order of their names."""
     return sorted((series.folder / FOLDER).glob(f"*/{series.station_id}_*.nc"))
+
+
+def is_day(path: Path) -> bool:
+    """Return True if a file is that of a day, not of a month."""
+    return len(path.stem.split("_")[-2]) == DAY_DIGITS
 
 
 def is_current(series: Series, period: LevelPeriod) -> bool:
@@ -116,23 +126,23 @@ def write_levels(
     title = f"Level and rate of the surface at {series.name or series.station_id}, {period.name}"
     with atomic_write(path) as tmp_path:
         with netCDF4.Dataset(tmp_path, "w", clobber=False) as file:
-            create_file(file, series, title, 1)
+            create_level_file(file, series, title, 1, period.noun)
             file.setncatts(time_coverage(period.start_s, period.end_s) | {KEY_ATTRIBUTE: period.key})
-            file["time"].long_name = f"middle of the last epoch of the {period.noun}"
             file["time"][0], file["time_bnds"][0] = period.time_s, (period.start_s, period.end_s)
-            create_variable(file, EPOCH_COUNT, series, 1)[0] = period.epoch_count
-            version = create_variable(file, BY_NAME["reference_version"], series, 1)
-            version[0] = encode_text([period.version], "text")[0]
-            for spec in LEVEL_VARIABLES:
-                variable = create_variable(file, spec, series, 1)
-                if spec.name == "rate":
-                    variable.comment = {
-                        "day": "at the end of the day, without steps such as avalanches",
-                        "month": "mean since the end of the month before, steps included",
-                    }[period.noun]
+            file["epoch_count"][0] = period.epoch_count
+            file["reference_version"][0] = encode_text([period.version], "text")[0]
         write_rasters(tmp_path, LEVEL_VARIABLES, lambda rows: _ordered(get_rows(rows)))
         write_fingerprints(path, tmp_path)
     return path
+
+
+def create_level_file(file: netCDF4.Dataset, series: Series, title: str, times: int, noun: str) -> None:
+    """Write everything into a new file of days or months (`noun`) but its values."""
+    create_file(file, series, title, times)
+    file["time"].long_name = f"middle of the last epoch of the {noun}"
+    for spec in (EPOCH_COUNT, BY_NAME["reference_version"], *LEVEL_VARIABLES):
+        create_variable(file, spec, series, times)
+    file["rate"].comment = RATE_COMMENTS[noun]
 
 
 def _ordered(rasters: Mapping[str, Array]) -> list[Array]:

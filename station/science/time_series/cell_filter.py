@@ -67,6 +67,7 @@ class Motion:
     mean_rate_m_d: Floats | float = 0.0  # over the last day
     faster_m_d: Floats | float = 0.0  # change of the mean rate
     common_error_m: Floats | float = 0.0  # of the scan, in all cells of the class
+    lag_m_d: Floats | float = 0.0  # of the rates of its cells behind its own mean rate
 
 
 def first_estimate(change_m: Floats, variance_m2: Floats) -> LevelRate:
@@ -92,12 +93,12 @@ def predict(state: LevelRate, days: float, noise: ProcessNoise) -> LevelRate:
 def shifted(state: LevelRate, motion: Motion) -> LevelRate:
     """Return the state after what the class did: the cell has as much of its daily wave as of its mean rate.
 
-    Where the class moves more slowly than the rate of the cell is uncertain, the cell moves as the class.
-    Source: equations.md, 6.12.
+    Where the class moves more slowly than the rate of the cell is uncertain, or otherwise than its cells did
+    so far, as when snow begins to fall, the cell moves as the class. Source: equations.md, 6.12.
     """
-    squared = motion.mean_rate_m_d**2 + state.rate_m2_d2
+    uncertain = state.rate_m2_d2 + motion.lag_m_d**2
     with np.errstate(invalid="ignore"):
-        share = (motion.mean_rate_m_d * state.rate_m_d + state.rate_m2_d2) / squared
+        share = (motion.mean_rate_m_d * state.rate_m_d + uncertain) / (motion.mean_rate_m_d**2 + uncertain)
     share = np.clip(share, 0.0, MAX_SHARE)
     return replace(
         state,

@@ -7,7 +7,7 @@ filtered relative to it.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from itertools import product
 
 import numpy as np
@@ -33,6 +33,15 @@ LEAST_SCANS, LEAST_SPAN_D = 6, 0.25  # within a day, for a daily wave
 MEDIAN_VARIANCE = np.pi / 2  # of the median over that of the mean, for normal errors
 
 
+@dataclass(frozen=True)
+class CourseErrors:
+    """Variances of the level [m²] or mean rate [m²/d²] of a class: what it did unseen, and measurement."""
+
+    process: float
+    random: float
+    systematic: Floats  # at each cell (n,)
+
+
 class ClassCourse:
     """Filter of the level of a class, from the median change of its cells since the last scan."""
 
@@ -45,7 +54,7 @@ class ClassCourse:
         self._likelihood = np.zeros(count)
         self._best = LEVEL_NOISES_M2_D.index(1e-5) * len(rate_noises) + len(rate_noises) // 2
         self._day = np.zeros((2, 1))  # times [d] before now, and levels [m], of the last day and before it
-        self._rate_m_d = 0.0
+        self.mean_rate_m_d = 0.0  # over the last day; 0 if there is no daily wave
         self._ahead_m = 0.0  # of the levels of its cells, most of which have followed it
         self.shares: ErrorShares | None = None
 
@@ -54,7 +63,7 @@ class ClassCourse:
         return {
             "course_states": np.stack(list(vars(self._states).values())),
             "course_likelihood": self._likelihood,
-            "course_best": np.array([self._best, self._rate_m_d, self._ahead_m]),
+            "course_best": np.array([self._best, self.mean_rate_m_d, self._ahead_m]),
             "course_day": self._day,
             "course_shares": ErrorShares.to_array(self.shares),
         }
@@ -63,7 +72,7 @@ class ClassCourse:
         """Continue from what `to_arrays` returned."""
         self._states = LevelRate(*arrays["course_states"])
         self._likelihood = arrays["course_likelihood"]
-        best, self._rate_m_d, self._ahead_m = arrays["course_best"].tolist()
+        best, self.mean_rate_m_d, self._ahead_m = arrays["course_best"].tolist()
         self._best = int(best)
         self._day = arrays["course_day"]
         self.shares = ErrorShares.from_array(arrays["course_shares"])
@@ -99,7 +108,7 @@ class ClassCourse:
                 shares = shares.updated(median_m2, systematic_m2)
         went_m = float(states.level_m[self._best])
         wave_m, mean_rate_m_d = self._remember(days, went_m, surge_m)
-        before_m_d, rate_m_d = self._rate_m_d, mean_rate_m_d
+        before_m_d, rate_m_d = self.mean_rate_m_d, mean_rate_m_d
         motion = Motion(
             anomaly_m=wave_m,
             surge_m=surge_m,
@@ -110,7 +119,7 @@ class ClassCourse:
         self._ahead_m += went_m
         # the next scan is compared with the best candidate
         self._states = replace(states, level_m=states.level_m - went_m)
-        self._best, self._rate_m_d, self.shares = int(np.argmax(self._likelihood)), rate_m_d, shares
+        self._best, self.mean_rate_m_d, self.shares = int(np.argmax(self._likelihood)), rate_m_d, shares
         return motion
 
     def follow(self, moved_m: Floats) -> None:
@@ -148,17 +157,18 @@ class ClassCourse:
         levels_m = np.concatenate([[np.interp(-span_d, -age_d, level_m)], level_m[inside]])
         return float(np.trapezoid(levels_m, time_d)) / span_d
 
-    def variances(self, systematic_m2: Floats) -> tuple[Floats, Floats]:
-        """Return the variances of level [m²] and mean rate [m²/d²] of the class at cells (n,) of it.
+    def errors(self, index: int, systematic_m2: Floats) -> CourseErrors:
+        """Return the variances of the level (index 0) or the mean rate (1) of the class, at cells (n,) of it.
 
         `systematic_m2` is that of a scan at these cells.
         """
         if self.shares is None:
-            return np.zeros_like(systematic_m2), np.zeros_like(systematic_m2)
-        level_m2, rate_m2_d2 = (
-            self.shares.process[index, index]
-            + self.shares.random[index, index]
-            + self.shares.systematic[index, index] * systematic_m2
-            for index in (0, 1)
+            return CourseErrors(0.0, 0.0, np.zeros_like(systematic_m2))
+        factor = 1.0
+        if index == 1 and self._has_wave:
+            index, factor = 0, 2.0  # the difference of the levels of two days
+        process, random, systematic = (
+            factor * float(matrix[index, index])
+            for matrix in (self.shares.process, self.shares.random, self.shares.systematic)
         )
-        return level_m2, 2 * level_m2 if self._has_wave else rate_m2_d2  # of the difference of two days
+        return CourseErrors(process, random, systematic * systematic_m2)

@@ -44,6 +44,7 @@ class ClassFilter:
     """
 
     def __init__(self, sample_count: int, *, stable: bool = False) -> None:
+        self.is_stable = stable
         rate_noises = STABLE_RATE_NOISES_M2_D3 if stable else MOVING_RATE_NOISES_M2_D3
         self._candidates = np.array(list(product(LEVEL_NOISES_M2_D, rate_noises))).T
         self._shape = self._candidates.shape[1], sample_count
@@ -52,6 +53,7 @@ class ClassFilter:
         self._likelihood = np.zeros(self._shape[0])
         self._best = LEVEL_NOISES_M2_D.index(1e-5) * len(rate_noises)
         self.course = ClassCourse(stable=stable)
+        self._surges = np.zeros((3, 0))  # of the last day: age [d], height [m], scatter of the cells [m²]
         self.shares: ErrorShares | None = None  # None before the first scan with a cell of the sample
 
     def to_arrays(self) -> dict[str, Floats]:
@@ -61,6 +63,7 @@ class ClassFilter:
             "likelihood": self._likelihood,
             "best": np.array([self._best], np.float64),
             "shares": ErrorShares.to_array(self.shares),
+            "surges": self._surges,
         } | self.course.to_arrays()
 
     def restore(self, arrays: Mapping[str, Floats]) -> None:
@@ -68,12 +71,31 @@ class ClassFilter:
         self._states = LevelRate(*arrays["states"])
         self._likelihood, self._best = arrays["likelihood"], int(arrays["best"][0])
         self.shares = ErrorShares.from_array(arrays["shares"])
+        self._surges = arrays["surges"]
         self.course.restore(arrays)
 
     @property
     def learned(self) -> ProcessNoise:
         """The likeliest process noise so far; both are numbers."""
         return ProcessNoise(*self._candidates[:, self._best])
+
+    @property
+    def missing_rate(self) -> tuple[float, float]:
+        """What the rates of the cells lack of the mean rate of the last day [m/d], and its variance [m²/d²].
+
+        It is the height that the class gained at once, as by snowfall. What the cells lag behind its course
+        is in the variance. Snow that drifts lies in the same places all day. A lag differs from cell to cell
+        by as much as it is, and the course itself may lag by as much. Source: equations.md, 6.12.
+        """
+        _, height_m, scatter_m2 = self._surges
+        lag_m_d = self._lag_m_d(self.course.mean_rate_m_d)
+        return float(height_m.sum()), float(np.sqrt(scatter_m2).sum() ** 2) + 2 * lag_m_d**2
+
+    def _lag_m_d(self, mean_rate_m_d: float) -> float:
+        """Return what the rates of the cells lack of the mean rate of the class; 0 if that is not known."""
+        rate_m_d = self._states.rate_m_d[self._best]
+        known = np.isfinite(rate_m_d)
+        return mean_rate_m_d - float(np.median(rate_m_d[known])) if mean_rate_m_d and known.any() else 0.0
 
     def advance(
         self, days: float, change_m: Floats, random_m2: Floats, systematic_m2: Floats
@@ -92,15 +114,18 @@ class ClassFilter:
         known = observed & np.isfinite(states.level_m[0])
         innovation_m = (change_m - states.level_m)[:, known]
         expected_m2 = (states.level_m2 + variance_m2)[:, known]
+        scatter_m2 = 0.0
         if known.any():
             allowed_m2 = expected_m2[self._best] + (SYSTEMATIC_SIGMAS**2 - 1) * systematic_m2[known]
             excess = np.median(innovation_m[self._best] ** 2 / allowed_m2) / MEDIAN_CHI2
-            surge_m2 = max(excess - 1, 0.0) * float(np.median(allowed_m2))
             if excess > MOVED_EXCESS and days > 0:
-                noise = replace(noise, level_m2_d=noise.level_m2_d + surge_m2 / days)
-                states = replace(states, level_m2=states.level_m2 + surge_m2)
+                scatter_m2 = (excess - 1) * float(np.median(allowed_m2))
+                noise = replace(noise, level_m2_d=noise.level_m2_d + scatter_m2 / days)
+                states = replace(states, level_m2=states.level_m2 + scatter_m2)
             else:
                 self._learn(days, innovation_m, expected_m2)
+        aged = self._surges + np.array([[days], [0.0], [0.0]])
+        self._surges = np.column_stack([aged[:, aged[0] < 1], [0.0, motion.surge_m, scatter_m2]])
         self._states = _updated(states, observed, np.where(observed, change_m, 0.0), variance_m2)
         moved_m = self._states.level_m[self._best] - before_m
         self.course.follow(moved_m[np.isfinite(moved_m)])
@@ -118,7 +143,8 @@ class ClassFilter:
         variances_m2 = (
             float(np.median(values[chosen])) if chosen.any() else 0.0 for values in (random_m2, systematic_m2)
         )
-        return self.course.advance(days, moved_m, *variances_m2)
+        motion = self.course.advance(days, moved_m, *variances_m2)
+        return replace(motion, lag_m_d=self._lag_m_d(float(motion.mean_rate_m_d)))
 
     def _learn(self, days: float, innovation_m: Floats, expected_m2: Floats) -> None:
         loss = np.minimum(innovation_m**2 / expected_m2, STEP_SIGMAS**2) + np.log(expected_m2)

@@ -11,6 +11,7 @@ from station.science.time_series.cell_filter import LevelRate
 from station.science.time_series.class_filter import ClassFilter
 
 TINY_M2 = 1e-12  # against division by zero
+OWN_PROCESS = 0.5  # share of what a cell does besides its class that the cells around it do not do
 
 
 @dataclass(frozen=True)
@@ -18,7 +19,9 @@ class FilterErrors:
     """Variances of the errors of level [m²] and rate [m²/d²] of cells (n,), without those of the reference.
 
     Random errors are independent between cells. Systematic ones are taken as the same in all of them: errors
-    that a scan's cells share, and what the surface did since that the scans do not show.
+    that a scan's cells share, and what the surface did since that the scans do not show. Errors that last are
+    learned as process noise too, and are in the course as in the cells: the largest of the three counts. What
+    stable ground seems to do is such an error.
     """
 
     level_random_m2: Floats
@@ -45,7 +48,7 @@ def filter_errors(
     random, systematic = (_moved(matrix, unseen_d) for matrix in (shares.random, shares.systematic))
     single = random_m2 / np.maximum(random_m2 + systematic_m2, TINY_M2)
     is_seen = unseen_d == 0
-    parts = []
+    parts: list[Floats] = []
     one, zero = np.ones_like(single), np.zeros_like(single)
     for index, (variance, first_random, first_process, first_shared) in enumerate(
         ((state.level_m2, single, zero, one), (state.rate_m2_d2, zero, one, zero))
@@ -53,21 +56,31 @@ def filter_errors(
         total = shares.total[index, index]
         settled = np.minimum(total / np.maximum(variance, TINY_M2), 1.0)
 
-        def share(matrix: Floats, first: Floats, index: int = index, settled: Floats = settled) -> Floats:
-            return np.asarray(settled * matrix[index, index] + (1 - settled) * first)
+        def share(part: float, first: Floats, settled: Floats = settled) -> Floats:
+            return np.asarray(settled * part + (1 - settled) * first)
 
+        process = 0.0 if ground.is_stable else shares.process[index, index] / total
         random_part = np.where(
             is_seen,
-            share(shares.random / total, first_random) * variance,
+            share(shares.random[index, index] / total, first_random) * variance,
             np.minimum(random[index], variance),
         )
-        process_part = np.where(
-            is_seen, share(shares.process / total, first_process) * variance, variance - random_part
-        )
-        shared_part = np.where(is_seen, share(shares.systematic, first_shared), systematic[index])
-        parts += [random_part, process_part + shared_part * systematic_m2]
-    for index, course in zip((1, 3), ground.course.variances(systematic_m2), strict=True):
-        parts[index] = parts[index] + course
+        process_part = np.where(is_seen, share(process, first_process) * variance, variance - random_part)
+        process_part += ground.missing_rate[1] * index  # of the rate
+        shared = np.where(is_seen, share(shares.systematic[index, index], first_shared), systematic[index])
+        course = ground.course.errors(index, systematic_m2)
+        course_process = 0.0 if ground.is_stable else course.process
+        parts += [
+            random_part + OWN_PROCESS * process_part,
+            np.maximum.reduce(
+                [
+                    (1 - OWN_PROCESS) * process_part + course_process,
+                    shared * systematic_m2,
+                    course.systematic,
+                ]
+            )
+            + course.random,
+        ]
     return FilterErrors(*parts)
 
 

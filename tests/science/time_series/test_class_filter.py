@@ -1,5 +1,7 @@
 """Learned process noise and error shares: against explicit weights, and simulated seasons with a truth."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -30,7 +32,7 @@ def test_shares_are_those_of_the_weights_of_each_scan():
 
 
 def season(kind, random_m, systematic_m, seed, *, lasting=False, cells=600, days=12):
-    """True levels (t, n), true rates over the last day without steps, and hourly observations with gaps."""
+    """True levels (t, n), true mean rates over the last day, and hourly observations with gaps."""
     rng = RNG(seed)
     day = HOUR_D * np.arange(24 * days)
     factor = rng.uniform(0.7, 1.3, cells)
@@ -43,9 +45,9 @@ def season(kind, random_m, systematic_m, seed, *, lasting=False, cells=600, days
         "melt": np.cumsum(-0.06 * weather * sun) * HOUR_D,
         "snow": settling_m,
     }[kind]
-    rate_m_d = (course_m - np.roll(course_m, 24))[:, None] * factor
     fall_m = 0.3 * np.clip((day - 4.0) / 0.4, 0, 1) if kind == "snow" else 0.0
     level_m = (course_m + fall_m)[:, None] * factor
+    rate_m_d = level_m - np.roll(level_m, 24, axis=0)
     shared = rng.standard_normal(len(day))
     if lasting:
         kept = np.exp(-HOUR_D / CORRELATION_D)
@@ -68,6 +70,7 @@ def filtered(change_m, random_m, systematic_m, *, stable=False):
         noise, motion = ground.advance(days, scan_m[sample], random_m2[sample], systematic_m2[sample])
         cells.advance(days, noise, motion, scan_m, random_m2, systematic_m2)
         state = cells.estimates()
+        state = replace(state, rate_m_d=state.rate_m_d + ground.missing_rate[0])
         yield state, filter_errors(state, cells.unseen_d, random_m2, systematic_m2, ground)
 
 
