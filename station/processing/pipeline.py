@@ -150,11 +150,17 @@ class AdjustmentInputs:
 
 
 def adjust_to_reference(
-    gridder: Gridder, scan_geometry: ScanGeometry, inputs: AdjustmentInputs, viewing: ViewingGeometry
+    gridder: Gridder,
+    scan_geometry: ScanGeometry,
+    inputs: AdjustmentInputs,
+    viewing: ViewingGeometry,
+    *,
+    of_reference: bool = False,
 ) -> Adjustment:
     """Return the scanner state estimated from a gridded scan: tilt, heading, position, range, refraction.
 
     If it has moved farther than expected, it is estimated again with a prior as wide as the motion.
+    A scan `of_reference` is one that the reference is built from.
     """
     components, reference_state = usual_motion(viewing.reference, inputs.time_s), viewing.reference.shared
     cells = _cells(gridder, viewing, snow_test(gridder, scan_geometry, viewing))
@@ -167,7 +173,8 @@ def adjust_to_reference(
         log = inputs.log
         if log is not None and reference_state is not None:
             log = log.relative_to(inputs.params, state_prior.reference_covariance(reference_state))
-        return adjust_scan(patches, inputs.assumed_rad, state_prior.relative_to(reference_state), log)
+        relative_prior = state_prior.relative_to(reference_state)
+        return adjust_scan(patches, inputs.assumed_rad, relative_prior, log, of_reference=of_reference)
 
     adjustment = adjusted(components)
     widened = variance_components.as_wide_as(components, adjustment.estimate)

@@ -79,16 +79,20 @@ def adjust_scan(
     viewing: ViewingGeometry | None,
     *,
     even_if_given: bool = False,
+    of_reference: bool = False,
 ) -> tuple[AdjustmentInputs, Adjustment] | None:
     """Return the adjustment of a scan to the reference; None if it is disabled or there is no reference.
 
-    Also None if its registration is given, unless `even_if_given`.
+    Also None if its registration is given, unless `even_if_given`. A scan `of_reference` is one that the
+    reference is built from.
     """
     if inputs.is_given and not even_if_given:
         return None
     if not site.adjusts or inputs.adjustment_inputs is None or viewing is None:
         return None
-    adjustment = adjust_to_reference(gridder, inputs.geometry, inputs.adjustment_inputs, viewing)
+    adjustment = adjust_to_reference(
+        gridder, inputs.geometry, inputs.adjustment_inputs, viewing, of_reference=of_reference
+    )
     trim_heap()
     return inputs.adjustment_inputs, adjustment
 
