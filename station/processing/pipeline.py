@@ -150,17 +150,11 @@ class AdjustmentInputs:
 
 
 def adjust_to_reference(
-    gridder: Gridder,
-    scan_geometry: ScanGeometry,
-    inputs: AdjustmentInputs,
-    viewing: ViewingGeometry,
-    *,
-    of_reference: bool = False,
+    gridder: Gridder, scan_geometry: ScanGeometry, inputs: AdjustmentInputs, viewing: ViewingGeometry
 ) -> Adjustment:
     """Return the scanner state estimated from a gridded scan: tilt, heading, position, range, refraction.
 
     If it has moved farther than expected, it is estimated again with a prior as wide as the motion.
-    A scan `of_reference` is one that the reference is built from.
     """
     components, reference_state = usual_motion(viewing.reference, inputs.time_s), viewing.reference.shared
     cells = _cells(gridder, viewing, snow_test(gridder, scan_geometry, viewing))
@@ -173,8 +167,7 @@ def adjust_to_reference(
         log = inputs.log
         if log is not None and reference_state is not None:
             log = log.relative_to(inputs.params, state_prior.reference_covariance(reference_state))
-        relative_prior = state_prior.relative_to(reference_state)
-        return adjust_scan(patches, inputs.assumed_rad, relative_prior, log, of_reference=of_reference)
+        return adjust_scan(patches, inputs.assumed_rad, state_prior.relative_to(reference_state), log)
 
     adjustment = adjusted(components)
     widened = variance_components.as_wide_as(components, adjustment.estimate)

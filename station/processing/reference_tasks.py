@@ -255,7 +255,7 @@ def _add_scan(
         gridder = shared[0] if shared else new_gridder(inputs.geometry, viewing)
         blocks = inputs.shots(opened, site.scans.intensity)
         (add_blocks if viewing is None else grid_scan)(gridder, blocks, inputs.pose, progress)
-    adjustment = adjust_scan(site, gridder, inputs, viewing, of_reference=True)
+    adjustment = adjust_scan(site, gridder, inputs, viewing)
     if viewing is None:
         shared[:] = [gridder]
     else:

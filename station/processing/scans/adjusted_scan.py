@@ -79,20 +79,16 @@ def adjust_scan(
     viewing: ViewingGeometry | None,
     *,
     even_if_given: bool = False,
-    of_reference: bool = False,
 ) -> tuple[AdjustmentInputs, Adjustment] | None:
     """Return the adjustment of a scan to the reference; None if it is disabled or there is no reference.
 
-    Also None if its registration is given, unless `even_if_given`. A scan `of_reference` is one that the
-    reference is built from.
+    Also None if its registration is given, unless `even_if_given`.
     """
     if inputs.is_given and not even_if_given:
         return None
     if not site.adjusts or inputs.adjustment_inputs is None or viewing is None:
         return None
-    adjustment = adjust_to_reference(
-        gridder, inputs.geometry, inputs.adjustment_inputs, viewing, of_reference=of_reference
-    )
+    adjustment = adjust_to_reference(gridder, inputs.geometry, inputs.adjustment_inputs, viewing)
     trim_heap()
     return inputs.adjustment_inputs, adjustment
 

@@ -5,9 +5,7 @@ smoothly between knots. Bare ground that is not known to be stable has trends an
 at the edge of the ice, as the refraction of cold air does, and snow does not. Stable ground is not quite at
 rest: it heaves, as a whole and by blocks, and where moving ground rises it may be under thin snow. The sizes
 of trends and of the change between knots are not known. A model is one choice of them, and of whether bare
-ground has trends; an adjustment weighs all models by their likelihood. The mean and the trends with distance
-and height, as of melt and settling, are free in any model: between them and a motion of the scanner only
-stable ground and the log decide.
+ground has trends; an adjustment weighs all models by their likelihood.
 Source: equations.md, 6.3; adjustment.md, 5.
 """
 
@@ -30,8 +28,6 @@ CHANGE_RANGE_BINS = 3  # range bins between two knots of the change
 CHANGE_STEPS_M = tuple(float(step) for step in np.geomspace(0.5 / 2**11, 0.5, 12))
 TREND_SIZES_M = tuple(float(size) for size in np.geomspace(0.0005, 2.0, 8))
 TRENDS = 6
-FREE_TRENDS = np.array([True, False, False, True, False, True])  # mean, distance, height
-FREE_TREND_M = 0.3  # one sigma: melt, snowfall and settling of days
 KINDS = 2  # of moving ground: ice and snow, bare ground
 KIND_SPACING = 10_000  # of the azimuth knots of two kinds, so that they are not correlated
 MIN_SHARE = 1e-6  # of a kind of ground in a patch; less is rounding
@@ -107,8 +103,7 @@ START_MODEL = ChangeModel(0, len(CHANGE_STEPS_M) // 2, len(TREND_SIZES_M) // 2)
 class GroundChange:
     """Unknown change of patches (n,): trends, knots, depths of thin snow, heave, in this order.
 
-    `free_m` is sigma of the trends that are free, zero if none is. `rise_m` is the mean estimated rise; snow
-    may lie if it is positive.
+    Snow depths are free if `surface_rises`.
     """
 
     design: sparse.csr_array  # (n, k)
@@ -120,15 +115,12 @@ class GroundChange:
     snow_columns: int
     heave_columns: int
     heave_m: float
-    free_m: float
-    rise_m: float = THIN_SNOW_M
+    surface_rises: bool = True
 
     def precision_at(self, model: ChangeModel) -> tuple[Floats, float]:
         """Return the precision (k, k) of a model, and log |precision⁻¹|."""
-        change_m = np.hypot(model.size_m, self.rise_m if self.free_m else 0.0)
-        snow_m = min(float(change_m), THIN_SNOW_M) if self.rise_m > 0 else NO_CHANGE_M
+        snow_m = min(model.size_m, THIN_SNOW_M) if self.surface_rises else NO_CHANGE_M
         trend_m = TREND_SIZES_M[model.trend] * np.array([1.0] + [TREND_RATIO] * (TRENDS - 1))
-        trend_m = np.hypot(trend_m, self.free_m * FREE_TRENDS)
         bare_m = trend_m if model.bare else np.full(TRENDS, NO_CHANGE_M)
         knots, step_m = len(self.knot_precisions[model.ratio]), CHANGE_STEPS_M[model.step]
         first, last = self.trend_columns, self.trend_columns + knots
@@ -148,18 +140,18 @@ class GroundChange:
         return precision, float(log_determinant + 2 * np.log(sigma_m).sum())
 
     def updated(self, estimate_m: Floats, heave_variance_m2: Floats) -> GroundChange:
-        """Return this change with the size of heave that an estimate (k,) shows, and the mean rise.
+        """Return this change with the size of heave that an estimate (k,) shows, and whether snow may lie.
 
         Its variance is the mean of estimate squared plus posterior variance (heave_columns,), shrunk towards
         the start value (expectation-maximisation).
         """
-        rise_m = float((self.design @ estimate_m)[self.moving].mean()) if self.moving.any() else 0.0
+        rises = float((self.design @ estimate_m)[self.moving].mean()) > 0 if self.moving.any() else False
         heave_m = HEAVE_M
         if self.heave_columns:
             second_moment_m2 = float(np.sum(estimate_m[-self.heave_columns :] ** 2 + heave_variance_m2))
             second_moment_m2 += PRIOR_HEAVE_BLOCKS * HEAVE_M**2
             heave_m = max(np.sqrt(second_moment_m2 / (PRIOR_HEAVE_BLOCKS + self.heave_columns)), MIN_HEAVE_M)
-        return replace(self, heave_m=heave_m, rise_m=rise_m)
+        return replace(self, heave_m=heave_m, surface_rises=rises)
 
     def polar_mean(self, patches: Patches, estimate_m: Floats) -> Floats:
         """Return the mean estimated change of moving ground by azimuth sector and range ring."""
@@ -169,11 +161,8 @@ class GroundChange:
         return common_mode.polar_mean(azimuth_rad, distance_m, (self.design @ estimate_m)[self.moving])
 
 
-def ground_change(patches: Patches, moving: Bools, *, free: bool) -> GroundChange:
-    """Return the unknown change of patches, of which `moving` (n,) are moving ground.
-
-    With `free`, the trends in `FREE_TRENDS` are.
-    """
+def ground_change(patches: Patches, moving: Bools) -> GroundChange:
+    """Return the unknown change of patches, of which `moving` (n,) are moving ground."""
     shares = _shares(patches, moving)
     knot_design, precisions, log_determinants = _knots(patches, shares)
     trends = [_trends(patches, share) for share in shares]
@@ -190,7 +179,6 @@ def ground_change(patches: Patches, moving: Bools, *, free: bool) -> GroundChang
         snow_design.shape[1],
         heave_design.shape[1],
         HEAVE_M,
-        FREE_TREND_M if free else 0.0,
     )
 
 

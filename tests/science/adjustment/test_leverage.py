@@ -145,14 +145,11 @@ def test_leverage_of_a_cell_falls_with_the_sampling_step():
 
 
 def test_changing_ground_has_little_leverage():
-    """Of a scan of the reference; in others the mean of moving ground is free and has none."""
     rng = np.random.default_rng(7)
     noise_m, ground_class = rng.normal(0, 0.02, PATCH_COUNT), ground_classes(100)
     snow_m = np.where(ground_class == GroundClass.MOVING, 0.5 + 0.3 * rng.normal(size=PATCH_COUNT), 0.0)
     unchanged, changed = (
-        adjust_scan(
-            make_patches(noise_m + change_m, ground_class), NO_TILT, PRIOR, None, of_reference=True
-        ).leverage_m2
+        adjust_scan(make_patches(noise_m + change_m, ground_class), NO_TILT, PRIOR, None).leverage_m2
         for change_m in (0.0, snow_m)
     )
     assert max(unchanged) < 5 * SIGMA_M**2  # the trends of moving ground absorb some

@@ -43,9 +43,9 @@ def make_patches(seed, change_m, bare_share=0.0):
     return Patches(jacobian, range_bin, height_m, ground_class, residual_m, variance_m2, cells)
 
 
-def solve(seed, change_m, bare_share=0.0, *, free=False):
+def solve(seed, change_m, bare_share=0.0):
     patches = make_patches(seed, change_m, bare_share)
-    change = ground_change.ground_change(patches, patches.ground_class == GroundClass.MOVING, free=free)
+    change = ground_change.ground_change(patches, patches.ground_class == GroundClass.MOVING)
     equations = NormalEquations(patches.jacobian, change.design, patches.residual_m, PRIOR, None)
     reduced = equations.reduce(1 / patches.variance_m2)
     return patches, change, equations.size, solution.solve(reduced, equations.size, change, None)
@@ -113,7 +113,7 @@ def test_size_of_change_follows_the_change():
 
 
 def test_change_that_looks_like_tilt_widens_sigma():
-    """Settling in proportion to the distance, with a little stable ground on one side; no trend is free."""
+    """Settling in proportion to the distance, with a little stable ground on one side."""
     patches = make_patches(3, 0.0)
     distance_m = 80 * (patches.range_bin + 0.5)
     far = distance_m > 2000
@@ -128,25 +128,12 @@ def test_change_that_looks_like_tilt_widens_sigma():
     assert far_sigma_m(-0.2 * distance_m / 2400) > 1.2 * far_sigma_m(0.0)
 
 
-@pytest.mark.parametrize("free", [False, True], ids=["of the reference", "free trends"])
 @pytest.mark.parametrize("change_m", [0.0, 0.1, -3.0])
-def test_melt_that_ends_at_the_edge_of_the_ice_is_no_refraction(change_m, free):
+def test_melt_that_ends_at_the_edge_of_the_ice_is_no_refraction(change_m):
     """Neighbouring bare ground has not changed; k over ice does not differ."""
     moving = PARAMS.names.index("refraction_ice")
     standardised = []
     for seed in range(12):
-        mixture = solve(seed, change_m, bare_share=0.4, free=free)[3].mixture()
+        mixture = solve(seed, change_m, bare_share=0.4)[3].mixture()
         standardised.append(mixture.estimate[moving] / sigma_of(mixture, moving + 1)[moving])
     assert np.abs(standardised).max() < 3
-
-
-@pytest.mark.parametrize("free", [False, True], ids=["of the reference", "free trends"])
-def test_only_mean_distance_and_height_are_free(free):
-    """Sigma of the trends with no observation, where the model says half a millimetre."""
-    change = solve(1, 0.0, free=free)[1]
-    precision, log_determinant = change.precision_at(ChangeModel(0, 0, 0))
-    sigma_m = 1 / np.sqrt(np.diag(precision)[:6])
-    small = 0.0005 * np.array([1, 0.6, 0.6, 0.6, 0.6, 0.6])
-    expected = np.hypot(small, [0.3, 0, 0, 0.3, 0, 0.3]) if free else small
-    assert sigma_m == pytest.approx(expected, rel=1e-9)
-    assert log_determinant == pytest.approx(-np.linalg.slogdet(precision)[1], rel=1e-9)
