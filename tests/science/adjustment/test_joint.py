@@ -554,7 +554,10 @@ def test_an_avalanche_does_not_change_heights_elsewhere():
 
 
 def simulate_thin_snow(seed, change_m):
-    """Standardised errors and errors, where glacier and all but steep rock changed by `change_m`."""
+    """Standardised errors and errors, where glacier and all but steep rock changed by `change_m`.
+
+    Frost has moved all rock by a millimetre, up or down.
+    """
     rng = np.random.default_rng(seed)
     _, root = dense_prior(PARAMS)
     state = root @ rng.normal(size=len(root))
@@ -564,8 +567,9 @@ def simulate_thin_snow(seed, change_m):
         random_sites(99, 200),
     )
     snow_covered = np.hypot(stable.east, stable.north) < np.tan(np.radians(40)) if change_m > 0 else 0.0
+    stable_m = stable.matrix() @ state + rng.normal(0, 0.003, 1500) + change_m * snow_covered
     patches = concatenate(
-        stable.patches(stable.matrix() @ state + rng.normal(0, 0.003, 1500) + change_m * snow_covered, 0.003),
+        stable.patches(stable_m + rng.choice([-0.001, 0.001]), 0.003),
         glacier.patches(
             glacier.matrix() @ state + rng.normal(0, 0.003, 1500) + change_m, 0.003, GroundClass.MOVING
         ),
@@ -581,7 +585,7 @@ def test_thin_snow_on_rock_is_not_mistaken_for_a_shift_of_the_scanner():
         for values in zip(*(simulate_thin_snow(seed, 0.006) for seed in range(6)), strict=True)
     )
     assert np.abs(error_m.mean(axis=1)).max() < 0.003  # without the snow depths: 6 mm
-    assert 0.6 < np.sqrt(np.mean(z**2)) < 1.25  # of six scans, whose cells share most of their error
+    assert 0.7 < np.sqrt(np.mean(z**2)) < 1.25  # of six scans, whose cells share most of their error
 
 
 def test_the_uncertainty_of_the_reference_is_added_to_the_prior():
