@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import xarray as xr
 from xarray.backends import BackendArray
+from xarray.backends.netCDF4_ import NETCDF4_PYTHON_LOCK
 from xarray.core.indexing import (
     ExplicitIndexer,
     IndexingSupport,
@@ -82,7 +83,8 @@ class ComputedArrays:
             window = slice(rows.min(), rows.max() + 1), slice(columns.min(), columns.max() + 1)
             versions = np.array([self._versions[time] for time in times.tolist()])
             for version in set(versions.tolist()) - {""}:
-                height_m = self._surfaces.height_m(version, *window)
+                with NETCDF4_PYTHON_LOCK:  # netCDF4 reads the reference, and dask calls this in threads
+                    height_m = self._surfaces.height_m(version, *window)
                 surface_m[versions == version] = height_m[np.ix_(rows - rows.min(), columns - columns.min())]
         single = tuple(axis for axis, part in enumerate(key) if isinstance(part, int | np.integer))
         return np.asarray(surface_m.squeeze(single))

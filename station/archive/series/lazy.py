@@ -82,18 +82,20 @@ class _SeriesStore(NetCDF4DataStore):
         stored: dict[str, xr.Variable] = dict(super().get_variables())  # type: ignore[no-untyped-call]
         if CHANGE not in stored:
             return stored
-        computed = ComputedArrays(self.folder, stored, self._read_stored, self._read_versions)
+        # Opened here, because dask reads in threads and opening a variable of netCDF4 takes no lock.
+        arrays = {name: _CheckedArray(name, self) for name in stored}  # type: ignore[no-untyped-call]
+
+        def read_stored(name: str, key: Key) -> Array:
+            return np.asarray(arrays[name]._getitem(key))  # noqa: SLF001 - of this module
+
+        def read_versions() -> list[str]:
+            return decode_text(read_stored("reference_version", (...,)))
+
+        computed = ComputedArrays(self.folder, stored, read_stored, read_versions)
         variables = stored | computed.variables()
         variables.pop(OUTSIDE, None)  # it is in the elevation
         position = {name: number for number, name in enumerate(BY_NAME)}
         return dict(sorted(variables.items(), key=lambda item: position.get(item[0], -1)))
-
-    def _read_stored(self, name: str, key: Key) -> Array:
-        return np.asarray(_CheckedArray(name, self)._getitem(key))  # type: ignore[no-untyped-call]  # noqa: SLF001 - of this module
-
-    def _read_versions(self) -> list[str]:
-        characters = _CheckedArray("reference_version", self)._getitem(...)  # type: ignore[no-untyped-call]  # noqa: SLF001
-        return decode_text(np.asarray(characters))
 
     def open_store_variable(self, name: str, var: Any) -> xr.Variable:  # noqa: ANN401 - netCDF4 has no types
         """Return a lazy variable; that of a raster has chunks to read and to write it by."""

@@ -125,6 +125,16 @@ def test_chunks_of_dask(stored, chunks, expected):
         )
 
 
+def test_threads_of_dask_read_the_reference_one_at_a_time(stored):
+    """The library netCDF4 is not safe in threads: two that open a file at once end the process."""
+    with station.open(stored.folder) as plain:
+        expected = plain.elevation.load()
+    for _ in range(4):
+        with station.open(stored.folder, {"time": 1}) as ds:
+            actual = ds.elevation.compute(scheduler="threads", num_workers=8)
+        xr.testing.assert_identical(actual, expected)
+
+
 @pytest.mark.parametrize("chunks", [None, {}])
 def test_a_part_of_the_series_is_written_compressed_and_without_a_warning(stored, tmp_path, chunks):
     """pytest turns warnings into errors."""
