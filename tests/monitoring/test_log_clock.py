@@ -82,6 +82,7 @@ def test_status_lists_the_offset_among_the_faults(problem_of, tmp_path, monkeypa
         epoch=None,
         registration=None,
         grid=SimpleNamespace(shape=(2, 3)),
+        publish=None,
         adjusts=True,
         weather=None,
         mirror=None,
