@@ -332,17 +332,3 @@ def test_the_index_is_current_until_a_file_is_added_or_removed(growing, epoch):
     assert len(manifest.index_if_current(series)) == 2
     written.path.unlink()
     assert manifest.index_if_current(series) is None
-
-
-@pytest.mark.slow
-def test_the_cost_of_an_epoch_hardly_grows_over_a_year(tmp_path, monkeypatch):
-    """CPU time of series, areas and page; measuring a scan does not depend on the length of the series."""
-    from benchmarks import growth
-
-    monkeypatch.undo()
-    cpu_s = []
-    for count in (600, 8760):
-        site = growth.station_of(tmp_path / str(count), growth.SMALL)
-        cost = growth.cost(site, growth.fill(site, count))
-        cpu_s.append(cost["update_s"] + cost["publish_s"])
-    assert cpu_s[1] < 1.6 * cpu_s[0]  # the checksum of the series grows with it

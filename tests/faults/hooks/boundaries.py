@@ -110,9 +110,16 @@ class _Connection(sqlite3.Connection):
 
 
 def _label(target):
-    """Return a name of a file or descriptor in the data folder that is equal in all runs; None elsewhere."""
+    """Return a name of a file or descriptor in the data folder that is equal in all runs; None elsewhere.
+
+    The files that the page has of each epoch are one boundary.
+    """
     path = Path(f"/proc/self/fd/{target}").readlink() if isinstance(target, int) else Path(target)
     _, separator, relative = f"{path}/".partition("/data/")
+    if relative.startswith("page/"):
+        relative = re.sub(r"\d{8}T\d{6}Z(_r\d+)?", "EPOCH", relative)
+    elif relative.startswith("blocks/"):
+        relative = re.sub(r"_[0-9a-f]{8}(?=\.)", "_HASH", relative)
     return re.sub(r"\.\d+\.part/$", ".part/", relative) if separator else None
 
 
