@@ -211,7 +211,7 @@ def fill(
     build_series(series)
     update_areas(series, load_areas(site), _InstantAggregator(), lambda: None)
     update_boxes(series, _RepeatedBlocks(series), lambda: None)
-    with mock.patch.object(EventQueries, "_search", lambda *_: []):  # of a year it would take half an hour
+    with mock.patch.object(EventQueries, "_search", return_value=[]):  # of a year it would take half an hour
         update_series(site, lambda: None)
     for _ in range(PAGE_UPDATES):
         publish(site, None, lambda: None)
