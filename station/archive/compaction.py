@@ -37,7 +37,7 @@ from station.archive.series.epoch_reader import (
 )
 from station.archive.series.index import SeriesIndex, list_epochs
 from station.archive.series.manifest import listed_sources
-from station.archive.series.virtual import write_scalars, write_time_coverage
+from station.archive.series.virtual import create_scalars, write_scalars, write_time_coverage
 
 DAY_CLOSED = timedelta(hours=6)  # after its end; a later scan causes a new revision
 MONTH_CLOSED = timedelta(days=2)
@@ -142,17 +142,19 @@ def write_compacted(
 ) -> None:
     """Copy epochs into one file with `name` in its title."""
     title = f"Elevation change at {series.name or series.station_id}, {name}"
+    count = epoch_sources[-1].series_start + epoch_sources[-1].count
     with atomic_write(path) as tmp_path:
         with netCDF4.Dataset(tmp_path, "w", clobber=False) as file:
-            write_scalars(file, series, title, epoch_sources, epoch_sources[0].parameters)
+            create_scalars(file, series, title, count, epoch_sources[0].parameters)
             for spec in LARGE_VARIABLES:
                 if any(spec.name in source.raster_shapes for source in epoch_sources):
-                    create_variable(file, spec, series, len(file["time"]))
+                    create_variable(file, spec, series, count)
         with h5py.File(tmp_path, "r+", libver=LIBVER_COMPAT, meta_block_size=METADATA_BLOCK_BYTES) as file:
+            write_scalars(file, epoch_sources, epoch_sources[0].parameters)
             write_time_coverage(file)
             for spec in LARGE_VARIABLES:
                 if spec.name in file:
-                    file[spec.name].resize(len(file["time"]), axis=0)
+                    file[spec.name].resize(count, axis=0)
             for source in epoch_sources:
                 verify(source.path)
                 _copy_epochs(file, source, progress)

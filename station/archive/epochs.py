@@ -27,6 +27,7 @@ from station.archive.discovery import time_coverage
 from station.archive.netcdf_layout import Series, create_file, create_variable, decode_text, encode_text
 from station.archive.raster_io import Array, rounded, write_rasters
 from station.archive.schema import BY_NAME, FILL, TERMS, VARIABLES, VERDICTS
+from station.archive.small_variables import write_epochs
 from station.errors import StoreError
 from station.quantities import Floats, Measurement, Quality, SharedParameters
 
@@ -109,8 +110,11 @@ def write_epoch(
     suffix = f"_r{revision}" if revision > 1 else ""
     path = epoch_folder(series, start) / f"{series.station_id}_{start.strftime(TIME_FORMAT)}{suffix}.nc"
     with atomic_write(path) as tmp_path:
+        values = _small_values(epoch, path.name)
         with netCDF4.Dataset(tmp_path, "w", clobber=False) as file:
-            _write(file, series, epoch, path.name)
+            _create(file, series, epoch, values)
+        with h5py.File(tmp_path, "r+") as file:
+            write_epochs(file, values)
         columns = _measurement_variables(epoch.measurement)
         specs = {column: BY_NAME[name] for name, column in columns.items()}
 
@@ -228,28 +232,16 @@ def read_air(path: Path) -> tuple[float, ...]:
     return () if len(values) < len(AIR_VARIABLES) or np.ma.is_masked(values[0]) else tuple(map(float, values))
 
 
-def _write(file: netCDF4.Dataset, series: Series, epoch: Epoch, name: str) -> None:
+def _create(file: netCDF4.Dataset, series: Series, epoch: Epoch, values: Mapping[str, Array]) -> None:
+    """Create the file of an epoch with all its variables."""
     shared = epoch.shared
     parameters = (shared.names, shared.units) if shared is not None else ((), ())
     title = f"Elevation change at {series.name or series.station_id}, one scan"
     create_file(file, series, title, 1, parameters)
-    file["time"][0] = (epoch.start_s + epoch.end_s) / 2
-    file["time_bnds"][0] = (epoch.start_s, epoch.end_s)
     file.setncatts(time_coverage(epoch.start_s, epoch.end_s))
-    for variable in _measurement_variables(epoch.measurement):
-        create_variable(file, BY_NAME[variable], series, 1)
-    if shared is not None:
-        create_variable(file, BY_NAME["shared_parameter"], series, 1)[0] = shared.estimate
-        create_variable(file, BY_NAME["shared_parameter_covariance"], series, 1)[0] = shared.covariance
-        create_variable(file, BY_NAME["shared_parameter_line_tilt_variance"], series, 1)[0] = (
-            shared.line_tilt_variance
-        )
-        if epoch.redundancy is not None:
-            create_variable(file, BY_NAME["shared_parameter_redundancy"], series, 1)[0] = epoch.redundancy
-        if shared.change_errors is not None:
-            create_variable(file, BY_NAME["change_errors"], series, 1)[0] = shared.change_errors.modes
-            create_variable(file, BY_NAME["change_pattern"], series, 1)[0] = shared.change_errors.polar_change
-    _write_scalars(file, series, epoch, name)
+    for spec in VARIABLES:
+        if spec.name in values or spec.name in _measurement_variables(epoch.measurement):
+            create_variable(file, spec, series, 1)
 
 
 def _measurement_variables(measurement: Measurement) -> dict[str, str]:
@@ -257,8 +249,8 @@ def _measurement_variables(measurement: Measurement) -> dict[str, str]:
     return MEASUREMENT_VARIABLES | {term: term for term in TERMS if term in measurement.terms}
 
 
-def _write_scalars(file: netCDF4.Dataset, series: Series, epoch: Epoch, name: str) -> None:
-    """Write the values with one entry per scan: numbers and texts."""
+def _small_values(epoch: Epoch, name: str) -> dict[str, Array]:
+    """Return the values (1, …) of every variable of the file `name` but the rasters."""
     texts = {
         "scan_id": epoch.scan_id,
         "verdict_reason": epoch.verdict_reason,
@@ -266,14 +258,37 @@ def _write_scalars(file: netCDF4.Dataset, series: Series, epoch: Epoch, name: st
         **epoch.provenance,
     }
     valid_count = int(np.count_nonzero(np.isfinite(epoch.measurement.change_m)))
-    verdict = VERDICTS.index(epoch.verdict)
-    numbers: dict[str, float] = {**epoch.scalars, "verdict": verdict, "valid_count": valid_count}
+    numbers: dict[str, float] = {
+        **epoch.scalars,
+        "verdict": VERDICTS.index(epoch.verdict),
+        "valid_count": valid_count,
+    }
+    values: dict[str, Array] = {
+        "time": np.array([(epoch.start_s + epoch.end_s) / 2]),
+        "time_bnds": np.array([(epoch.start_s, epoch.end_s)]),
+    }
     for spec in VARIABLES:
         if spec.dims == ("time",):
-            value = numbers.get(spec.name)
-            variable = create_variable(file, spec, series, 1)
-            variable[0] = value if value is not None and np.isfinite(value) else np.ma.masked
+            value = numbers.get(spec.name, np.nan)
+            values[spec.name] = np.array([value if np.isfinite(value) else FILL])
         elif spec.dtype == "S1":
-            create_variable(file, spec, series, 1)[0] = encode_text([texts.get(spec.name, "")], spec.dims[1])[
-                0
-            ]
+            values[spec.name] = encode_text([texts.get(spec.name, "")], spec.dims[1])
+    return values | _shared_values(epoch)
+
+
+def _shared_values(epoch: Epoch) -> dict[str, Array]:
+    """Return the values (1, …) of the shared parameters."""
+    shared = epoch.shared
+    if shared is None:
+        return {}
+    values = {
+        "shared_parameter": shared.estimate,
+        "shared_parameter_covariance": shared.covariance,
+        "shared_parameter_line_tilt_variance": shared.line_tilt_variance,
+    }
+    if epoch.redundancy is not None:
+        values["shared_parameter_redundancy"] = epoch.redundancy
+    if shared.change_errors is not None:
+        values["change_errors"] = shared.change_errors.modes
+        values["change_pattern"] = shared.change_errors.polar_change
+    return {name: np.asarray(value)[np.newaxis] for name, value in values.items()}

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -159,22 +160,24 @@ def create_crs(file: netCDF4.Dataset, series: Series) -> None:
 
     Each form fixes a tool that failed without it. Source: store.md, 4.
     """
-    full_crs = CRS.from_user_input(series.crs)
-    crs = full_crs.sub_crs_list[0] if full_crs.is_compound else full_crs.to_2d()
-    attrs = {k: v for k, v in crs.to_cf().items() if v not in (None, "")}
-    wkt = crs.to_wkt().encode("ascii", "ignore").decode()
     grid = series.grid
-    attrs |= {
-        "crs_wkt": wkt,
-        "spatial_ref": wkt,
+    attrs = _crs_attributes(series.crs) | {
         "GeoTransform": f"{grid.west_m!r} {grid.cell_m!r} 0 {grid.north_m!r} 0 {-grid.cell_m!r}",
-        "proj_params": _proj4(crs),
     }
     if series.vertical_datum:
         attrs["geoid_name"] = series.vertical_datum
     variable = file.createVariable("crs", "i4", ())
     variable.setncatts({k: _ascii(v) for k, v in attrs.items()})
     variable[...] = 0
+
+
+@lru_cache(8)
+def _crs_attributes(user_crs: str) -> dict[str, Any]:
+    full_crs = CRS.from_user_input(user_crs)
+    crs = full_crs.sub_crs_list[0] if full_crs.is_compound else full_crs.to_2d()
+    wkt = crs.to_wkt().encode("ascii", "ignore").decode()
+    attrs = {k: v for k, v in crs.to_cf().items() if v not in (None, "")}
+    return attrs | {"crs_wkt": wkt, "spatial_ref": wkt, "proj_params": _proj4(crs)}
 
 
 def _proj4(crs: CRS) -> str:

@@ -5,13 +5,14 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
-import netCDF4
+import h5py
 import numpy as np
 
 from station.archive.areas import AreaChange
 from station.archive.derived.computed_rasters import CHANGE, RANDOM, TOTAL
 from station.archive.epochs import EpochRef
 from station.archive.netcdf_layout import Series
+from station.archive.small_variables import read_number
 from station.quantities import Bools, Floats, Grid, Quality, Reals
 from station.queries.epoch_cells import EpochCells, EpochReader, bounding_box, read_cells_of, read_window
 from station.science.adjustment import ground_classes
@@ -196,10 +197,10 @@ class Aggregates(EpochReader):
         the reference itself, a tenth of a millimetre for an area, which is counted nowhere else.
         """
         index = epoch_cells.epoch.index
-        with netCDF4.Dataset(epoch_cells.epoch.path) as file:
-            if not epoch_cells.adjusted or not set(LEVERAGE_VARIABLES) <= set(file.variables):
+        with h5py.File(epoch_cells.epoch.path, "r") as file:
+            if not epoch_cells.adjusted or not set(LEVERAGE_VARIABLES) <= set(file):
                 return None
-            moving, stable = (float(np.ma.filled(file[name][index], np.nan)) for name in LEVERAGE_VARIABLES)
+            moving, stable = (read_number(file, name, index) for name in LEVERAGE_VARIABLES)
         if not np.isfinite([moving, stable]).all():
             return None
         grid, (row, column) = self.grid, np.nonzero(common_cells)
@@ -230,7 +231,7 @@ class Aggregates(EpochReader):
         ny, nx = grid.ny // cells, grid.nx // cells
         if not ny or not nx:
             raise ValueError(f"blocks of {cells} cells do not fit a grid of {grid.ny} × {grid.nx}")
-        with netCDF4.Dataset(epoch.path) as file:
+        with h5py.File(epoch.path, "r") as file:
             change_m, random_m, sigma_m, count = (
                 read_window(file, name, epoch.index, (slice(ny * cells), slice(nx * cells)))
                 for name in (CHANGE, RANDOM, TOTAL, "point_count")
@@ -308,6 +309,6 @@ def observed_in_all(epochs: list[EpochCells], cells: Bools) -> Bools:
 
 def _has_quality(epoch: EpochRef, cells: Bools, flags: Quality) -> Bools:
     """Return True for selected cells (n,) that have any of the flags in an epoch."""
-    with netCDF4.Dataset(epoch.path) as file:
+    with h5py.File(epoch.path, "r") as file:
         quality = read_cells_of(file, "quality", epoch.index, cells).astype(np.int64)
     return np.asarray((quality & flags) > 0)

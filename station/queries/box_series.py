@@ -8,12 +8,13 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
-import netCDF4
+import h5py
 import numpy as np
 from scipy import sparse
 
 from station.archive.epochs import EpochRef
 from station.archive.netcdf_layout import Series
+from station.archive.small_variables import read_number
 from station.quantities import Bools, Grid, Ints
 from station.queries.aggregates import Aggregates
 from station.queries.epoch_cells import EpochCells
@@ -79,10 +80,8 @@ def _epoch_statistics(
         jacobian.sums(observed_weights).variance(np.where(observed, epoch_cells.random_m**2, 0.0), shared)
     )
     scatter_m = np.sqrt(observed_weights @ np.where(observed, (change_m - mean_m[box_index]) ** 2, 0.0))
-    with netCDF4.Dataset(epoch.path) as file:
-        tilt = {
-            f"{name[9:]}_deg": float(np.ma.filled(file[name][epoch.index], np.nan)) for name in TILT_VARIABLES
-        }
+    with h5py.File(epoch.path, "r") as file:
+        tilt = {f"{name[9:]}_deg": read_number(file, name, epoch.index) for name in TILT_VARIABLES}
     start = epoch.start.strftime("%Y-%m-%dT%H:%M:%SZ")
     return [
         {
@@ -95,10 +94,9 @@ def _epoch_statistics(
 
 
 def _scanner_position(epoch: EpochRef) -> tuple[float, float, float]:
-    with netCDF4.Dataset(epoch.path) as file:
+    with h5py.File(epoch.path, "r") as file:
         east_m, north_m, height_m = (
-            float(np.ma.filled(file[f"scanner_{axis}"][epoch.index], np.nan))
-            for axis in ("east", "north", "height")
+            read_number(file, f"scanner_{axis}", epoch.index) for axis in ("east", "north", "height")
         )
     return east_m, north_m, height_m
 

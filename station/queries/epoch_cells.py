@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-import netCDF4
+import h5py
 import numpy as np
 
 from station.archive.derived.computed_rasters import CHANGE, RANDOM, is_value, read_raster
@@ -13,8 +13,8 @@ from station.archive.epochs import EpochRef
 from station.archive.netcdf_layout import Series, decode_parameters
 from station.archive.raster_io import bounding_slices
 from station.archive.reference_files import open_reference
-from station.archive.schema import FILL
 from station.archive.series.index import list_epochs, nearest_epoch
+from station.archive.small_variables import read_epochs, read_number, read_text, read_variable
 from station.errors import StationError, StoreError
 from station.quantities import Bools, ChangeErrors, Floats, Reference, SharedParameters
 from station.queries.grid_arrays import to_index_or_time
@@ -92,36 +92,32 @@ class EpochReader:
         return self._read(epoch, None)
 
     def _read(self, epoch: EpochRef, cells: Bools | None) -> EpochCells:
-        with netCDF4.Dataset(epoch.path) as file:
-            reference = self.reference(str(file["reference_version"][epoch.index]))
+        with h5py.File(epoch.path, "r") as file:
+            reference = self.reference(read_text(file, "reference_version", epoch.index))
             change_m, random_m = (
                 np.empty(0) if cells is None else read_cells_of(file, name, epoch.index, cells)
                 for name in (CHANGE, RANDOM)
             )
-            scanner = tuple(
-                float(np.ma.filled(file[name][epoch.index], np.nan)) for name in SCANNER_VARIABLES
-            )
-            adjusted = str(file["adjustment"][epoch.index]) == "joint"
+            scanner = tuple(read_number(file, name, epoch.index) for name in SCANNER_VARIABLES)
+            adjusted = read_text(file, "adjustment", epoch.index) == "joint"
             shared = self._read_shared(file, epoch, scanner)
         return EpochCells(change_m, random_m, shared, scanner, reference, adjusted, epoch)
 
     def _read_shared(
-        self, file: netCDF4.Dataset, epoch: EpochRef, scanner: tuple[float, ...]
+        self, file: h5py.File, epoch: EpochRef, scanner: tuple[float, ...]
     ) -> SharedParameters | None:
         """Return the shared parameters of an epoch; None if the file does not contain them."""
-        if "parameter_name" not in file.variables or not np.isfinite(scanner).all():
+        if "parameter_name" not in file or not np.isfinite(scanner).all():
             return None
         if self._shared_cache is None or self._shared_cache[0] != epoch:
-            file.set_auto_chartostring(False)
             names, units = (
-                tuple(decode_parameters(np.ma.getdata(file[name][:]))) for name in PARAMETER_VARIABLES
+                tuple(decode_parameters(read_variable(file, name))) for name in PARAMETER_VARIABLES
             )
+            has_change_errors = set(CHANGE_ERROR_VARIABLES) <= set(file)
             estimate, covariance, line_tilt_variance, *change_fields = (
-                np.ma.filled(file[name][epoch.index].astype(np.float64), 0.0)  # 0 where not this epoch's
-                for name in (
-                    *SHARED_VARIABLES,
-                    *(CHANGE_ERROR_VARIABLES if set(CHANGE_ERROR_VARIABLES) <= set(file.variables) else ()),
-                )
+                np.where(is_value(values), values.astype(np.float64), 0.0)  # 0 where not this epoch's
+                for name in (*SHARED_VARIABLES, *(CHANGE_ERROR_VARIABLES if has_change_errors else ()))
+                for values in read_epochs(file, name, epoch.index, 1)
             )
             change_errors = ChangeErrors(*change_fields) if change_fields else None
             shared = SharedParameters(names, units, estimate, covariance, line_tilt_variance, change_errors)
@@ -138,7 +134,7 @@ class EpochReader:
         return parameter_layout(self.grid, position_m, (axis_east, axis_north, axis_up)), position_m
 
 
-def read_cells_of(file: netCDF4.Dataset, name: str, index: int, cells: Bools) -> Floats:
+def read_cells_of(file: h5py.File, name: str, index: int, cells: Bools) -> Floats:
     """Return the selected cells (n,) of a raster of a file; only their bounding box is read."""
     if not cells.any():
         return np.empty(0)
@@ -146,13 +142,11 @@ def read_cells_of(file: netCDF4.Dataset, name: str, index: int, cells: Bools) ->
     return np.asarray(read_window(file, name, index, bounds)[cells[bounds]])
 
 
-def read_window(file: netCDF4.Dataset, name: str, index: int, window: tuple[slice, slice]) -> Floats:
+def read_window(file: h5py.File, name: str, index: int, window: tuple[slice, slice]) -> Floats:
     """Return a window of a raster of a file, NaN without a value; not of the elevation."""
 
     def read(stored: str) -> Floats | None:
-        if stored not in file.variables:
-            return None
-        return np.ma.filled(file[stored][(index, *window)].astype(np.float64), FILL)
+        return file[stored][(index, *window)].astype(np.float64) if stored in file else None
 
     values = read_raster(name, read, lambda: np.empty(0))
     return np.where(is_value(values), values, np.nan)

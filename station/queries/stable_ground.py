@@ -7,7 +7,7 @@ from dataclasses import asdict, dataclass
 from itertools import pairwise
 from typing import Any
 
-import netCDF4
+import h5py
 import numpy as np
 from scipy import sparse
 
@@ -16,6 +16,7 @@ from station.archive.epochs import EpochRef, read_provenance
 from station.archive.netcdf_layout import Series
 from station.archive.read_errors import read_errors
 from station.archive.series.index import list_epochs
+from station.archive.small_variables import read_number, read_text
 from station.quantities import Bools, Floats, Floats32, Ints, Quality, Reference, SharedParameters
 from station.queries.aggregates import Aggregates
 from station.queries.epoch_cells import read_window
@@ -86,13 +87,11 @@ def z_by_range(series: Series, epoch: EpochRef) -> list[tuple[float, float | Non
     Raises StoreError if the epoch cannot be read.
     """
     grid = series.grid
-    with read_errors(epoch.path), netCDF4.Dataset(epoch.path) as file:
-        if "scanner_east" not in file.variables:
+    with read_errors(epoch.path), h5py.File(epoch.path, "r") as file:
+        if "scanner_east" not in file:
             return []
-        east_m, north_m = (
-            float(np.ma.filled(file[name][epoch.index], np.nan)) for name in ("scanner_east", "scanner_north")
-        )
-        quality = np.ma.filled(file["quality"][epoch.index], 0)
+        east_m, north_m = (read_number(file, name, epoch.index) for name in ("scanner_east", "scanner_north"))
+        quality = file["quality"][epoch.index]
         row, column = np.nonzero((quality & Quality.STABLE_GROUND) > 0)
         holdout = ground_classes.is_holdout(grid.x_m[column], grid.y_m[row])
         row, column = row[holdout], column[holdout]
@@ -128,13 +127,11 @@ def _read_holdout(series: Series, max_epochs: int, progress: Callable[[], None])
     aggregates, grid = Aggregates(series), series.grid
     is_holdout_cell = ground_classes.is_holdout(grid.x_m[None, :], grid.y_m[:, None])
     for epoch in sample_epochs(series, max_epochs):
-        with netCDF4.Dataset(epoch.path) as file:
-            quality = np.ma.filled(file["quality"][epoch.index], 0)
-            scan_id = str(file["scan_id"][epoch.index])
+        with h5py.File(epoch.path, "r") as file:
+            quality = file["quality"][epoch.index]
+            scan_id = read_text(file, "scan_id", epoch.index)
             holdout_cells = is_holdout_cell & ((quality & Quality.STABLE_GROUND) > 0)
-            sigma_m = np.ma.filled(
-                file["elevation_change_uncertainty"][epoch.index].astype(np.float64), np.nan
-            )
+            sigma_m = read_window(file, TOTAL, epoch.index, (slice(None), slice(None)))
         progress()
         if not holdout_cells.any():
             continue

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import netCDF4
+import h5py
 import numpy as np
 import xarray as xr
 
@@ -104,7 +104,7 @@ class Volumes(Aggregates):
 
     def _sigma(self, epoch: EpochRef, common_cells: Bools) -> Floats:
         """Return one sigma (n,) of the selected cells in an epoch, random and shared errors [m]."""
-        with netCDF4.Dataset(epoch.path) as file:
+        with h5py.File(epoch.path, "r") as file:
             return read_cells_of(file, TOTAL, epoch.index, common_cells)
 
     def _variance_contributions(

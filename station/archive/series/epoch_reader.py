@@ -16,6 +16,7 @@ from station.archive.epochs import EpochRef
 from station.archive.netcdf_layout import decode_parameters
 from station.archive.read_errors import read_errors
 from station.archive.schema import VARIABLES
+from station.archive.small_variables import open_variable, read_epochs, read_variable
 
 Parameters = dict[str, str]  # unit of each shared parameter, by name
 
@@ -59,11 +60,11 @@ def read_source(path: Path, file_start: int, series_start: int, count: int) -> E
         names = set(file)
         small_names = {"time_bnds", *(spec.name for spec in SMALL_VARIABLES)} & names
         parameter_texts = [
-            decode_parameters(_read(file, name))
+            decode_parameters(read_variable(file, name))
             for name in ("parameter_name", "parameter_unit")
             if name in names
         ]
-        scalars = {name: _read_epochs(file, name, file_start, count) for name in small_names}
+        scalars = {name: read_epochs(file, name, file_start, count) for name in small_names}
         return EpochSource(
             path=path,
             file_start=file_start,
@@ -71,7 +72,9 @@ def read_source(path: Path, file_start: int, series_start: int, count: int) -> E
             count=count,
             scalars=scalars | {"time": middle(scalars["time_bnds"])},
             raster_shapes={
-                spec.name: _open(file, spec.name).shape for spec in LARGE_VARIABLES if spec.name in names
+                spec.name: open_variable(file, spec.name).shape
+                for spec in LARGE_VARIABLES
+                if spec.name in names
             },
             parameters=dict(zip(*parameter_texts, strict=True)) if parameter_texts else {},
         )
@@ -80,28 +83,6 @@ def read_source(path: Path, file_start: int, series_start: int, count: int) -> E
 def middle(bounds_s: np.ndarray[Any, Any]) -> np.ndarray[Any, Any]:
     """Return the time (n,) of epochs with these bounds (n, 2) [s]; `series.nc` stores the bounds only."""
     return np.asarray(bounds_s.mean(axis=1), dtype=np.float64)
-
-
-def _open(file: Any, name: str) -> Any:  # noqa: ANN401 - h5py has no types
-    """Open a variable through h5py's low-level API; the high-level API dominates the time of small files."""
-    return h5py.h5d.open(file.id, name.encode())
-
-
-def _read(file: Any, name: str) -> np.ndarray[Any, Any]:  # noqa: ANN401
-    variable = _open(file, name)
-    values = np.empty(variable.shape, variable.dtype)
-    variable.read(h5py.h5s.ALL, h5py.h5s.ALL, values)
-    return values
-
-
-def _read_epochs(file: Any, name: str, start: int, count: int) -> np.ndarray[Any, Any]:  # noqa: ANN401
-    variable = _open(file, name)
-    values = np.empty((count, *variable.shape[1:]), variable.dtype)
-    if count:
-        space = variable.get_space()
-        space.select_hyperslab((start, *[0] * (values.ndim - 1)), values.shape)
-        variable.read(h5py.h5s.create_simple(values.shape), space, values)
-    return values
 
 
 def has_same_encoding(first: Any, second: Any) -> bool:  # noqa: ANN401 - h5py has no types

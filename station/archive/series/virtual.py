@@ -23,6 +23,7 @@ from station.archive.epochs import list_files
 from station.archive.netcdf_layout import TIMES_PER_CHUNK, Series, attributes, create_file, create_variable
 from station.archive.schema import FILL, VARIABLES, Variable
 from station.archive.series.epoch_reader import (
+    SMALL_VARIABLES,
     EpochSource,
     Parameters,
     contiguous_runs,
@@ -31,10 +32,14 @@ from station.archive.series.epoch_reader import (
 )
 from station.archive.series.index import list_epochs
 from station.archive.series.manifest import SeriesManifest, listed_sources, pending_epochs, write_manifest
+from station.archive.small_variables import open_variable, write_epochs
 from station.errors import StoreError
 from station.quantities import Quality
 
 LIBVER_VIRTUAL = ("v110", "v110")  # HDF5 version bounds; with newer ones only xarray can read the file
+SMALL_DIMS = {"time": ("time",), "time_bnds": ("time", "bnds")} | {
+    spec.name: spec.dims for spec in SMALL_VARIABLES
+}
 SCALE_ATTRIBUTES = ("CLASS", "NAME", "REFERENCE_LIST", "_FillValue")  # of a dimension scale, written by HDF5
 COMMENT = (
     "This file is virtual: times and rasters are read from days/, months/ and epochs/ beside it; copy the"
@@ -97,9 +102,9 @@ def _append(series: Series, manifest: SeriesManifest, new_sources: list[EpochSou
     for virtual in _virtual_files(series):
         last_chunk = read_source(virtual.path, unchanged, unchanged, manifest.count - unchanged)
         with atomic_write(virtual.path) as tmp_path:
-            with netCDF4.Dataset(tmp_path, "w", clobber=False) as file:
-                _write_stored(file, series, virtual, [last_chunk, *new_sources], manifest.parameters)
+            _create(tmp_path, series, virtual, new_sources[-1], manifest.parameters)
             with h5py.File(tmp_path, "r+", libver=LIBVER_VIRTUAL) as file:
+                write_scalars(file, [last_chunk, *new_sources], manifest.parameters)
                 with h5py.File(virtual.path, "r") as old_file:
                     names = ("time_bnds", *(spec.name for spec in virtual.variables if not spec.is_large))
                     copy_unchanged(old_file, file, names, unchanged)
@@ -118,9 +123,9 @@ def _rebuild(series: Series) -> Path:
         parameters = source.parameters | parameters
     for virtual in _virtual_files(series):
         with atomic_write(virtual.path) as tmp_path:
-            with netCDF4.Dataset(tmp_path, "w", clobber=False) as file:
-                _write_stored(file, series, virtual, epoch_sources, parameters)
+            _create(tmp_path, series, virtual, epoch_sources[-1], parameters)
             with h5py.File(tmp_path, "r+", libver=LIBVER_VIRTUAL) as file:
+                write_scalars(file, epoch_sources, parameters)
                 _link_sources(file, series, virtual, epoch_sources, parameters)
             _touch_replaced(series, {source.path for source in epoch_sources})
     newest_start_s = max(epoch.start for epoch in epochs).timestamp()
@@ -128,19 +133,17 @@ def _rebuild(series: Series) -> Path:
     return series.path
 
 
-def _write_stored(
-    file: netCDF4.Dataset,
-    series: Series,
-    virtual: _VirtualFile,
-    epoch_sources: list[EpochSource],
-    parameters: Parameters,
+def _create(
+    path: Path, series: Series, virtual: _VirtualFile, last: EpochSource, parameters: Parameters
 ) -> None:
-    """Write all that a virtual file contains itself."""
+    """Create a virtual file up to the last source, with all that it contains itself but the values."""
     has_parameters = any("parameter" in spec.dims for spec in virtual.variables)
-    write_scalars(
-        file, series, virtual.title, epoch_sources, parameters if has_parameters else {}, virtual.variables
-    )
-    file.comment = virtual.comment
+    count = last.series_start + last.count
+    with netCDF4.Dataset(path, "w", clobber=False) as file:
+        create_scalars(
+            file, series, virtual.title, count, parameters if has_parameters else {}, virtual.variables
+        )
+        file.comment = virtual.comment
 
 
 def _touch_replaced(series: Series, used: set[Path]) -> None:
@@ -153,38 +156,40 @@ def _touch_replaced(series: Series, used: set[Path]) -> None:
             os.utime(path)
 
 
-def write_scalars(
+def create_scalars(
     file: netCDF4.Dataset,
     series: Series,
     title: str,
-    epoch_sources: list[EpochSource],
+    count: int,
     parameters: Parameters,
     variables: Sequence[Variable] = VARIABLES,
 ) -> None:
-    """Write all of a file of many epochs but the large variables; missing values keep the fill value.
-
-    Epochs that precede the first source are not written.
-    """
-    file.set_auto_mask(False)
-    file.set_auto_chartostring(False)
-    first, count = epoch_sources[0].series_start, epoch_sources[-1].series_start + epoch_sources[-1].count
+    """Create all of a file of `count` epochs but the large variables."""
     create_file(file, series, title, count, (tuple(parameters), tuple(parameters.values())))
     for spec in variables:
         if not spec.is_large and all(dim in file.dimensions for dim in spec.dims):
             create_variable(file, spec, series, count)
-    for name, variable in file.variables.items():
-        if variable.dimensions[:1] != ("time",):
+
+
+def write_scalars(file: Any, epoch_sources: list[EpochSource], parameters: Parameters) -> None:  # noqa: ANN401 - h5py has no types
+    """Write the values of what `create_scalars` created; missing values keep the fill value.
+
+    Epochs that precede the first source are not written.
+    """
+    first, count = epoch_sources[0].series_start, epoch_sources[-1].series_start + epoch_sources[-1].count
+    names, values = set(file), {}
+    for name, dims in SMALL_DIMS.items():
+        if name not in names:
             continue
+        variable = open_variable(file, name)
         fill = {"S": b"", "f": FILL}.get(variable.dtype.kind, 0)
-        values = np.full((count - first, *variable.shape[1:]), fill, variable.dtype)
+        values[name] = np.full((count - first, *variable.shape[1:]), fill, variable.dtype)
         for source in epoch_sources:
             if name in source.scalars:
                 target = slice(source.series_start - first, source.series_start + source.count - first)
-                indices = (
-                    _parameter_indices(source, parameters) if "parameter" in variable.dimensions else ...
-                )
-                values[target, indices] = source.scalars[name]
-        variable[first:count] = values
+                indices = _parameter_indices(source, parameters) if "parameter" in dims else ...
+                values[name][target, indices] = source.scalars[name]
+    write_epochs(file, values, first)
 
 
 def write_time_coverage(file: Any) -> None:  # noqa: ANN401 - h5py has no types
