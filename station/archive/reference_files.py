@@ -9,6 +9,7 @@ from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
+import h5py
 import netCDF4
 import numpy as np
 
@@ -21,7 +22,9 @@ from station.archive.netcdf_layout import (
     decode_parameters,
 )
 from station.archive.raster_io import LazyRaster, rounded, write_rasters
+from station.archive.read_errors import read_errors
 from station.archive.schema import FILL, Variable
+from station.archive.small_variables import read_variable, text_attribute
 from station.errors import StoreError
 from station.quantities import Floats, Floats32, Reference, SharedParameters, VarianceComponents
 from station.science.geometry.terrain import known_cell_means
@@ -141,19 +144,13 @@ def valid_versions(series: Series) -> dict[str, ReferenceProvenance]:
 def read_reference_provenance(series: Series, version: str) -> ReferenceProvenance:
     """Return the provenance of a version; raise StoreError if it cannot be read."""
     path = version_path(series, version)
-    try:
-        with netCDF4.Dataset(path) as file:
-            attributes = set(file.ncattrs())
-            return ReferenceProvenance(
-                base=str(file.base) if "base" in attributes else version,
-                science_hash=str(file.science_hash) if "science_hash" in attributes else "",
-                replaces=tuple(str(file.replaces).split()) if "replaces" in attributes else (),
-                scan_provenance=tuple(json.loads(str(file.scan_provenance)))
-                if "scan_provenance" in attributes
-                else (),
-            )
-    except (OSError, RuntimeError, ValueError) as error:
-        raise StoreError(f"{path}: cannot be read: {error}") from error
+    with read_errors(path), h5py.File(path, "r") as file:
+        return ReferenceProvenance(
+            base=text_attribute(file, "base", version),
+            science_hash=text_attribute(file, "science_hash", ""),
+            replaces=tuple(text_attribute(file, "replaces", "").split()),
+            scan_provenance=tuple(json.loads(text_attribute(file, "scan_provenance", "[]"))),
+        )
 
 
 def write_reference(
@@ -258,13 +255,11 @@ def open_reference(series: Series, version: str | None = None) -> Reference | No
     path = series.folder / "reference.nc" if version is None else reference_path(series, version)
     if not path.is_file():
         return None
-    try:
-        with netCDF4.Dataset(path) as file:
-            if version not in (None, str(file.reference_version)):
-                return None
-            return _reference_from_file(file, reference_path(series, str(file.reference_version)), series)
-    except (OSError, RuntimeError, KeyError, IndexError, AttributeError) as error:
-        raise StoreError(f"{path}: cannot be read: {error}") from error
+    with read_errors(path), h5py.File(path, "r") as file:
+        stored_version = text_attribute(file, "reference_version")
+        if version not in (None, stored_version):
+            return None
+        return _reference_from_file(file, reference_path(series, stored_version), series)
 
 
 def read_variance_components(series: Series) -> VarianceComponents:
@@ -272,54 +267,48 @@ def read_variance_components(series: Series) -> VarianceComponents:
     path = series.folder / "reference.nc"
     if not path.is_file():
         return VarianceComponents()
-    try:
-        with netCDF4.Dataset(path) as file:
-            return _read_components(file)
-    except (OSError, RuntimeError, AttributeError) as error:
-        raise StoreError(f"{path}: cannot be read: {error}") from error
+    with read_errors(path), h5py.File(path, "r") as file:
+        return _read_components(file)
 
 
-def _reference_from_file(file: netCDF4.Dataset, path: Path, series: Series) -> Reference:
+def _reference_from_file(file: h5py.File, path: Path, series: Series) -> Reference:
     grid = series.grid
     if (
         file["x"].shape != (grid.nx,)
         or file["y"].shape != (grid.ny,)
         or (abs(file["x"][0] - grid.x_m[0]) + abs(file["y"][0] - grid.y_m[0]) > 1e-6)
     ):
-        raise StoreError(f"{file.filepath()}: is on another grid: move it away or restore [grid]")
-    file.set_auto_chartostring(False)
+        raise StoreError(f"{file.filename}: is on another grid: move it away or restore [grid]")
     shared = None
-    if "parameter_name" in file.variables:
+    if "parameter_name" in file:
         names, units = (
-            tuple(decode_parameters(np.ma.getdata(file[name][:])))
+            tuple(decode_parameters(read_variable(file, name)))
             for name in ("parameter_name", "parameter_unit")
         )
         covariance = np.asarray(file["shared_parameter_covariance"][:], dtype=np.float64)
         line_tilt_variance = np.asarray(file["shared_parameter_line_tilt_variance"][:], dtype=np.float64)
         shared = SharedParameters(names, units, np.zeros(len(names)), covariance, line_tilt_variance)
     rasters: dict[str, Any] = {
-        field: LazyRaster(path, name, transform)
-        for field, name, transform in _RASTER_FIELDS
-        if name in file.variables
+        field: LazyRaster(path, name, transform) for field, name, transform in _RASTER_FIELDS if name in file
     }
     return Reference(
         grid=grid,
-        version=str(file.reference_version),
+        version=text_attribute(file, "reference_version"),
         shared=shared,
-        scan_ids=tuple(str(file.scan_ids).split()),
-        time_s=float(file.mean_time),
+        scan_ids=tuple(text_attribute(file, "scan_ids").split()),
+        time_s=float(file.attrs["mean_time"].item()),
         components=_read_components(file),
         **rasters,
     )
 
 
-def _read_components(file: netCDF4.Dataset) -> VarianceComponents:
-    attributes = set(file.ncattrs())
+def _read_components(file: h5py.File) -> VarianceComponents:
     older = {name: old for old, name in RENAMED_PARAMETERS.items()}
 
     def component(name: str) -> float:
         stored = f"{COMPONENT_PREFIX}{name}"
-        return float(file.getncattr(stored if stored in attributes else f"{COMPONENT_PREFIX}{older[name]}"))
+        older_name = f"{COMPONENT_PREFIX}{older.get(name, name)}"
+        return float(file.attrs[stored if stored in file.attrs else older_name].item())
 
     return VarianceComponents(**{field.name: component(field.name) for field in fields(VarianceComponents)})
 

@@ -54,6 +54,14 @@ def write_epochs(file: Any, values: Mapping[str, Array], start: int = 0) -> None
         variable.write(h5py.h5s.create_simple(array.shape), space, array, variable.get_type())
 
 
+def text_attribute(file: Any, name: str, default: str | None = None) -> str:  # noqa: ANN401
+    """Return a global attribute, which netCDF stores as bytes; raise KeyError without it and a default."""
+    value = file.attrs[name] if default is None else file.attrs.get(name, default)
+    if isinstance(value, h5py.Empty):
+        return ""
+    return value.decode() if isinstance(value, bytes) else str(value)
+
+
 def read_number(file: Any, name: str, index: int) -> float:  # noqa: ANN401
     """Return a number of an epoch; NaN where it has none."""
     value = float(read_epochs(file, name, index, 1)[0])
