@@ -13,6 +13,7 @@ import pytest
 
 sys.path.insert(0, str(Path(__file__).parent))
 import harness
+import simulated_world
 
 
 @pytest.fixture(scope="session")
@@ -64,3 +65,9 @@ def rng():
     seed = int(environ.get("STATION_FAULTS_SEED", secrets.randbits(31)))
     print(f"STATION_FAULTS_SEED={seed}")
     return random.Random(seed)  # noqa: S311 - no secret
+
+
+@pytest.fixture(scope="session")
+def template(tmp_path_factory):
+    """Return the station of which all simulated worlds begin as copies."""
+    return simulated_world.make_template(tmp_path_factory.mktemp("world") / "template")

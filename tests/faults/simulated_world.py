@@ -136,6 +136,7 @@ class World(Faults):
     def run(self) -> None:
         """Run the service through all that is planned, and restart it whenever it dies, as systemd does."""
         (self.folder / "state").mkdir(exist_ok=True)
+        starts_in_vain = 0
         with self.installed():
             while not (self.is_finished or self.is_time_up()):
                 self.starts += 1
@@ -147,9 +148,11 @@ class World(Faults):
                         self.daemon.serve()
                 except DiedError:
                     self.deaths += 1
+                    starts_in_vain = 0
                 except StationError as error:
                     self.log.append(f"service ended: {error}")
-                    self.advance(600.0)  # many starts in vain would only take time
+                    starts_in_vain += 1
+                    self.advance(600.0 * starts_in_vain)  # many starts in vain would only take time
                 self.in_child = False
                 self.advance(10.0)
 
