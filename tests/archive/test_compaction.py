@@ -2,7 +2,6 @@
 
 import dataclasses
 import os
-import shutil
 from datetime import UTC, datetime, timedelta
 
 import h5py
@@ -10,7 +9,7 @@ import numpy as np
 import pytest
 import xarray as xr
 from support.epochs import GRID, make_epoch, write_surface
-from support.series import open_with_processing, without_dates
+from support.series import copied, open_with_processing, without_dates
 
 import station
 from station.archive import epochs
@@ -49,7 +48,7 @@ def base_store(tmp_path_factory):
 @pytest.fixture
 def filled(base_store, tmp_path):
     """A store of five epochs that a test may change."""
-    return dataclasses.replace(base_store, folder=shutil.copytree(base_store.folder, tmp_path / "store"))
+    return copied(base_store, tmp_path / "store")
 
 
 def test_compaction_changes_no_value_and_reduces_the_number_of_files(filled):

@@ -176,6 +176,7 @@ def test_silent_work_counts_as_progress(tasks, monkeypatch):
     assert len(reports) >= 3
 
 
+@pytest.mark.integration
 def test_fork_server_is_restarted_when_its_socket_was_deleted(tasks):
     """Programs that clean /tmp delete it after some days."""
     runner = TaskRunner()

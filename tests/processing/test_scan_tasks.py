@@ -187,6 +187,7 @@ def test_scan_without_its_absolute_log_is_unusable(folder, keep, reason):
     assert re.search(reason, result.reason)
 
 
+@pytest.mark.integration
 def test_swapped_axes_of_the_log_are_named(folder):
     """The mount of the simulated station rolls by 2.1° and pitches by -1.3°."""
     change_log(folder, lambda rows: ["{0},{2},{1}".format(*row.split(",")) for row in rows])
@@ -394,6 +395,7 @@ def rewrite(path, change):
     las.write(path)
 
 
+@pytest.mark.integration
 def test_scan_without_brightness_is_degraded_and_uses_steep_ground_only(folder):
     site = edited_site(folder)
     scans = sorted(site.scans.inbox.glob("*.laz"))
@@ -423,6 +425,7 @@ def stable_ground(site, result):
         return (np.ma.filled(file["quality"][0], 0).astype(int) & Quality.STABLE_GROUND) > 0
 
 
+@pytest.mark.integration
 def test_brightness_in_decibels_is_recognised_as_such(folder):
     """The same scans with the intensity as PDAL writes reflectance, and the site file that says so."""
     site = edited_site(folder, ("[scans]", '[scans]\nintensity = "decibel"'))

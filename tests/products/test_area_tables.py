@@ -61,6 +61,7 @@ def test_areas_nc_of_outdated_polygons_is_not_used(site, small):
     assert records[0].statistics["mean_change"] == pytest.approx(-0.30, abs=0.01)
 
 
+@pytest.mark.integration
 def test_change_between_any_two_epochs(site, other_polygons):
     """The area rises by 5 cm per hour; sigma compared with `station.variance` of the observed cells."""
     hourly = [

@@ -40,6 +40,7 @@ def test_unusable_epochs_are_left_out(site, monkeypatch):
     assert [record.epochs for record in trend_records(site, None, ALL)] == [5, 5]
 
 
+@pytest.mark.integration
 def test_rates_of_periods_and_of_one_area(site):
     (whole,) = trend_records(site, None, ALL, "rises")
     (day,) = trend_records(site, None, ALL, "rises", "1D")
@@ -85,6 +86,7 @@ def test_inverse_velocity_of_an_insignificant_rate_is_empty():
     assert [(row["inverse_velocity_d_m"], row["acceleration_m_d2"]) for row in rows] == [("", "0"), ("2", "")]
 
 
+@pytest.mark.integration
 @pytest.mark.usefixtures("site")
 def test_command_prints_text_or_csv(tmp_path):
     path = str(tmp_path / "site.toml")

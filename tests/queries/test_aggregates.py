@@ -1,6 +1,5 @@
 """Variances of boxes, areas, volumes and differences from the store, compared with dense matrix algebra."""
 
-import shutil
 from dataclasses import replace
 from datetime import UTC, datetime
 from functools import cache
@@ -9,7 +8,7 @@ import numpy as np
 import pytest
 import xarray as xr
 from support.epochs import START_S, random_epoch
-from support.series import open_with_processing
+from support.series import copied, open_with_processing
 from support.shared_parameters import SCANNER
 
 import station
@@ -111,7 +110,7 @@ def base_store(tmp_path_factory):
 @pytest.fixture
 def stored(base_store, tmp_path):
     """A store of four epochs that a test may change."""
-    return replace(base_store, folder=shutil.copytree(base_store.folder, tmp_path / "store"))
+    return copied(base_store, tmp_path / "store")
 
 
 class Queries(Aggregates):

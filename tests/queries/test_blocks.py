@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import xarray as xr
 from support.epochs import START_S, random_epoch
+from support.series import copied
 from support.shared_parameters import SCANNER, random_shared
 
 import station
@@ -68,7 +69,7 @@ def base(tmp_path_factory):
 
 @pytest.fixture
 def stored(base, tmp_path):
-    return replace(base, folder=shutil.copytree(base.folder, tmp_path / "store"))
+    return copied(base, tmp_path / "store")
 
 
 def read(series, name):
@@ -136,6 +137,7 @@ def test_times_are_those_of_the_series(base):
     assert daily.time_bnds.values[0, 1] == np.datetime64("2025-11-22")
 
 
+@pytest.mark.integration
 def test_a_daily_mean_has_the_sigma_of_three_epochs(base):
     """Var(mean) = Σᵢⱼ covᵢⱼ / n², each covᵢⱼ from the variance of the difference of two epochs."""
     daily = read(base, "daily.nc").isel(time=0)

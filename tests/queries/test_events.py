@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from support.epochs import random_epoch
+from support.series import copied
 from support.shared_parameters import SCANNER, random_shared
 
 from station.archive import epochs
@@ -93,7 +94,7 @@ def base(tmp_path_factory):
 
 @pytest.fixture
 def stored(base, tmp_path):
-    return replace(base, folder=shutil.copytree(base.folder, tmp_path / "store"))
+    return copied(base, tmp_path / "store")
 
 
 def test_scar_and_deposit_are_a_pair_with_the_true_volumes(base):
@@ -125,6 +126,7 @@ def test_the_second_scan_tells_an_event_and_no_scan_before(base, tmp_path):
     assert len(read_events(series.folder)) == 2
 
 
+@pytest.mark.integration
 def test_live_equals_anew_and_a_late_scan(base, tmp_path):
     """Scan by scan, and with one scan that comes last; each searches only windows that changed."""
     live = empty_store(tmp_path / "live")

@@ -21,6 +21,7 @@ from station.products.exports.levels import export_levels
 from station.quantities import Grid, Reference
 from station.queries.levels import update_levels
 
+pytestmark = pytest.mark.integration
 GRID = Grid(west_m=632_000.0, north_m=5_186_000.0, cell_m=10.0, nx=40, ny=30)
 SIGMA_M = np.full(GRID.shape, 0.02)
 REFERENCE_M = 0.01

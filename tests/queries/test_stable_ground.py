@@ -121,6 +121,7 @@ def by_scale(validation):
     return {(row["scale"], row["band"]): row for row in validation.overall}
 
 
+@pytest.mark.integration
 def test_errors_as_large_as_stated_are_confirmed_at_every_scale(series):
     validation = validate_sigma(series, 100, lambda: None)
     scales = by_scale(validation)

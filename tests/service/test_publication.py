@@ -216,6 +216,7 @@ def test_the_hook_runs_once_for_each_new_epoch_in_a_bare_environment(
     }  # fmt: skip
 
 
+@pytest.mark.integration
 def test_a_hook_that_hangs_is_ended_with_its_children_and_tried_three_times(site_with, add_epoch, tmp_path):
     log, late = tmp_path / "log", tmp_path / "late"
     script = f"echo begun >> {log}; (sleep 1.5; echo late >> {late}) & wait"

@@ -127,6 +127,7 @@ def test_both_are_renewed_in_processes_of_their_own(site):
         worker.close()
 
 
+@pytest.mark.integration
 def test_reprocessing_replaces_damaged_levels(site):
     with Journal(site.station.data / "journal.sqlite") as journal:
         worker = Worker(site, journal)

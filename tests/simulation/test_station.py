@@ -84,6 +84,7 @@ def test_true_elevation_is_the_cell_mean_of_the_changed_ground():
     assert np.median(np.abs(errors_m)) < 3e-4
 
 
+@pytest.mark.integration
 def test_surface_changes_at_the_time_and_place_of_the_scenario(folder):
     with xr.open_dataset(folder / "truth.nc") as dataset:
         stable = dataset.stable.to_numpy() == 1

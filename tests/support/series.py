@@ -1,14 +1,21 @@
-"""Series of two stores, or of two times, compared as a whole."""
+"""Series of two stores, or of two times, compared as a whole; copies that a test may change."""
 
 from __future__ import annotations
 
+import shutil
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 
 import station
 from station.archive.series.lazy import open_virtual
 
 WHEN_WRITTEN = ("date_created", "history")
+
+
+def copied(series, folder):
+    """Return a store with copies of the files of another."""
+    return replace(series, folder=shutil.copytree(series.folder, folder, dirs_exist_ok=True))
 
 
 def without_dates(dataset):

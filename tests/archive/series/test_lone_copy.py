@@ -7,21 +7,37 @@ import subprocess
 import numpy as np
 import pytest
 import xarray as xr
+from support.epochs import GRID, make_epoch, write_surface
+from support.series import copied
 
 import station
 from station.archive.epochs import write_epoch
+from station.archive.netcdf_layout import Series
 from station.archive.series.virtual import build_series
 from station.errors import StoreError
 
-ENGINES = ("netcdf4", "h5netcdf")
+ENGINES = ("netcdf4", pytest.param("h5netcdf", marks=pytest.mark.integration))
 NO_TIME_S = 9.96921e36
 
 
-@pytest.fixture
-def stored(series, epoch):
+@pytest.fixture(scope="module")
+def base_store(tmp_path_factory):
+    series = Series(tmp_path_factory.mktemp("base"), "hef", GRID, "EPSG:32632")
+    write_surface(series)
     for hour in range(4):
-        write_epoch(series, epoch(hour))
-    return build_series(series)
+        write_epoch(series, make_epoch(hour))
+    build_series(series)
+    return series
+
+
+@pytest.fixture
+def series(base_store, tmp_path):
+    return copied(base_store, tmp_path / "store")
+
+
+@pytest.fixture
+def stored(series):
+    return series.path
 
 
 @pytest.fixture

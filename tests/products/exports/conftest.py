@@ -8,9 +8,19 @@ from station.archive.netcdf_layout import Series
 
 @pytest.fixture
 def series(tmp_path):
+    return new_store(tmp_path / "data")
+
+
+@pytest.fixture(scope="module")
+def base_store(tmp_path_factory):
+    """A store without epochs, for those that a module writes once."""
+    return new_store(tmp_path_factory.mktemp("base") / "data")
+
+
+def new_store(folder):
     """Return a store without a geoid, with metadata as a site file gives them."""
     metadata = (("license", "CC-BY-4.0"), ("creator_name", "A. Nother"))
-    series = Series(tmp_path / "data", "hef", GRID, "EPSG:32632", "", "Hintereisferner", "Tests", metadata)
+    series = Series(folder, "hef", GRID, "EPSG:32632", "", "Hintereisferner", "Tests", metadata)
     write_surface(series)
     return series
 

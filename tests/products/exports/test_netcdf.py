@@ -8,7 +8,8 @@ from datetime import UTC, datetime
 import netCDF4
 import numpy as np
 import pytest
-from support.epochs import write_surface
+from support.epochs import make_epoch, write_surface
+from support.series import copied
 
 import station
 from station.archive import epochs
@@ -24,18 +25,23 @@ ALWAYS = Span.parse(None, None)
 NETCDF = FORMATS["netcdf"]
 
 
-@pytest.fixture
-def stored(series, epoch):
+@pytest.fixture(scope="module")
+def filled(base_store):
     """A series of two days; the shared parameters change on the second."""
     for hour in (0, 1, 2, 25, 26):
-        result = epoch(hour, terms=hour > 1)
+        result = make_epoch(hour, terms=hour > 1)
         if hour > 24:
             shared = dataclasses.replace(result.shared, names=("range_bias", "tilt_north", "heading"))
             result = dataclasses.replace(result, shared=shared, verdict_reason="Schnee über Fels")
-        epochs.write_epoch(series, result)
-    compact(series, datetime(2025, 11, 22, 12, tzinfo=UTC), lambda: None)
-    build_series(series)
-    return series
+        epochs.write_epoch(base_store, result)
+    compact(base_store, datetime(2025, 11, 22, 12, tzinfo=UTC), lambda: None)
+    build_series(base_store)
+    return base_store
+
+
+@pytest.fixture
+def stored(filled, tmp_path):
+    return copied(filled, tmp_path / "data")
 
 
 def write(selection, out, every=None, advance=lambda _: None, verify=lambda _: None):

@@ -10,6 +10,8 @@ import numpy as np
 import pytest
 import xarray as xr
 import zarr
+from support.epochs import make_epoch
+from support.series import copied
 
 from station.archive import epochs
 from station.archive.compaction import compact
@@ -23,14 +25,21 @@ ALWAYS = Span.parse(None, None)
 NCML = "{http://www.unidata.ucar.edu/namespaces/netcdf/ncml-2.2}"
 
 
-@pytest.fixture
-def stored(series, epoch):
+@pytest.fixture(scope="module")
+def filled(base_store):
     """A series of a compacted day, and of single epochs."""
     for hour in (0, 1, 2, 25, 26):
-        epochs.write_epoch(series, dataclasses.replace(epoch(hour), verdict_reason="Schnee über Fels"))
-    compact(series, datetime(2025, 11, 22, 12, tzinfo=UTC), lambda: None)
-    build_series(series)
-    return series
+        epochs.write_epoch(
+            base_store, dataclasses.replace(make_epoch(hour), verdict_reason="Schnee über Fels")
+        )
+    compact(base_store, datetime(2025, 11, 22, 12, tzinfo=UTC), lambda: None)
+    build_series(base_store)
+    return base_store
+
+
+@pytest.fixture
+def stored(filled, tmp_path):
+    return copied(filled, tmp_path / "data")
 
 
 def write(kind, selection, out, every=None):

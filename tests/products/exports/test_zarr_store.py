@@ -7,6 +7,8 @@ import numpy as np
 import pytest
 import xarray as xr
 import zarr
+from support.epochs import make_epoch
+from support.series import copied
 
 import station
 from station.archive import epochs
@@ -20,13 +22,18 @@ ALWAYS = Span.parse(None, None)
 ZARR = FORMATS["zarr"]
 
 
-@pytest.fixture
-def stored(series, epoch):
+@pytest.fixture(scope="module")
+def filled(base_store):
     for hour in range(5):
-        result = epoch(hour, terms=hour > 1)
-        epochs.write_epoch(series, dataclasses.replace(result, verdict_reason="Schnee über Fels"))
-    build_series(series)
-    return series
+        result = make_epoch(hour, terms=hour > 1)
+        epochs.write_epoch(base_store, dataclasses.replace(result, verdict_reason="Schnee über Fels"))
+    build_series(base_store)
+    return base_store
+
+
+@pytest.fixture
+def stored(filled, tmp_path):
+    return copied(filled, tmp_path / "data")
 
 
 def write(selection, out, every=None, advance=lambda _: None):
@@ -64,6 +71,7 @@ def test_xarray_reads_it_like_the_series(stored, tmp_path):
         assert list(actual.verdict_reason.values) == ["Schnee über Fels"] * 5
 
 
+@pytest.mark.integration
 def test_a_killed_export_continues_after_its_last_block(stored, tmp_path):
     done = []
 
@@ -88,6 +96,7 @@ def test_a_killed_export_continues_after_its_last_block(stored, tmp_path):
             np.testing.assert_array_equal(actual[name], expected[name])
 
 
+@pytest.mark.integration
 def test_a_changed_series_replaces_the_store(stored, epoch, tmp_path):
     out = tmp_path / "days"
     (path,) = write(select(stored, ALWAYS), out, "1D")

@@ -52,6 +52,7 @@ def decode(path):
     return local, time_s, usable, values
 
 
+@pytest.mark.integration
 def test_a_tile_has_the_changes_and_sigmas_of_the_store(series, curve_epochs, tmp_path):
     about = update_curves(series, tmp_path, tiers(curve_epochs, recent=6), lambda: None)
     aggregates, grid = Aggregates(series), series.grid

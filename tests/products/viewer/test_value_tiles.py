@@ -101,6 +101,7 @@ def test_cells_are_those_that_were_written_however_many_rows_come_at_once(base, 
     assert 0.035 < np.abs(sigma_m[seen] / total[seen] - 1).max() < 0.0411
 
 
+@pytest.mark.integration
 def test_means_have_the_sigma_of_the_mean_of_their_cells(base, rasters, tmp_path):
     builder = OverviewBuilder(base)
     builder.add(slice(0, SHAPE[0]), rasters)

@@ -111,6 +111,7 @@ with open(sys.argv[2], 'wb') as file:
     assert (tmp_path / "a.laz").stat().st_size <= 1 << 20
 
 
+@pytest.mark.integration
 def test_a_slow_command_and_what_it_started_are_killed(tmp_path):
     pids = tmp_path / "pids"
     script = f"""
@@ -124,6 +125,7 @@ time.sleep(60)
     assert not [pid for pid in pids.read_text().split() if is_running(pid)]
 
 
+@pytest.mark.integration
 def test_a_command_ends_with_the_worker_that_is_killed(tmp_path):
     pids, source = tmp_path / "pids", tmp_path / "a.rxp"
     source.write_bytes(b"scan")

@@ -95,6 +95,7 @@ def calibration(kind, random_m, systematic_m, **options):
     return rms[0], rms[1], rms[2] / np.sqrt(2 * (random_m**2 + systematic_m**2))
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize(
     ("kind", "level_z", "rate_z", "twelve_hours"),
     [
@@ -111,6 +112,7 @@ def test_sigma_of_level_and_rate_and_error_of_twelve_hours(kind, level_z, rate_z
     assert change < twelve_hours
 
 
+@pytest.mark.integration
 def test_errors_that_last_for_hours_are_in_the_systematic_part():
     levels, rates, _ = calibration("stable", 0.02, 0.02, lasting=True)
     assert 0.6 < levels < 1.25

@@ -22,6 +22,7 @@ def drawn_errors(time_s, sigma_m, common, *, lasting, count=2000):
     return sigma_m * shared
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize("common", [0.0, 0.6])
 @pytest.mark.parametrize(
     ("time_s", "lasting", "low", "high"),
