@@ -96,13 +96,13 @@
 
   // The colour bar and the legend in words.
   let keyShown = "";
+  byId("map-caption").hidden = true;  // says the same of the picture, for readers without scripts
   function drawKey() {
     const { layer, contours } = layers.state, scale = data.scales[stationValues.LAYERS[layer].scale];
     const since = layers.before() ? `${page.utc(layers.before().time_s)} UTC` : text.the_reference;
     const every_m = contours ? layers.every_m() : 0, now = [layer, since, every_m, layers.isComparable()].join();
     if (now === keyShown) return;
     keyShown = now;
-    byId("map-caption").hidden = layer !== "change" || layers.before() !== null;  // it speaks of the picture
     const bar = make("canvas", { width: 256, height: 1 }), context = bar.getContext("2d");
     layers.scales[stationValues.LAYERS[layer].scale].table.forEach((rgb, i) => {
       context.fillStyle = `rgb(${rgb.join()})`;
@@ -172,13 +172,14 @@
   function drawOutlines(context, now) {
     drawKey();
     if (!outlined) return;
+    const written = [];  // a name that would cover another is left out: the tables have all
     const draw = (rings, name, dash = []) => {
       if (!rings.length) return;
       context.setLineDash(dash);
       for (const ring of rings) drawShape(context, now, ring, true, 1.2);
       context.setLineDash([]);
       const end = rings[0].reduce((a, b) => b[1] > a[1] === !dash.length ? b : a), [x, y] = now.toPixel(end);
-      label(context, name, x + 4, dash.length ? y + 15 : y - 5);  // areas above, events below
+      label(context, name, x + 4, dash.length ? y + 15 : y - 5, written);  // areas above, events below
     };
     for (const area of data.outlines.areas) draw(area.rings, area.name);
     for (const event of data.outlines.events) draw(event.rings, text[`event_${event.kind}`] || event.kind, [5, 4]);
@@ -248,8 +249,12 @@
     context.fill();
   }
 
-  function label(context, words, x, y) {
+  // Write words, unless they would cover one of the boxes [left, top, right, bottom] of those written before.
+  function label(context, words, x, y, written = []) {
     context.font = "600 14px system-ui, sans-serif";
+    const box = [x, y - 14, x + context.measureText(words).width, y + 4];
+    if (written.some((other) => [0, 1].every((k) => box[k] < other[k + 2] && other[k] < box[k + 2]))) return;
+    written.push(box);
     context.lineWidth = 4;
     context.strokeStyle = "#fff";
     context.fillStyle = "#000";

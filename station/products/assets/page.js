@@ -78,6 +78,7 @@
       byId("map-caption").textContent = `${when}. ${rest}`;
     };
     image.addEventListener("error", () => {
+      byId("map-caption").hidden = false;
       byId("map-caption").textContent = text.js_map_gone;
     });
     slider.max = maps.length - 1;
