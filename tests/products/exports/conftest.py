@@ -2,6 +2,7 @@
 
 import pytest
 from support.epochs import GRID, make_epoch, write_surface
+from support.series import copied
 
 from station.archive.netcdf_layout import Series
 
@@ -28,3 +29,9 @@ def new_store(folder):
 @pytest.fixture
 def epoch():
     return make_epoch
+
+
+@pytest.fixture
+def stored(filled, tmp_path):
+    """Return a copy of the store that a module filled."""
+    return copied(filled, tmp_path / "data")

@@ -9,7 +9,6 @@ import netCDF4
 import numpy as np
 import pytest
 from support.epochs import make_epoch, write_surface
-from support.series import copied
 
 import station
 from station.archive import epochs
@@ -37,11 +36,6 @@ def filled(base_store):
     compact(base_store, datetime(2025, 11, 22, 12, tzinfo=UTC), lambda: None)
     build_series(base_store)
     return base_store
-
-
-@pytest.fixture
-def stored(filled, tmp_path):
-    return copied(filled, tmp_path / "data")
 
 
 def write(selection, out, every=None, advance=lambda _: None, verify=lambda _: None):

@@ -11,7 +11,6 @@ import pytest
 import xarray as xr
 import zarr
 from support.epochs import make_epoch
-from support.series import copied
 
 from station.archive import epochs
 from station.archive.compaction import compact
@@ -35,11 +34,6 @@ def filled(base_store):
     compact(base_store, datetime(2025, 11, 22, 12, tzinfo=UTC), lambda: None)
     build_series(base_store)
     return base_store
-
-
-@pytest.fixture
-def stored(filled, tmp_path):
-    return copied(filled, tmp_path / "data")
 
 
 def write(kind, selection, out, every=None):

@@ -8,7 +8,6 @@ import pytest
 import xarray as xr
 import zarr
 from support.epochs import make_epoch
-from support.series import copied
 
 import station
 from station.archive import epochs
@@ -29,11 +28,6 @@ def filled(base_store):
         epochs.write_epoch(base_store, dataclasses.replace(result, verdict_reason="Schnee über Fels"))
     build_series(base_store)
     return base_store
-
-
-@pytest.fixture
-def stored(filled, tmp_path):
-    return copied(filled, tmp_path / "data")
 
 
 def write(selection, out, every=None, advance=lambda _: None):
