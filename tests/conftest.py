@@ -10,7 +10,18 @@ import pytest
 # As in the worker processes: on a busy machine, threaded linear algebra is many times slower.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 pytest_plugins = ["support.epochs", "support.site"]
+LONGEST = (  # files whose integration tests take longest, which begin first
+    "test_truth", "test_kills", "test_large", "test_simulated_world", "test_earlier_findings",
+    "test_docs_snippets", "test_reprocessing", "test_world", "test_pose_stability",
+)  # fmt: skip
 PROJECT = Path(__file__).resolve().parents[1]
+
+
+@pytest.hookimpl(trylast=True)
+def pytest_collection_modifyitems(items):
+    """Begin with the longest files, so that in the end no worker waits for another."""
+    rank = {name: number for number, name in enumerate(LONGEST)}
+    items.sort(key=lambda item: rank.get(item.path.stem, len(rank)))
 
 
 @pytest.fixture(scope="session")
