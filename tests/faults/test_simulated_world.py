@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import pytest
 import simulated_world
+from support.effort import SHARE
 
 pytestmark = pytest.mark.slow
 
@@ -17,7 +18,7 @@ def undisturbed(template, tmp_path_factory):
     return world
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", range(10 // SHARE))
 def test_a_year_of_faults_changes_no_value(template, undisturbed, tmp_path, seed):
     """Replay: `python tests/faults/simulated_world.py --seed SEED --years 1 --log`."""
     world = simulated_world.make_world(tmp_path / "world", template, seed)

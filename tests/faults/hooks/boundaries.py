@@ -8,6 +8,7 @@ command, by `warm.py` if it is forked. `FAULTS_PLAN` (JSON) has the keys:
     once      victim at every boundary that has no file in the folder `died` yet; "full": no process dies,
               but the disk is full
     died      folder with an empty file for each boundary at which that has happened
+    draw      [share, seed]: `once` at one in `share` boundaries only, drawn by the seed
 
 `victim`: "child" (the worker process), "service" (its worker must then end without help), or "both". There is
 a boundary before and one after each fsync, rename, link, mkdir, unlink and commit.
@@ -26,6 +27,7 @@ import signal
 import sqlite3
 import threading
 import time
+import zlib
 from contextlib import suppress
 from pathlib import Path
 
@@ -138,13 +140,17 @@ def _cross(label, full=None):
             threading.Thread(target=_kill, args=(victim, delay_s, claim), daemon=True).start()
         else:
             _kill(victim, 0.0, claim)
-    if not plan.get("once"):
+    if not plan.get("once") or not _is_drawn(label, *plan.get("draw", (1, ""))):
         return
     claim = os.path.join(plan["died"], f"{plan['once']} {label}".replace("/", "|"))  # noqa: PTH118 - is faster
     if plan["once"] != "full":
         _kill(plan["once"], 0.0, claim)
     elif _is_first(claim) and label.split(" ", 2)[2]:  # without its data folder the service does not start
         raise full or OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), label)
+
+
+def _is_drawn(label, share, seed):
+    return zlib.crc32(f"{seed} {label}".encode()) % share == 0
 
 
 def _kill(victim, delay_s, claim):
