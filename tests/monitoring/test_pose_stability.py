@@ -126,7 +126,7 @@ def test_damaged_series_is_reported(site):
 def test_simulated_pose_step_is_reported_with_its_size(tmp_path, caplog):
     """The scanner is tilted by 0.02°, turned by 0.01° and shifted by 5 mm between two scans."""
     folder = tmp_path / "station"
-    simulate(folder, named("moved", hours=20))
+    simulate(folder, named("moved", hours=30))
     site = read_site(folder / "site.toml")
     process_scans(site, sorted(site.scans.inbox.glob("*.laz")), lambda _: None)
     (line,) = [record.getMessage() for record in caplog.records if "moved=" in record.getMessage()]
