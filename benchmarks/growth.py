@@ -32,11 +32,12 @@ from rich.table import Table
 from scipy import ndimage
 
 from benchmarks.process_cost import cpu_of, family, peak_of
-from station.archive import compaction, epochs
+from station.archive import epochs
 from station.archive.areas import AreaChange, update_areas
 from station.archive.derived.boxes import Rasters
 from station.archive.netcdf_layout import Series, encode_text
 from station.archive.reference_files import write_reference
+from station.archive.series import compaction
 from station.archive.series.epoch_reader import EpochSource, read_source
 from station.archive.series.index import SeriesIndex
 from station.archive.series.lazy import open_series

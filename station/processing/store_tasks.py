@@ -8,10 +8,11 @@ from contextlib import suppress
 from datetime import UTC, datetime
 from pathlib import Path
 
-from station.archive import compaction, epochs
+from station.archive import epochs
 from station.archive.areas import update_areas
 from station.archive.derived.level_files import damaged_levels, delete_levels
 from station.archive.reference_files import repair_reference_link
+from station.archive.series import compaction
 from station.archive.series.manifest import source_count
 from station.archive.series.virtual import build_series
 from station.config import Site

@@ -11,7 +11,7 @@ import xarray as xr
 
 from station.archive import epochs
 from station.archive.areas import AreaChange, area_polygons, update_areas
-from station.archive.compaction import compact
+from station.archive.series.compaction import compact
 from station.archive.series.virtual import build_series
 from station.errors import StoreError
 

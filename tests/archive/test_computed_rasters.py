@@ -11,12 +11,12 @@ import pytest
 from support.epochs import GRID, make_epoch
 
 import station
-from station.archive.compaction import compact
 from station.archive.derived import computed_rasters
 from station.archive.epochs import write_epoch
 from station.archive.raster_io import rounded
 from station.archive.reference_files import mean_elevation, write_reference
 from station.archive.schema import BY_NAME, FILL
+from station.archive.series.compaction import compact
 from station.archive.series.index import list_epochs
 from station.archive.series.virtual import build_series
 from station.errors import StoreError

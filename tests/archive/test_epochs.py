@@ -16,8 +16,8 @@ import xarray as xr
 
 import station
 from station.archive import epochs, reference_files
-from station.archive.compaction import compact
 from station.archive.series import index
+from station.archive.series.compaction import compact
 from station.archive.series.virtual import build_series
 from station.errors import StoreError
 from station.quantities import Reference, SharedParameters, VarianceComponents

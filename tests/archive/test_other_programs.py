@@ -23,7 +23,7 @@ from support.programs import (
 
 from station.archive import epochs, reference_files
 from station.archive.areas import AreaChange, update_areas
-from station.archive.compaction import compact
+from station.archive.series.compaction import compact
 from station.archive.series.virtual import build_series
 from station.quantities import Reference
 from station.queries.blocks import BlockQueries, update_boxes

@@ -12,9 +12,9 @@ import xarray as xr
 
 import station
 from station.archive import epochs
-from station.archive.compaction import compact
 from station.archive.netcdf_layout import decode_text, encode_text, roundtrip_text
 from station.archive.schema import TEXT_LENGTH
+from station.archive.series.compaction import compact
 from station.archive.series.virtual import build_series
 
 TEXT = "Hütte – 5°"

@@ -13,9 +13,9 @@ from support.shared_parameters import SCANNER
 
 import station
 from station.archive import epochs
-from station.archive.compaction import compact
 from station.archive.netcdf_layout import Series
 from station.archive.reference_files import write_reference
+from station.archive.series.compaction import compact
 from station.archive.series.virtual import build_series
 from station.errors import StationError, StoreError
 from station.quantities import (

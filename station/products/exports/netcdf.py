@@ -12,9 +12,9 @@ import netCDF4
 import numpy as np
 
 from station.archive.atomic_files import atomic_write
-from station.archive.compaction import METADATA_BLOCK_BYTES
 from station.archive.raster_io import deflated_chunks
 from station.archive.schema import Variable
+from station.archive.series.compaction import METADATA_BLOCK_BYTES
 from station.archive.series.epoch_reader import LIBVER_COMPAT, copy_chunks, has_same_encoding
 from station.products.exports.contents import Advance, Block, PartContents, fill_value
 from station.products.exports.selection import FINGERPRINT, Part, Selection

@@ -15,9 +15,9 @@ from support.epochs import GRID, make_epoch, write_surface
 
 import station
 from station.archive.chunk_codec import read_column
-from station.archive.compaction import compact
 from station.archive.epochs import write_epoch
 from station.archive.netcdf_layout import Series
+from station.archive.series.compaction import compact
 from station.archive.series.index import list_epochs
 from station.archive.series.virtual import build_series
 

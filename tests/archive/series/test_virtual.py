@@ -11,9 +11,9 @@ import pytest
 from station.archive import areas, epochs, netcdf_layout
 from station.archive.areas import AreaChange, update_areas
 from station.archive.atomic_files import atomic_write
-from station.archive.compaction import compact
 from station.archive.derived import fingerprints
 from station.archive.series import epoch_reader, manifest, virtual
+from station.archive.series.compaction import compact
 from station.archive.series.index import SeriesIndex, list_epochs
 from station.archive.series.virtual import build_series
 from station.quantities import Grid, SharedParameters

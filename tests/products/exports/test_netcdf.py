@@ -12,8 +12,8 @@ from support.epochs import make_epoch, write_surface
 
 import station
 from station.archive import epochs
-from station.archive.compaction import compact
 from station.archive.schema import FILL
+from station.archive.series.compaction import compact
 from station.archive.series.virtual import build_series
 from station.errors import StationError, StoreError
 from station.products.area_tables import Span

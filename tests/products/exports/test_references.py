@@ -13,7 +13,7 @@ import zarr
 from support.epochs import make_epoch
 
 from station.archive import epochs
-from station.archive.compaction import compact
+from station.archive.series.compaction import compact
 from station.archive.series.virtual import build_series
 from station.errors import StationError
 from station.products.area_tables import Span

@@ -13,8 +13,8 @@ from support.series import copied, open_with_processing, without_dates
 
 import station
 from station.archive import epochs
-from station.archive.compaction import compact, count_compactable, delete_expired, latest_start
 from station.archive.netcdf_layout import Series
+from station.archive.series.compaction import compact, count_compactable, delete_expired, latest_start
 from station.archive.series.index import list_epochs, source_files
 from station.archive.series.virtual import build_series
 from station.errors import StoreError
