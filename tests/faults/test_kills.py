@@ -61,7 +61,7 @@ def test_few_random_kills(make_station, undisturbed, rng, capsys):
 
 
 @pytest.mark.slow
-def test_hundreds_of_random_kills(make_station, undisturbed, rng, capsys):
+def test_random_kills(make_station, undisturbed, rng, capsys):
     """SIGKILL to the service and to its worker process, which decodes, publishes and compacts."""
     stations = []
     while sum(station.kills for station in stations) < RANDOM_KILLS:
