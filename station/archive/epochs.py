@@ -239,8 +239,9 @@ def _create(file: netCDF4.Dataset, series: Series, epoch: Epoch, values: Mapping
     title = f"Elevation change at {series.name or series.station_id}, one scan"
     create_file(file, series, title, 1, parameters)
     file.setncatts(time_coverage(epoch.start_s, epoch.end_s))
+    names = values.keys() | _measurement_variables(epoch.measurement)
     for spec in VARIABLES:
-        if spec.name in values or spec.name in _measurement_variables(epoch.measurement):
+        if spec.name in names:
             create_variable(file, spec, series, 1)
 
 
