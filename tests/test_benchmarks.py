@@ -23,15 +23,17 @@ memory = bytearray(300_000_000)
 for offset in range(0, len(memory), 4096):
     memory[offset] = 1
 subprocess.run([sys.executable, "-c", "sum(range(20_000_000))"], check=True)
-used = [resource.getrusage(who) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)]
-print(sum(usage.ru_utime + usage.ru_stime for usage in used))
+for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN):
+    usage = resource.getrusage(who)
+    print(usage.ru_utime + usage.ru_stime)
 """
 
 
 @pytest.mark.integration
 def test_cost_of_a_program_includes_its_children(tmp_path):
     cost, output = cost_of([sys.executable, "-c", WORK], tmp_path)
-    assert cost.cpu_s == pytest.approx(float(output), abs=0.05)
+    own_s, children_s = map(float, output.split())  # before the exit, which frees the memory
+    assert own_s + children_s <= cost.cpu_s + 0.01 < own_s + 1.5 * children_s
     assert 0.3 < cost.peak_gb < 0.4 or resource.getrusage(resource.RUSAGE_SELF).ru_maxrss > 3e5
     assert cost.wall_s > 0.9 * cost.cpu_s
 
