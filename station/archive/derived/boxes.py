@@ -145,10 +145,13 @@ def box_file(grid: Grid, cells: int) -> BlockFile:
     return BlockFile(BOXES, title, "middle of the scan", _coarse(grid, cells), BOX_VARIABLES)
 
 
-def day_file(series: Series, cells: int, entries: Entries) -> BlockFile:
-    """Return the description of a file in `blocks/`: blocks of `cells` × `cells`, the epochs of a day."""
-    day = f"{datetime.fromtimestamp(entries.start_s[0], UTC):%Y%m%d}"
-    key = hashlib.sha256(entries.keys.tobytes()).hexdigest()[:KEY_DIGITS]
+def day_file(series: Series, cells: int, start_s: float, keys: Array) -> BlockFile:
+    """Return the description of a file in `blocks/`: blocks of `cells` × `cells`, the epochs of a day.
+
+    `start_s` is the start of the first, `keys` (n,) are those of their entries.
+    """
+    day = f"{datetime.fromtimestamp(start_s, UTC):%Y%m%d}"
+    key = hashlib.sha256(keys.tobytes()).hexdigest()[:KEY_DIGITS]
     return replace(
         box_file(series.grid, cells), name=f"{BLOCKS}/{day[:4]}/{series.station_id}_{day}_{key}.nc"
     )
@@ -178,19 +181,21 @@ def update_days(
     """
     if not len(entries):
         return
-    existing, current = block_files(series), set()
-    by_day = {_day_of(path): path for path in existing}
+    folder, keys, current = series.folder / BLOCKS, entries.keys, set[str]()
+    existing = {path.name: path for path in block_files(series)}
+    recorded = {path.name for path in folder.glob(f"*/.{series.station_id}_*.json")}
+    by_day = {_day_of(path): path for path in existing.values()}
     changes = np.flatnonzero(np.diff(entries.start_s // DAY_S)) + 1
     for first, end in pairwise([0, *changes.tolist(), len(entries)]):
-        of_day = entries[first:end]
-        block_file = day_file(series, cells, of_day)
+        block_file = day_file(series, cells, entries.start_s[first], keys[first:end])
         path = series.folder / block_file.name
-        current.add(path)
-        if not (path in existing and fingerprints_path(path).is_file()):
+        current.add(path.name)
+        if not (path.name in existing and fingerprints_path(path).name in recorded):
             older = by_day.get(_day_of(path))
-            update_blocks(series, block_file, of_day, partial(_shifted, compute, first), progress, older)
-    for path in existing - current:
-        for file in (path, fingerprints_path(path)):
+            compute_of_day = partial(_shifted, compute, first)
+            update_blocks(series, block_file, entries[first:end], compute_of_day, progress, older)
+    for name in existing.keys() - current:
+        for file in (existing[name], fingerprints_path(existing[name])):
             with suppress(OSError):
                 file.unlink()
 
