@@ -15,6 +15,7 @@ import netCDF4
 import numpy as np
 
 from station.archive.atomic_files import atomic_write
+from station.archive.discovery import time_coverage
 from station.archive.netcdf_layout import (
     RENAMED_PARAMETERS,
     Series,
@@ -186,6 +187,11 @@ def _write(
     file.setncatts({"base": provenance.base, "science_hash": provenance.science_hash})
     file.setncatts({"replaces": " ".join(provenance.replaces)})
     file.setncatts({"scan_provenance": json.dumps(provenance.scan_provenance)})
+    if provenance.scan_provenance:
+        starts_s, ends_s = (
+            [float(scan[name]) for scan in provenance.scan_provenance] for name in ("start_s", "end_s")
+        )
+        file.setncatts(time_coverage(min(starts_s), max(ends_s)))
     file.setncatts(
         {f"{COMPONENT_PREFIX}{name}": value for name, value in asdict(reference.components).items()}
     )
