@@ -46,6 +46,7 @@ BOXES, DAILY, BLOCKS = "boxes.nc", "daily.nc", "blocks"
 BOX_M, BLOCK_M = 100.0, 10.0
 DAY_S = 86_400.0
 KEY_DIGITS = 8  # of the hash in the name of a file of a day
+ENTRIES_KEPT = 100  # at once: a file of years can be interrupted
 _SOURCES = Variable("sources", TEXT, "S1", "name of the epoch file, or SHA-256 of the names of several")
 _KEYS = (_SOURCES, BY_NAME["reference_version"])
 
@@ -225,19 +226,35 @@ def update_blocks(
     """Bring a file of blocks up to date with its entries and return its path.
 
     `compute` returns the rasters of the entry at an index; those already in the file are copied, unless it is
-    damaged. `older` is the file to copy them from, if it has another name. Returns None and writes nothing
-    without entries. `progress` is called after each entry written. Raises StoreError if an epoch is damaged
-    or the file cannot be written; the old file remains.
+    damaged. `older` is the file to copy them from, if it has another name. Many new ones are written in
+    steps, so that an interrupted update continues. Returns None and writes nothing without entries.
+    `progress` is called after each entry written. Raises StoreError if an epoch is damaged or the file cannot
+    be written; the old file remains.
     """
     path = series.folder / block_file.name
     if not len(entries):
         return None
-    known = older or path
-    blocks = replace(series, grid=block_file.grid)
-    wanted = entries.keys
-    stored = _stored_keys(known, blocks) if is_intact(known) else wanted[:0]
-    if known == path and np.array_equal(stored, wanted):
+    known, keys = older or path, entries.keys
+    stored = _stored_keys(known, replace(series, grid=block_file.grid)) if is_intact(known) else keys[:0]
+    if known == path and np.array_equal(stored, keys):
         return path
+    for count in (*range(len(stored) + ENTRIES_KEPT, len(entries), ENTRIES_KEPT), len(entries)):
+        _write_entries(series, block_file, entries[:count], compute, progress, (known, stored))
+        known, stored = path, keys[:count]
+    return path
+
+
+def _write_entries(
+    series: Series,
+    block_file: BlockFile,
+    entries: Entries,
+    compute: Callable[[int], Rasters],
+    progress: Callable[[], None],
+    previous: tuple[Path, Array],
+) -> None:
+    """Write a file of blocks with all its entries; `previous` is a file with some of them, and their keys."""
+    path, blocks = series.folder / block_file.name, replace(series, grid=block_file.grid)
+    wanted, (known, stored) = entries.keys, previous
     is_kept = 0 < len(stored) <= len(wanted)  # a file cannot become shorter
     unchanged = np.zeros(len(wanted), np.bool_)
     if is_kept:
@@ -262,7 +279,6 @@ def update_blocks(
                 progress()
             file.setncatts(time_coverage(entries.start_s[0], entries.end_s[-1]))
         write_fingerprints(path, tmp_path)
-    return path
 
 
 def _stored_keys(path: Path, blocks: Series) -> Array:
