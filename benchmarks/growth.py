@@ -59,7 +59,7 @@ from station.science.uncertainty.parameters import parameter_layout
 from station.service.publishing import publish
 
 YEAR = 8760  # hourly scans
-FEW = 10
+FEW = 60  # as many as any search for events looks at
 OPEN_EPOCHS = 37  # most epochs in files of their own: a day, and the hours until it is compacted
 SMALL = Grid(west_m=632_000.0, north_m=5_186_000.0, cell_m=10.0, nx=60, ny=45)
 FULL = Grid(west_m=632_000.0, north_m=5_186_000.0, cell_m=1.0, nx=4000, ny=5000)

@@ -23,12 +23,14 @@ HOURS, MINUTES = ("%H", "%I", "%T", "%X", "%c", "%s", "%f"), ("%M", "%T", "%X", 
 
 def scan_stem(name: str | PurePath) -> str:
     """Return the name of a scan without folder and suffixes, also of `x.laz.gz` and `x.copc.laz`."""
-    base = PurePath(name).name
+    base = str(name).rpartition(SEPARATOR)[2]
     if base.lower().endswith(COMPRESSED):
         base = base[: -len(COMPRESSED)]
-    stem = PurePath(base).stem
-    inner = PurePath(stem).suffix
-    return stem[: -len(inner)] if inner.lower() in INNER_SUFFIXES else stem
+    stem = (
+        base.rpartition(".")[0] or base
+    )  # by hand, ten times as fast as with paths: the page needs those of a year
+    outer, _, inner = stem.rpartition(".")
+    return outer if outer and f".{inner.lower()}" in INNER_SUFFIXES else stem
 
 
 def scan_id(name: str) -> str:

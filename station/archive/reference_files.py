@@ -6,6 +6,7 @@ import json
 import os
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, fields, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +15,7 @@ import netCDF4
 import numpy as np
 
 from station.archive.atomic_files import atomic_write
+from station.archive.discovery import time_coverage
 from station.archive.netcdf_layout import (
     RENAMED_PARAMETERS,
     Series,
@@ -27,10 +29,11 @@ from station.archive.schema import FILL, Variable
 from station.archive.small_variables import read_variable, text_attribute
 from station.errors import StoreError
 from station.quantities import Floats, Floats32, Reference, SharedParameters, VarianceComponents
-from station.science.geometry.terrain import known_cell_means
+from station.science.geometry.terrain import HALO_ROWS, known_cell_means
 
 # Prefix of the attributes with the variance components of the station, one sigma each.
 COMPONENT_PREFIX = "component_"
+MEAN_ELEVATION = "reference_mean_elevation"
 _VARIABLES = (
     Variable(
         "reference_elevation", ("y", "x"), "f4", "elevation of the reference surface at the cell centre", "m",
@@ -42,7 +45,7 @@ _VARIABLES = (
         "elevation changes are counted from the surface plus this height",
     ),
     Variable(
-        "reference_mean_elevation", ("y", "x"), "f4",
+        MEAN_ELEVATION, ("y", "x"), "f4",
         "elevation of the reference, mean over the cell", "m", "surface_altitude", 4, None,
         "elevation changes are counted from it: mean of reference_elevation over the cell, plus"
         " reference_mean_residual",
@@ -184,6 +187,11 @@ def _write(
     file.setncatts({"base": provenance.base, "science_hash": provenance.science_hash})
     file.setncatts({"replaces": " ".join(provenance.replaces)})
     file.setncatts({"scan_provenance": json.dumps(provenance.scan_provenance)})
+    if provenance.scan_provenance:
+        starts_s, ends_s = (
+            [float(scan[name]) for scan in provenance.scan_provenance] for name in ("start_s", "end_s")
+        )
+        file.setncatts(time_coverage(min(starts_s), max(ends_s)))
     file.setncatts(
         {f"{COMPONENT_PREFIX}{name}": value for name, value in asdict(reference.components).items()}
     )
@@ -200,7 +208,7 @@ def _raster_rows(reference: Reference, rows: slice) -> list[np.ndarray[Any, Any]
     return [
         reference.elevation_m[rows],
         reference.mean_residual_m[rows],
-        mean_elevation(reference.elevation_m, reference.mean_residual_m, rows, slice(0, reference.grid.nx)),
+        _stored_mean_elevation(reference, rows),
         np.sqrt(reference.random_variance_m2[rows]),
         np.sqrt(reference.roughness_m2[rows]),
         reference.variance_factor[rows],
@@ -210,9 +218,39 @@ def _raster_rows(reference: Reference, rows: slice) -> list[np.ndarray[Any, Any]
     ]
 
 
-def mean_elevation(elevation_m: Floats, mean_residual_m: Floats32, rows: slice, columns: slice) -> Floats:
+def _stored_mean_elevation(reference: Reference, rows: slice) -> Floats:
+    """Return the mean elevation of cells (r, nx) [m] by the stored values, which change is counted from."""
+    halo = slice(max(rows.start - HALO_ROWS, 0), rows.stop + HALO_ROWS)
+    elevation, mean_residual, *_ = _VARIABLES
+    elevation_m = _replace_fill(rounded(elevation, reference.elevation_m[halo]))
+    mean_residual_m = _replace_fill(rounded(mean_residual, reference.mean_residual_m[halo]))
+    inner = slice(rows.start - halo.start, rows.stop - halo.start)
+    return _mean_elevation(elevation_m, mean_residual_m, inner, slice(0, reference.grid.nx))
+
+
+def _mean_elevation(
+    elevation_m: Floats | Floats32, mean_residual_m: Floats32, rows: slice, columns: slice
+) -> Floats:
     """Return the mean elevation of cells in a window of a reference (r, c) [m]: change is counted from it."""
     return known_cell_means(elevation_m, rows, columns) + mean_residual_m[rows, columns]
+
+
+def open_mean_elevation(
+    series: Series, version: str
+) -> Callable[[slice, slice], np.ndarray[Any, Any]] | None:
+    """Return a function that reads the mean elevation of cells in a window of a reference (r, c) [m].
+
+    None without the file of the version. Older files do not contain it: it is computed.
+    """
+    reference, path = open_reference(series, version), reference_path(series, version)
+    if reference is None:
+        return None
+    with read_errors(path), h5py.File(path, "r") as file:
+        is_stored = MEAN_ELEVATION in file
+    if not is_stored:
+        return partial(_mean_elevation, reference.elevation_m, reference.mean_residual_m)
+    raster = LazyRaster(path, MEAN_ELEVATION, _replace_fill)
+    return lambda rows, columns: raster[rows, columns]
 
 
 def repair_reference_link(series: Series) -> None:

@@ -320,7 +320,7 @@ VARIABLES: tuple[Variable, ...] = (
         "f8",
         "number of cells with a value of elevation_change",
         "1",
-        comment="as written; if elevation_change has fewer, files that it is read from are missing",
+        comment="as written; if elevation_change has another number, files that it is read from are missing",
     ),
     Variable("stable_count", ("time",), "f8", "number of hold-out cells of stable ground", "1"),
     Variable("stable_median", ("time",), "f8", "median change on hold-out stable ground", "m"),

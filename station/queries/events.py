@@ -6,7 +6,7 @@ import hashlib
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
-from functools import lru_cache, partial
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -14,7 +14,9 @@ import shapely
 from scipy import ndimage, sparse
 
 from station.archive.derived.event_table import (
+    KEY_LENGTH,
     Event,
+    Found,
     decode_blocks,
     encode_blocks,
     outline,
@@ -22,10 +24,11 @@ from station.archive.derived.event_table import (
     write_events,
     write_found,
 )
+from station.archive.epochs import EpochRef
 from station.archive.netcdf_layout import Series
 from station.archive.series.index import SeriesIndex, references_and_usable
 from station.errors import StoreError
-from station.quantities import Bools, Floats, Grid, SharedParameters
+from station.quantities import Bools, Floats, Grid, Ints, SharedParameters
 from station.queries.aggregates import common_error_covariance
 from station.queries.block_sums import epoch_sums
 from station.queries.blocks import BlockQueries, Blocks
@@ -54,6 +57,7 @@ CACHED_EPOCHS = 4  # whose shared parameters are in memory
 NEIGHBOURS = np.ones((3, 3), np.bool_)  # of a block, itself included
 RETAINED_SIGMA = 0.02  # of the share of a change that cells with few points retain (accuracy.md)
 EDGE_BLOCKS = 2  # around what was detected: an event covers them in part
+SEARCHES_KEPT = 200  # at once: a long search of a whole series can be interrupted
 EDGE_SIGMAS = 3.0  # of a block at the edge that has changed the other way: it belongs to another event
 
 
@@ -71,22 +75,27 @@ class EventQueries:
     def __init__(self, series: Series, queries: BlockQueries, expected_every_s: float) -> None:
         self._series, self._queries, self._scans_per_year = series, queries, YEAR_S / expected_every_s
         self._index = SeriesIndex(series)
-        self._usable = self._usable_epochs()
-        epoch_files = self._index.epoch_file[[position for position, _ in self._usable]]
-        self._names = [name.decode() for name in epoch_files.tolist()]  # once: they are in many keys
+        self._positions, self._versions = self._usable_epochs()
+        self._names = self._index.epoch_file[self._positions]
         self._reader = EpochReader(series)
         self._shared = lru_cache(CACHED_EPOCHS)(self._read_shared)
         self._levels = lru_cache(HISTORY + 2)(self._read_levels)
         self._found = read_found(series)
         self._used: dict[str, Any] = {}  # of what was found, what is still of these epochs
 
-    def _usable_epochs(self) -> list[tuple[int, str]]:
-        """Return the position and the reference version of each usable epoch that has one."""
+    def _usable_epochs(self) -> tuple[Ints, np.ndarray[Any, Any]]:
+        """Return the positions and the reference versions (n,) of the usable epochs that have one."""
         if not len(self._index):
-            return []
+            return np.empty(0, np.int64), np.empty(0, "S1")
         versions, usable = references_and_usable(self._series)
-        positions = np.flatnonzero((versions != b"") & usable).tolist()
-        return [(position, versions[position].decode()) for position in positions]
+        positions = np.flatnonzero((versions != b"") & usable)
+        return positions, versions[positions]
+
+    def _epoch(self, scan: int) -> EpochRef:
+        return self._index[int(self._positions[scan])]
+
+    def _version(self, scan: int) -> str:
+        return str(self._versions[scan].decode())
 
     @property
     def grid(self) -> Grid:
@@ -102,12 +111,12 @@ class EventQueries:
         While a reference is damaged, which stops no scan that is measured from another, the table remains as
         it is. Raises StoreError if an epoch is damaged or the table cannot be written.
         """
-        if not self._usable:
+        if not len(self._names):
             return set()
         try:
             return self._update(progress)
         except StoreError:
-            if all(map(self._is_readable, {version for _, version in self._usable})):
+            if all(self._is_readable(version.decode()) for version in np.unique(self._versions).tolist()):
                 raise
             return set()
 
@@ -119,48 +128,80 @@ class EventQueries:
         return True
 
     def _update(self, progress: Callable[[], None]) -> set[str]:
-        tracks = track_events(self._detections(progress))
+        keys = self._unchanged_keys()
+        tracks = track_events(self._detections(keys, progress))
         write_events(self._series, self._events(tracks))
-        if self._used != self._found:
-            write_found(self._series, self._used)
-        newest = len(self._usable) - 1
+        self._keep(keys)
+        newest = len(self._names) - 1
         needed = set(range(newest - HISTORY, newest + 1))
         for track in tracks:
             if track.is_open(newest):
                 needed.update(self._window(track.first))
-        return {self._names[number] for number in needed if number >= 0}
+        return {self._names[number].decode() for number in needed if number >= 0}
 
-    def _detections(self, progress: Callable[[], None]) -> Iterator[tuple[int, list[Region]]]:
-        for scan in range(len(self._usable)):
+    def _unchanged_keys(self) -> list[str]:
+        """Return the keys of the windows that were searched, if no scan came between theirs; else none."""
+        keys = self._found.keys
+        return keys.copy() if self._hash_of_scans(len(keys)) == self._found.scans else []
+
+    def _hash_of_scans(self, count: int) -> str:
+        """Return a hash of the first scans and of all else that the keys of their windows depend on."""
+        rate = f"{self._scans_per_year:.6g}".encode()
+        return hashlib.sha256(
+            rate + self._names[:count].tobytes() + self._versions[:count].tobytes()
+        ).hexdigest()
+
+    def _detections(
+        self, keys: list[str], progress: Callable[[], None]
+    ) -> Iterator[tuple[int, list[Region]]]:
+        """Yield the scans that show regions, with these; add the keys of the other windows to `keys`."""
+        known, searched = self._found.values, set(self._found.keys)
+        for scan, key in enumerate(keys):
+            if key in known:
+                self._used[key] = known[key]
+                yield scan, self._regions(key)
+        unkept = 0
+        for scan in range(len(keys), len(self._names)):
             window = self._window(scan)
-            if len(window) < LEAST_HISTORY + 2:
-                continue
-            texts = self._remember(self._key("regions", window), partial(self._search, window, progress))
-            yield scan, [Region(decode_blocks(blocks, self.grid.shape), *values) for blocks, *values in texts]
+            key = self._key("regions", window)
+            if key in known:
+                self._used[key] = known[key]
+            elif key not in searched and len(window) >= LEAST_HISTORY + 2:
+                if found := self._search(window, progress):
+                    self._used[key] = found
+                unkept += 1
+            keys.append(key)
+            if unkept == SEARCHES_KEPT:
+                self._keep(keys)
+                unkept = 0
+            yield scan, self._regions(key)
+
+    def _regions(self, key: str) -> list[Region]:
+        found = self._used.get(key, [])
+        return [Region(decode_blocks(blocks, self.grid.shape), *values) for blocks, *values in found]
+
+    def _keep(self, keys: list[str]) -> None:
+        """Keep what was found, unless it is kept already."""
+        found = Found(self._hash_of_scans(len(keys)), keys, self._used)
+        if found != self._found:
+            write_found(self._series, found)
 
     def _window(self, scan: int) -> range:
         """Return the scans up to this one that are compared: as long as the reference is the same."""
-        version = self._usable[scan][1]
         first = max(scan - HISTORY - 1, 0)
-        while self._usable[first][1] != version:
+        while self._versions[first] != self._versions[scan]:
             first += 1
         return range(first, scan + 1)
 
-    def _remember(self, key: str, compute: Callable[[], Any]) -> Any:  # noqa: ANN401 - anything JSON can hold
-        if key not in self._used:
-            self._used[key] = self._found[key] if key in self._found else compute()
-        return self._used[key]
-
     def _key(self, kind: str, scans: Sequence[int], *texts: str) -> str:
-        names = [self._names[scan] for scan in scans]
-        parts = [kind, f"{self._scans_per_year:.6g}", self._usable[scans[-1]][1], *names, *texts]
-        return hashlib.sha256("\n".join(parts).encode()).hexdigest()[:32]
+        names = [self._names[scan].decode() for scan in scans]
+        parts = [kind, f"{self._scans_per_year:.6g}", self._version(scans[-1]), *names, *texts]
+        return hashlib.sha256("\n".join(parts).encode()).hexdigest()[:KEY_LENGTH]
 
     def _read_levels(self, scan: int) -> BlockLevels:
         """Return the levels of a scan: of its sums alone, which is all that most scans of a window need."""
-        position, version = self._usable[scan]
-        sums = epoch_sums(self._series, self._index[position])
-        surface = self._queries.reference_blocks(version)
+        sums = epoch_sums(self._series, self._epoch(scan))
+        surface = self._queries.reference_blocks(self._version(scan))
         count, known = np.maximum(sums["count"], 1), np.maximum(surface["known"], 1)
         observed = (sums["count"] > 0) & (surface["known"] > 0)
         random_m2 = sums["random_m2"] / count**2 - surface["random_m2"] / known / count
@@ -170,7 +211,7 @@ class EventQueries:
         )
 
     def _read_shared(self, scan: int) -> EpochCells:
-        return self._reader.read_shared(self._index[self._usable[scan][0]])
+        return self._reader.read_shared(self._epoch(scan))
 
     def _search(self, window: range, progress: Callable[[], None]) -> list[list[Any]]:
         """Return the regions that the two newest scans of a window show: encoded blocks, and the rest."""
@@ -181,7 +222,7 @@ class EventQueries:
             self._systematic_variance(newest, self._shared(scan), self._shared(before[-1]))
             for scan in (first, second)
         ]
-        known = self._queries.reference_blocks(self._usable[second][1])["known"] > 0
+        known = self._queries.reference_blocks(self._version(second))["known"] > 0
         regions = detect_regions(
             [self._levels(scan) for scan in before],
             (self._levels(first), self._levels(second)),
@@ -204,7 +245,7 @@ class EventQueries:
         ]
 
     def _with_jacobian(self, scan: int) -> Blocks:
-        return self._queries.read(self._index[self._usable[scan][0]])
+        return self._queries.read(self._epoch(scan))
 
     @staticmethod
     def _systematic_variance(geometry: Blocks, scan: EpochCells, before: EpochCells) -> Floats:
@@ -230,8 +271,7 @@ class EventQueries:
             volumes.append(
                 self._volume_of(track, np.any(others, axis=0) if others else np.zeros_like(track.blocks))
             )
-        version = self._usable[-1][1]
-        surface = self._queries.reference_blocks(version)
+        surface = self._queries.reference_blocks(self._version(-1))
         with np.errstate(invalid="ignore"):
             elevation_m = surface["surface_m"] / surface["known"]
         partners = pair_tracks(tracks, elevation_m)
@@ -253,7 +293,7 @@ class EventQueries:
         """Return the time of the first scan that shows each event, with a number if there are several."""
         ids: list[str] = []
         for track in tracks:
-            start = f"{self._index[self._usable[track.first - 1][0]].start:%Y%m%dT%H%M%SZ}"
+            start = f"{self._epoch(track.first - 1).start:%Y%m%dT%H%M%SZ}"
             ids.append(f"{start}-{1 + sum(name.startswith(start) for name in ids)}")
         return ids
 
@@ -261,7 +301,7 @@ class EventQueries:
         grid, (row, column) = self.grid, np.nonzero(track.blocks)
         size_m2 = np.count_nonzero(track.blocks) * grid.cell_m**2
         kinds = ("snowfall", "melt_front") if track.widespread else ("gain", "loss")
-        newest = len(self._usable) - 1
+        newest = len(self._names) - 1
         window = self._window(track.first)
         return Event(
             id=name,
@@ -278,18 +318,20 @@ class EventQueries:
             volume_sigma_m3=round(volume.sigma_m3, 2),
             mean_depth_m=round(volume.volume_m3 / size_m2, 4),
             sigmas=round(track.sigmas, 1),
-            reference_version=self._usable[track.first][1],
+            reference_version=self._version(track.first),
         )
 
     def _time(self, scan: int) -> str:
-        return f"{datetime.fromtimestamp(self._index.time_s[self._usable[scan][0]], UTC):%Y-%m-%dT%H:%M:%SZ}"
+        return f"{datetime.fromtimestamp(self._index.time_s[self._positions[scan]], UTC):%Y-%m-%dT%H:%M:%SZ}"
 
     def _volume_of(self, track: Track, others: Bools) -> _Volume:
         before = self._window(track.first)[:-2][-BEFORE:]
         after = [track.last - 1, track.last]
         texts = encode_blocks(track.blocks), encode_blocks(others)
         key = self._key("volume", [*before, *after], *texts)
-        return _Volume(*self._remember(key, lambda: self._measure(track, others, before, after)))
+        known = self._found.values
+        self._used[key] = known[key] if key in known else self._measure(track, others, before, after)
+        return _Volume(*self._used[key])
 
     def _measure(self, track: Track, others: Bools, before: range, after: list[int]) -> list[float]:
         """Return the volume of an event and its σ [m³], from the scans before and after it.
@@ -308,7 +350,7 @@ class EventQueries:
         rock = newest.rock > 0.5
         ground = rock if rock[core].mean() > 0.5 else ~rock
         members = _members(track, core, known, known & ground & ~others, change_m, random_m2)
-        surface = self._queries.reference_blocks(self._usable[after[-1]][1])["known"] > 0
+        surface = self._queries.reference_blocks(self._version(after[-1]))["known"] > 0
         if not track.widespread:
             members |= ndimage.binary_closing(core, NEIGHBOURS, EDGE_BLOCKS) & ~known & surface
         filled, distance = area_weights(members, known)

@@ -8,13 +8,16 @@ import h5py
 import netCDF4
 import numpy as np
 import pytest
+import xarray as xr
+from scipy.interpolate import interp1d
 from support.epochs import GRID, make_epoch
 
 import station
 from station.archive.derived import computed_rasters
 from station.archive.epochs import write_epoch
+from station.archive.netcdf_layout import Series
 from station.archive.raster_io import rounded
-from station.archive.reference_files import mean_elevation, write_reference
+from station.archive.reference_files import open_mean_elevation, write_reference
 from station.archive.schema import BY_NAME, FILL
 from station.archive.series.compaction import compact
 from station.archive.series.index import list_epochs
@@ -131,15 +134,36 @@ def test_an_export_of_old_and_new_epochs_has_the_values_of_the_series(mixed, tmp
 def test_the_reference_is_read_once_for_all_epochs_of_an_export(mixed, tmp_path, monkeypatch):
     windows = []
 
-    def recorded(*arguments):
-        windows.append(arguments)
-        return mean_elevation(*arguments)
+    def recorded(*version):
+        read = open_mean_elevation(*version)
+        return lambda *window: windows.append(window) or read(*window)
 
-    monkeypatch.setattr(computed_rasters, "mean_elevation", recorded)
+    monkeypatch.setattr(computed_rasters, "open_mean_elevation", recorded)
     selection = select(mixed, Span.parse(None, None), variables="elevation")
     parts = split(selection, tmp_path / "all.nc", ".nc", None)
     list(FORMATS["netcdf"].write(selection, parts, lambda _: None, lambda _: None))
     assert len(windows) == 1
+
+
+def test_the_mean_elevation_of_the_reference_is_that_of_its_stored_surface(tmp_path):
+    """Change counts from the surface as stored, to 1/1024 m: averaged here over 64 x 64 points of a cell."""
+    series = Series(tmp_path, "hef", GRID, "EPSG:32632")
+    random = np.random.default_rng(5)
+    residual_m = random.normal(0, 0.01, GRID.shape).astype(np.float32)
+    reference = Reference.from_elevation(GRID, "1", 2800 + random.normal(0, 0.3, GRID.shape))
+    write_reference(series, replace(reference, mean_residual_m=residual_m))
+    with xr.open_dataset(series.folder / "reference.nc") as ds:
+        nodes, residual, mean = (
+            ds[f"reference_{name}"].values.astype(np.float64)
+            for name in ("elevation", "mean_residual", "mean_elevation")
+        )
+    for axis, size in enumerate(GRID.shape):
+        fine = (np.arange(size * 64) + 0.5) / 64 - 0.5  # in cells, from the first centre
+        line = interp1d(np.arange(size), nodes, axis=axis, bounds_error=False, fill_value="extrapolate")(fine)
+        shape = (*nodes.shape[:axis], size, 64, *nodes.shape[axis + 1 :])
+        nodes = line.reshape(shape).mean(axis=axis + 1)
+    # Steps of float32 at 2,800 m are 0.24 mm, those of rounding 0.06 mm; unrounded nodes differ by 0.5 mm.
+    np.testing.assert_allclose(mean - residual, nodes, rtol=0, atol=1.6e-4)
 
 
 def test_boxes_of_an_old_and_of_a_new_epoch_of_the_same_values_are_equal(mixed):

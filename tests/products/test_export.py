@@ -9,6 +9,7 @@ import warnings
 import xml.etree.ElementTree as ET
 from dataclasses import replace
 
+import netCDF4
 import numpy as np
 import pytest
 import rasterio
@@ -184,10 +185,20 @@ def test_csv_of_scans(site, tmp_path, small):
     assert [row["in_reference"] for row in rows] == [""] * 6  # it was given as a surface
     series = series_in(site.station.data)
     reference = open_reference(series)
-    provenance = tuple({"scan_id": json.dumps(rows[index]["scan"])} for index in (1, 5))
+    provenance = tuple(
+        {
+            "scan_id": json.dumps(rows[index]["scan"]),
+            "start_s": f"{3600 * index}",
+            "end_s": f"{3600 * index + 900}",
+        }
+        for index in (1, 5)
+    )
     write_reference(
         series, replace(reference, version="2"), ReferenceProvenance("2", scan_provenance=provenance)
     )
+    with netCDF4.Dataset(series.folder / "reference.nc") as file:
+        assert file.time_coverage_start == "1970-01-01T01:00:00Z"
+        assert file.time_coverage_end == "1970-01-01T05:15:00Z"
     scans, _ = export(site, "csv", None, tmp_path / "csv")
     rows = list(csv.DictReader(io.StringIO(scans.read_text())))
     assert [row["in_reference"] for row in rows] == ["", "2", "", "", "", "2"]

@@ -207,6 +207,26 @@ def recorded(method, computed):
     return compute
 
 
+def test_an_interrupted_update_of_many_epochs_continues(stored, base, monkeypatch):
+    monkeypatch.setattr("station.archive.derived.boxes.ENTRIES_KEPT", 2)
+    (stored.folder / "boxes.nc").unlink()
+    computed = []
+
+    class Interrupted(BlockQueries):
+        def boxes(self, epoch):
+            computed.append(epoch)
+            if len(computed) == 4:
+                raise KeyboardInterrupt
+            return super().boxes(epoch)
+
+    with pytest.raises(KeyboardInterrupt):
+        update_boxes(stored, Interrupted(stored), lambda: None)
+    assert len(read(stored, "boxes.nc").time) == 2
+    update_boxes(stored, Interrupted(stored), lambda: None)
+    assert len(computed) == 4 + 3
+    xr.testing.assert_identical(read(stored, "boxes.nc").drop_attrs(), read(base, "boxes.nc").drop_attrs())
+
+
 def test_a_damaged_file_of_a_day_is_not_copied_from(stored):
     """The first day gets a late epoch; the file of the second day stays as it is until it is deleted."""
     paths, _ = days(stored)

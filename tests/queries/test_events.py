@@ -22,7 +22,7 @@ from station.archive.reference_files import write_reference
 from station.archive.series.virtual import build_series
 from station.quantities import Grid, Quality, Reference
 from station.queries.blocks import BlockQueries
-from station.queries.events import EventQueries
+from station.queries.events import LEAST_HISTORY, EventQueries
 
 GRID = Grid(west_m=632_000.0, north_m=5_186_000.0, cell_m=5.0, nx=60, ny=50)
 RANDOM_M = 0.02
@@ -139,6 +139,24 @@ def test_live_equals_anew_and_a_late_scan(base, tmp_path):
     copy_scans(base, live, [EVENT_HOUR - 1])
     assert update(live)[0] == HOURS - EVENT_HOUR + 1
     assert table(live) == table(base)
+
+
+def test_an_interrupted_search_of_a_whole_series_continues(base, tmp_path, monkeypatch):
+    monkeypatch.setattr("station.queries.events.SEARCHES_KEPT", 2)
+    series = empty_store(tmp_path / "store")
+    copy_scans(base, series, range(HOURS))
+    searched = []
+
+    def stop_in_the_fourth():
+        searched.append(1)
+        if len(searched) == 4:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        EventQueries(series, BlockQueries(series), 3600.0).update(stop_in_the_fourth)
+    windows = HOURS - LEAST_HISTORY - 1
+    assert update(series)[0] == windows - 2
+    assert table(series) == table(base)
 
 
 @pytest.mark.parametrize("name", ["events.geojson", FOUND_NAME])

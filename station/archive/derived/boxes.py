@@ -46,6 +46,7 @@ BOXES, DAILY, BLOCKS = "boxes.nc", "daily.nc", "blocks"
 BOX_M, BLOCK_M = 100.0, 10.0
 DAY_S = 86_400.0
 KEY_DIGITS = 8  # of the hash in the name of a file of a day
+ENTRIES_KEPT = 100  # at once: a file of years can be interrupted
 _SOURCES = Variable("sources", TEXT, "S1", "name of the epoch file, or SHA-256 of the names of several")
 _KEYS = (_SOURCES, BY_NAME["reference_version"])
 
@@ -145,10 +146,13 @@ def box_file(grid: Grid, cells: int) -> BlockFile:
     return BlockFile(BOXES, title, "middle of the scan", _coarse(grid, cells), BOX_VARIABLES)
 
 
-def day_file(series: Series, cells: int, entries: Entries) -> BlockFile:
-    """Return the description of a file in `blocks/`: blocks of `cells` × `cells`, the epochs of a day."""
-    day = f"{datetime.fromtimestamp(entries.start_s[0], UTC):%Y%m%d}"
-    key = hashlib.sha256(entries.keys.tobytes()).hexdigest()[:KEY_DIGITS]
+def day_file(series: Series, cells: int, start_s: float, keys: Array) -> BlockFile:
+    """Return the description of a file in `blocks/`: blocks of `cells` × `cells`, the epochs of a day.
+
+    `start_s` is the start of the first, `keys` (n,) are those of their entries.
+    """
+    day = f"{datetime.fromtimestamp(start_s, UTC):%Y%m%d}"
+    key = hashlib.sha256(keys.tobytes()).hexdigest()[:KEY_DIGITS]
     return replace(
         box_file(series.grid, cells), name=f"{BLOCKS}/{day[:4]}/{series.station_id}_{day}_{key}.nc"
     )
@@ -178,19 +182,21 @@ def update_days(
     """
     if not len(entries):
         return
-    existing, current = block_files(series), set()
-    by_day = {_day_of(path): path for path in existing}
+    folder, keys, current = series.folder / BLOCKS, entries.keys, set[str]()
+    existing = {path.name: path for path in block_files(series)}
+    recorded = {path.name for path in folder.glob(f"*/.{series.station_id}_*.json")}
+    by_day = {_day_of(path): path for path in existing.values()}
     changes = np.flatnonzero(np.diff(entries.start_s // DAY_S)) + 1
     for first, end in pairwise([0, *changes.tolist(), len(entries)]):
-        of_day = entries[first:end]
-        block_file = day_file(series, cells, of_day)
+        block_file = day_file(series, cells, entries.start_s[first], keys[first:end])
         path = series.folder / block_file.name
-        current.add(path)
-        if not (path in existing and fingerprints_path(path).is_file()):
+        current.add(path.name)
+        if not (path.name in existing and fingerprints_path(path).name in recorded):
             older = by_day.get(_day_of(path))
-            update_blocks(series, block_file, of_day, partial(_shifted, compute, first), progress, older)
-    for path in existing - current:
-        for file in (path, fingerprints_path(path)):
+            compute_of_day = partial(_shifted, compute, first)
+            update_blocks(series, block_file, entries[first:end], compute_of_day, progress, older)
+    for name in existing.keys() - current:
+        for file in (existing[name], fingerprints_path(existing[name])):
             with suppress(OSError):
                 file.unlink()
 
@@ -220,19 +226,35 @@ def update_blocks(
     """Bring a file of blocks up to date with its entries and return its path.
 
     `compute` returns the rasters of the entry at an index; those already in the file are copied, unless it is
-    damaged. `older` is the file to copy them from, if it has another name. Returns None and writes nothing
-    without entries. `progress` is called after each entry written. Raises StoreError if an epoch is damaged
-    or the file cannot be written; the old file remains.
+    damaged. `older` is the file to copy them from, if it has another name. Many new ones are written in
+    steps, so that an interrupted update continues. Returns None and writes nothing without entries.
+    `progress` is called after each entry written. Raises StoreError if an epoch is damaged or the file cannot
+    be written; the old file remains.
     """
     path = series.folder / block_file.name
     if not len(entries):
         return None
-    known = older or path
-    blocks = replace(series, grid=block_file.grid)
-    wanted = entries.keys
-    stored = _stored_keys(known, blocks) if is_intact(known) else wanted[:0]
-    if known == path and np.array_equal(stored, wanted):
+    known, keys = older or path, entries.keys
+    stored = _stored_keys(known, replace(series, grid=block_file.grid)) if is_intact(known) else keys[:0]
+    if known == path and np.array_equal(stored, keys):
         return path
+    for count in (*range(len(stored) + ENTRIES_KEPT, len(entries), ENTRIES_KEPT), len(entries)):
+        _write_entries(series, block_file, entries[:count], compute, progress, (known, stored))
+        known, stored = path, keys[:count]
+    return path
+
+
+def _write_entries(
+    series: Series,
+    block_file: BlockFile,
+    entries: Entries,
+    compute: Callable[[int], Rasters],
+    progress: Callable[[], None],
+    previous: tuple[Path, Array],
+) -> None:
+    """Write a file of blocks with all its entries; `previous` is a file with some of them, and their keys."""
+    path, blocks = series.folder / block_file.name, replace(series, grid=block_file.grid)
+    wanted, (known, stored) = entries.keys, previous
     is_kept = 0 < len(stored) <= len(wanted)  # a file cannot become shorter
     unchanged = np.zeros(len(wanted), np.bool_)
     if is_kept:
@@ -257,7 +279,6 @@ def update_blocks(
                 progress()
             file.setncatts(time_coverage(entries.start_s[0], entries.end_s[-1]))
         write_fingerprints(path, tmp_path)
-    return path
 
 
 def _stored_keys(path: Path, blocks: Series) -> Array:

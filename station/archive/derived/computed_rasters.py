@@ -16,10 +16,9 @@ import numpy as np
 from station.archive.netcdf_layout import Series
 from station.archive.raster_io import Array, LazyRaster
 from station.archive.read_errors import read_errors
-from station.archive.reference_files import mean_elevation, open_reference
+from station.archive.reference_files import open_mean_elevation
 from station.archive.schema import FILL
 from station.errors import StoreError
-from station.quantities import Reference
 
 ELEVATION, OUTSIDE, CHANGE = "elevation", "elevation_outside_reference", "elevation_change"
 TOTAL, SYSTEMATIC, RANDOM = (f"{CHANGE}{part}_uncertainty" for part in ("", "_systematic", "_random"))
@@ -58,7 +57,7 @@ def _compute(name: str, stored: Array | None, read: Read, surface: Callable[[], 
     counted = is_value(first) if stored is None else is_value(first) & ~is_value(stored)
     if not counted.any():
         return elevation_m
-    return np.where(counted, (surface() + first).astype(np.float32), elevation_m)
+    return np.where(counted, (surface() + first).astype(np.float32, copy=False), elevation_m)
 
 
 def is_value(values: Array) -> Array:
@@ -79,7 +78,7 @@ class ReferenceSurfaces:
 
     def __init__(self, series: Series) -> None:
         self._series = series
-        self._references: dict[str, Reference] = {}
+        self._surfaces: dict[str, Callable[[slice, slice], Array]] = {}
         self._last: tuple[object, Array] | None = None  # window and its heights: epochs share them
 
     def height_m(self, version: str, rows: slice, columns: slice) -> Array:
@@ -91,16 +90,15 @@ class ReferenceSurfaces:
         return last[1]
 
     def _read(self, version: str, rows: slice, columns: slice) -> Array:
-        if version not in self._references:
-            reference = open_reference(self._series, version)
-            if reference is None:
+        if version not in self._surfaces:
+            surface = open_mean_elevation(self._series, version)
+            if surface is None:
                 raise StoreError(
                     f"{self._series.folder}: reference_{version}.nc is missing, without which there is no"
                     " elevation: restore it"
                 )
-            self._references[version] = reference
-        reference = self._references[version]
-        return mean_elevation(reference.elevation_m, reference.mean_residual_m, rows, columns)
+            self._surfaces[version] = surface
+        return self._surfaces[version](rows, columns)
 
 
 class ComputedRaster:

@@ -10,9 +10,9 @@ from __future__ import annotations
 import base64
 import json
 import zlib
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from contextlib import suppress
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -27,7 +27,8 @@ from station.errors import StoreError
 from station.quantities import Bools, Grid
 
 FILE_NAME, FOUND_NAME = "events.geojson", ".event_regions.json"
-FORMAT = 1  # of the kept regions
+FORMAT = 2  # of the kept regions
+KEY_LENGTH = 32
 CLASSES = ("loss", "gain", "paired", "melt_front", "snowfall")
 
 
@@ -58,6 +59,19 @@ class Event:
 EVENT_COLUMNS = tuple(Event.__dataclass_fields__)
 
 
+@dataclass(frozen=True)
+class Found:
+    """What was found in the windows of scans that were searched.
+
+    `keys` are those of the windows, in order of their last scans, `scans` is a hash of these scans, and
+    `values` has what was found in a window, or measured of an event, by its key; nothing where it has none.
+    """
+
+    scans: str = ""
+    keys: list[str] = field(default_factory=list)
+    values: dict[str, Any] = field(default_factory=dict)
+
+
 def encode_blocks(blocks: Bools) -> str:
     """Return blocks (by, bx) as a short text."""
     return base64.b64encode(zlib.compress(np.packbits(blocks).tobytes(), 6)).decode()
@@ -77,20 +91,25 @@ def outline(blocks: Bools, grid: Grid) -> shapely.Geometry:
     return shapely.normalize(shapely.union_all(boxes))
 
 
-def read_found(series: Series) -> dict[str, Any]:
-    """Return what was found in each window of scans, by its key; {} if it is missing or damaged."""
+def read_found(series: Series) -> Found:
+    """Return what was found before; nothing if the file is missing or damaged."""
     content = read_checked_json(series.folder / FOUND_NAME)
     if not isinstance(content, dict) or content.get("format") != FORMAT:
-        return {}
-    found = content.get("found")
-    return found if isinstance(found, dict) else {}
+        return Found()
+    keys = content["keys"]
+    starts = range(0, len(keys), KEY_LENGTH)
+    return Found(content["scans"], [keys[start : start + KEY_LENGTH] for start in starts], content["values"])
 
 
-def write_found(series: Series, found: Mapping[str, Any]) -> None:
+def write_found(series: Series, found: Found) -> None:
     """Keep what was found; skipped without an error if the disk is full."""
-    path = series.folder / FOUND_NAME
+    path, keys = (
+        series.folder / FOUND_NAME,
+        "".join(found.keys),
+    )  # one text: reading a list takes ten times as long
+    content = {"format": FORMAT, "scans": found.scans, "keys": keys, "values": found.values}
     with suppress(StoreError), atomic_write(path) as tmp_path:
-        tmp_path.write_text(to_checked_json({"format": FORMAT, "found": found}), encoding="ascii")
+        tmp_path.write_text(to_checked_json(content), encoding="ascii")
 
 
 def write_events(series: Series, events: Iterable[tuple[Event, shapely.Geometry]]) -> Path:

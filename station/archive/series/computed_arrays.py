@@ -78,14 +78,17 @@ class ComputedArrays:
         times, rows, columns = (
             np.atleast_1d(np.arange(size)[part]) for part, size in zip(key, self._shape, strict=True)
         )
-        surface_m = np.full((len(times), len(rows), len(columns)), np.nan)
+        surface_m = np.full((len(times), len(rows), len(columns)), np.nan, np.float32)
         if surface_m.size:
             window = slice(rows.min(), rows.max() + 1), slice(columns.min(), columns.max() + 1)
             versions = np.array([self._versions[time] for time in times.tolist()])
             for version in set(versions.tolist()) - {""}:
                 with NETCDF4_PYTHON_LOCK:  # netCDF4 reads the reference, and dask calls this in threads
                     height_m = self._surfaces.height_m(version, *window)
-                surface_m[versions == version] = height_m[np.ix_(rows - rows.min(), columns - columns.min())]
+                inner = (rows - rows.min(), columns - columns.min())
+                if not all(isinstance(part, slice) and part.step in {None, 1} for part in key[1:]):
+                    height_m = height_m[np.ix_(*inner)]
+                surface_m[versions == version] = height_m
         single = tuple(axis for axis, part in enumerate(key) if isinstance(part, int | np.integer))
         return np.asarray(surface_m.squeeze(single))
 

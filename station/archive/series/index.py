@@ -177,11 +177,18 @@ def source_files(series_path: Path) -> set[Path]:
 
 
 def data_folder(site_or_folder: str | Path) -> Path:
-    """Return the data folder of a site file or a `series.nc`, or the folder itself."""
+    """Return the data folder of a site file or a `series.nc`, or the folder itself.
+
+    Raises StoreError if it is another file.
+    """
     path = Path(site_or_folder)
     if path.name == "series.nc" and not path.is_dir():
         return path.parent
     site = _site(path)
+    if site is None and path.is_file():
+        raise StoreError(
+            f"{path}: no site file, data folder or series.nc: xarray.open_dataset reads other files"
+        )
     return path if site is None else site.station.data
 
 

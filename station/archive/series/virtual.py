@@ -41,10 +41,11 @@ SMALL_DIMS = {"time": ("time",), "time_bnds": ("time", "bnds")} | {
     spec.name: spec.dims for spec in SMALL_VARIABLES
 }
 SCALE_ATTRIBUTES = ("CLASS", "NAME", "REFERENCE_LIST", "_FillValue")  # of a dimension scale, written by HDF5
+NO_SOURCE, NO_COUNT = 1e30, -1  # in rasters whose file is missing: nobody takes them for measurements
 COMMENT = (
     "This file is virtual: times and rasters are read from days/, months/ and epochs/ beside it; copy the"
-    " whole folder. Without a source, its times are 9.96921e36 and its rasters empty: the number of valid"
-    " cells of elevation_change is then below valid_count. How each scan was processed is in processing.nc."
+    " whole folder. Without a source, its times are 9.96921e36 and its rasters 1e30, so that the number of"
+    " valid cells of elevation_change is not valid_count. How each scan was processed is in processing.nc."
 )
 PROCESSING_COMMENT = (
     "This file is virtual: times and covariances are read from days/, months/ and epochs/ beside it; copy the"
@@ -227,7 +228,7 @@ def _link_sources(
             continue
         shape = tuple(len(file[dim]) for dim in spec.dims)
         layout = h5py.h5p.create(h5py.h5p.DATASET_CREATE)
-        layout.set_fill_value(np.array(_fill_value(spec), spec.dtype))
+        layout.set_fill_value(np.array(_unmapped_value(spec, epoch_sources, shape), spec.dtype))
         for source, path in zip(epoch_sources, paths, strict=True):
             if spec.name in source.raster_shapes:
                 key = (source.series_start, spec.dims, source.raster_shapes[spec.name])
@@ -242,9 +243,15 @@ def _link_sources(
         _write_raster_attrs(h5py.Dataset(dataset_id), file, spec, series)
 
 
-def _fill_value(spec: Variable) -> float:
-    """Return the value of cells without a source."""
-    return FILL if spec.dtype[0] == "f" else int(Quality.NOT_SEEN) if spec.name == "quality" else 0
+def _unmapped_value(spec: Variable, epoch_sources: list[EpochSource], shape: tuple[int, ...]) -> float:
+    """Return the value of a large variable where no file is read: it is missing, or lacks the variable.
+
+    Missing data if some epochs lack it, or a parameter; otherwise only a missing file shows this value.
+    """
+    is_covered = all(source.raster_shapes.get(spec.name, ())[1:] == shape[1:] for source in epoch_sources)
+    if spec.dtype[0] == "f":
+        return NO_SOURCE if is_covered else FILL
+    return int(Quality.NOT_SEEN) if spec.name == "quality" else NO_COUNT if is_covered else 0
 
 
 def _link_time(file: Any, epoch_sources: list[EpochSource], paths: list[bytes]) -> None:  # noqa: ANN401
@@ -311,7 +318,12 @@ def _contiguous_blocks(indices: list[int]) -> list[tuple[int, int, int]]:
 
 
 def _write_raster_attrs(dataset: Any, file: Any, spec: Variable, series: Series) -> None:  # noqa: ANN401 - h5py has no types
-    """Write dimensions and attributes of a virtual dataset the way netCDF expects them."""
+    """Write dimensions and attributes of a virtual dataset the way netCDF expects them.
+
+    The first dimension has two scales, of which netCDF and h5netcdf take the last. kerchunk and VirtualiZarr,
+    which do not follow virtual datasets and would find no values, refuse a dimension of two scales.
+    """
+    dataset.dims[0].attach_scale(file[spec.dims[1]])
     for axis, dim in enumerate(spec.dims):
         dataset.dims[axis].attach_scale(file[dim])
     for key, value in attributes(spec, series).items():

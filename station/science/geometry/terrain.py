@@ -208,7 +208,7 @@ def cell_means(nodes: Floats | Floats32) -> Floats:
     return np.asarray((rows[:, :-2] + 6 * rows[:, 1:-1] + rows[:, 2:]) / 8)
 
 
-def known_cell_means(nodes: Floats, rows: slice, columns: slice) -> Floats:
+def known_cell_means(nodes: Floats | Floats32, rows: slice, columns: slice) -> Floats:
     """Mean over each cell (r, c) of a window of a surface with nodes (ny, nx); NaN where they are unknown.
 
     Nodes around the known ones are extrapolated, as for the shots.

@@ -20,6 +20,7 @@ from station.archive.netcdf_layout import Series
 from station.archive.series.compaction import compact
 from station.archive.series.index import list_epochs
 from station.archive.series.virtual import build_series
+from station.errors import StoreError
 
 HOURS = (1, 2, 3, 5, 30, 31)  # the first four become a compacted day
 WITHOUT_TERMS = 30  # an epoch that lacks the sigma terms
@@ -123,6 +124,11 @@ def test_chunks_of_dask(stored, chunks, expected):
         xr.testing.assert_identical(
             ds.elevation_change.mean("time").load(), plain.elevation_change.mean("time")
         )
+
+
+def test_a_file_that_is_no_series_is_refused(stored):
+    with pytest.raises(StoreError, match=r"reference\.nc: no site file, data folder or series\.nc"):
+        station.open(stored.folder / "reference.nc")
 
 
 def test_threads_of_dask_read_the_reference_one_at_a_time(stored):

@@ -1,13 +1,16 @@
 """A `series.nc` without the files that it reads from: every reader must see that something is missing."""
 
+import dataclasses
 import json
 import shutil
 import subprocess
 
+import netCDF4
 import numpy as np
 import pytest
 import xarray as xr
 from support.epochs import GRID, make_epoch, write_surface
+from support.programs import readers_python
 from support.series import copied
 
 import station
@@ -18,6 +21,7 @@ from station.errors import StoreError
 
 ENGINES = ("netcdf4", pytest.param("h5netcdf", marks=pytest.mark.integration))
 NO_TIME_S = 9.96921e36
+NO_CHANGE_M = 1e30
 
 
 @pytest.fixture(scope="module")
@@ -89,6 +93,21 @@ def test_an_epoch_without_its_file_shows_itself(stored, series):
         assert (ds.time == NO_TIME_S).values.tolist() == [False, False, True, False]
         is_complete = ds.elevation_change.count(("y", "x")) == ds.valid_count
         assert is_complete.values.tolist() == [True, True, False, True]
+        assert (ds.elevation_change[2] == np.float32(NO_CHANGE_M)).all()
+        assert (ds.point_count[2] == -1).all()
+        assert float(ds.elevation_change.mean()) > NO_CHANGE_M / 10  # no mean hides it
+
+
+def test_a_variable_that_older_epochs_lack_is_missing_there(stored, series):
+    older = dataclasses.replace(make_epoch(5), verdict_reason="older")
+    path = write_epoch(series, older).path
+    with netCDF4.Dataset(path, "a") as file:
+        file.renameVariable("elevation_spread", "spread_of_old")
+    build_series(series)
+    with xr.open_dataset(stored) as ds:
+        assert ds.elevation_spread.count(("y", "x")).values.tolist() == [140 * 75] * 4 + [0]
+        assert float(ds.elevation_spread.max()) < 1
+        assert float(ds.elevation_change[-1].max()) == pytest.approx(0.05)
 
 
 def test_a_reader_learns_that_files_were_deleted(series, stored):
@@ -112,3 +131,40 @@ def test_other_programs_show_that_a_lone_copy_has_no_times(lone, tmp_path):
     assert times_s == pytest.approx([NO_TIME_S] * 4)
     (dates,) = run("cdo", "-s", "showdate", "-selname,elevation_change", str(lone)).stdout.splitlines()
     assert "2025" not in dates
+    for averaged in (
+        ("ncra", "-O", "-3", "-v", "elevation_change", str(lone), str(tmp_path / "mean.nc")),
+        ("cdo", "-s", "timmean", "-selname,elevation_change", str(lone), str(tmp_path / "mean.nc")),
+    ):
+        assert run(*averaged).returncode == 0
+        with xr.open_dataset(tmp_path / "mean.nc", decode_times=False) as ds:
+            assert (ds.elevation_change == np.float32(NO_CHANGE_M)).all()
+
+
+REFUSALS = """
+import warnings
+from kerchunk.hdf import SingleHdf5ToZarr
+from obspec_utils.registry import ObjectStoreRegistry
+from obstore.store import LocalStore
+from virtualizarr.parsers import HDFParser
+registry = ObjectStoreRegistry({"file://": LocalStore()})
+for path in paths:
+    try:
+        HDFParser()(f"file://{path}", registry)
+    except ValueError as error:
+        print(error)
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        names = {name.split("/")[0] for name in SingleHdf5ToZarr(path).translate()["refs"]}
+    refused = sum("2 dimension scales" in str(warning.message) for warning in caught)
+    print(refused, len(names & {"elevation_change", "shared_parameter_covariance"}))
+"""
+
+
+@pytest.mark.integration
+def test_readers_that_follow_no_virtual_file_refuse_it(stored):
+    """VirtualiZarr stops, kerchunk warns and leaves the variables out: both would find no values."""
+    paths = [str(stored), str(stored.with_name("processing.nc"))]
+    lines = run(str(readers_python()), "-c", f"paths = {paths!r}\n{REFUSALS}").stdout.splitlines()
+    for error in lines[::2]:
+        assert "has 2 dimension scales attached to dimension #0" in error
+    assert lines[1::2] == ["7 0", "2 0"]  # rasters; covariance of the parameters and of change

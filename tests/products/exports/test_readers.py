@@ -5,6 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 import xarray as xr
+from support.epochs import make_epoch
 from support.programs import (
     assert_acdd_misses_only_what_is_not_computed,
     assert_gdal_knows_the_place,
@@ -27,12 +28,12 @@ VALUES = (0.0, 0.01, 0.02, 0.03)  # change of the four epochs [m], in the wester
 CELLS = 75 * 140
 
 
-@pytest.fixture
-def exported(series, epoch, tmp_path):
+@pytest.fixture(scope="module")
+def exported(base_store, tmp_path_factory):
     for hour in range(len(VALUES)):
-        epochs.write_epoch(series, epoch(hour))
-    build_series(series)
-    return write(series, tmp_path / "all.nc")
+        epochs.write_epoch(base_store, make_epoch(hour))
+    build_series(base_store)
+    return write(base_store, tmp_path_factory.mktemp("exported") / "all.nc")
 
 
 def write(series, out):
