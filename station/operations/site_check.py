@@ -170,7 +170,7 @@ def _sop_poses(site: Site) -> Iterator[Finding]:
             max(grid.west_m - east_m, 0.0, east_m - grid.west_m - grid.nx * grid.cell_m),
             max(north_m - grid.north_m, 0.0, grid.north_m - grid.ny * grid.cell_m - north_m),
         )
-        if distance_m > site.scanner.range_max_m:
+        if distance_m > site.scanner_of(sop).range_max_m:
             yield _finding(
                 "fault", "grid", f"begins {distance_m:,.0f} m from the scanner: beyond range_max_m"
             )
@@ -275,7 +275,8 @@ def _inclination(site: Site) -> Iterator[Finding]:
         assert sop is not None  # noqa: S101 - there are some
         rotation = scanner_to_map(site, sop).to_local[:3, :3]
         log_path = scans[-1].with_name(scan_stem(scans[-1]) + site.inclination.suffix)
-        log, _ = inclination.clean(read_inclination(log_path), site.instrument.inclination_range_rad)
+        range_rad = site.scanner_of(sop).instrument.inclination_range_rad
+        log, _ = inclination.clean(read_inclination(log_path), range_rad)
     except StationError:
         return
     if not len(log.time_s):
@@ -285,7 +286,7 @@ def _inclination(site: Site) -> Iterator[Finding]:
     expected = float(expected_deg[0]), float(expected_deg[1])
     if site.inclination.mode == "absolute":
         yield from _named("inclination", double_tilt_findings(sop.file.name, expected, log_deg))
-    elif math.degrees(site.instrument.inclination_range_rad) > max(map(abs, expected)):
+    elif math.degrees(range_rad) > max(map(abs, expected)):
         yield from _named("inclination", [tilt_findings(sop.file.name, expected, log_deg)])
 
 

@@ -159,6 +159,12 @@ def _orthonormal_rotation(rotation: Floats, path: Path) -> Floats:
     return np.asarray(u @ vt)
 
 
+def sops_of_file(sops: Sequence[SopSection], name: str) -> list[SopSection]:
+    """Return the SOPs for a file of a scan: those whose pattern it matches, else those without one."""
+    own = [sop for sop in sops if sop.files is not None and fnmatchcase(name, sop.files)]
+    return own or [sop for sop in sops if sop.files is None]
+
+
 def valid_sop(sops: Sequence[SopSection], time_utc: datetime, name: str = "") -> SopSection | None:
     """Return the SOP valid at a time: the latest that has begun; None if there are none at all.
 
@@ -171,8 +177,7 @@ def valid_sop(sops: Sequence[SopSection], time_utc: datetime, name: str = "") ->
     if not started:
         raise ScanError(f"no [[sop]] of the site file has begun by {time_utc:%Y-%m-%d %H:%M:%S} UTC")
     if name:
-        own = [sop for sop in started if sop.files is not None and fnmatchcase(name, sop.files)]
-        started = own or [sop for sop in started if sop.files is None]
+        started = sops_of_file(started, name)
         if not started:
             raise ScanError(f"no [[sop]] of the site file is for {name}: see sop.files")
     else:
