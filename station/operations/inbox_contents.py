@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import shutil
 from collections import Counter
@@ -26,13 +27,16 @@ PATTERNS = (
     "%y%m%d %H%M%S", "%Y%m%d %H%M%S", "%Y-%m-%d %H-%M-%S", "%Y-%m-%d %H.%M.%S", "%Y-%m-%d %H-%M",
 )  # fmt: skip
 FOLDER_PATTERNS = ("%Y-%m-%d", "%Y%m%d", "%Y_%m_%d", "%y%m%d")
+# Commands that convert formats which the station does not read, by their suffix.
 CONVERTED = {
-    ".rxp": 'suffix = ".rxp" and convert = ["pdal", "translate", "{in}", "{out}", …]',
-    ".zfs": 'suffix = ".zfs" and convert = [COMMAND, "{in}", "{out}"]',
-    ".fls": 'suffix = ".fls" and convert = [COMMAND, "{in}", "{out}"]',
-    ".ptx": 'suffix = ".ptx" and convert = [COMMAND, "{in}", "{out}"]',
-    ".lvx": 'suffix = ".lvx" and convert = [COMMAND, "{in}", "{out}"]',
-}
+    ".rxp": (
+        "pdal", "translate", "{in}", "{out}", "ferry", "--filters.ferry.dimensions=InternalTime=>GpsTime",
+        "--readers.rxp.sync_to_pps=false", "--writers.las.minor_version=4", "--writers.las.dataformat_id=6",
+        "--writers.las.extra_dims=Reflectance=float,Roll=float,Pitch=float",
+        "--writers.las.scale_x=0.00025", "--writers.las.scale_y=0.00025", "--writers.las.scale_z=0.00025",
+    ),
+    **dict.fromkeys((".zfs", ".fls", ".ptx", ".lvx"), ("COMMAND", "{in}", "{out}")),
+}  # fmt: skip
 
 
 def inbox_findings(site: Site) -> Iterator[LevelAndMessage]:
@@ -78,7 +82,8 @@ def _other_formats(site: Site, others: list[Path], *, has_scans: bool) -> Iterat
     beside = tuple(section.suffix for section in sections if section and section.suffix)
     counts = Counter(path.suffix.lower() for path in others if not path.name.endswith(beside))
     for suffix, count in counts.most_common():
-        advice = CONVERTED.get(suffix, "")
+        command = json.dumps(CONVERTED.get(suffix, ())[:4])
+        advice = f'suffix = "{suffix}" and convert = {command[:-1]}, …]' if suffix in CONVERTED else ""
         if suffix in suffixes() or (suffix in TEXT_SUFFIXES and not has_scans and count > 1):
             advice = f'suffix = "{suffix}"'
         if advice:
