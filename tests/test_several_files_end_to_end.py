@@ -22,17 +22,17 @@ from station.simulation.station import simulate
 pytestmark = pytest.mark.integration
 
 TILES = 3
-DAY = "2025-07-15 hut"  # names with spaces are read like others
+DAY = "2025-07-15 Hütte Süd"  # names are of any language, and may have spaces
 COMPARED = ("point_count", "elevation", "elevation_change", "elevation_change_uncertainty")
 CELL_M, SIZE_M, COUNT = 0.5, 10.0, 20_000
-RANGE_SIGMA_M = {"first": 0.003, "second": 0.3}
+RANGE_SIGMA_M = {"first": 0.003, "Säule 2": 0.3}
 SITE = """
 [station]
 id = "positions"
 data = "data"
 [scans]
 inbox = "inbox"
-name = "%Y-%m-%d hut/ScanPos*"
+name = "%Y-%m-%d Hütte Süd/ScanPos*"
 settle_s = 0
 [epoch]
 name = "%Y-%m-%d"
@@ -43,7 +43,7 @@ file = "first.txt"
 files = "*/ScanPos001*"
 [[sop]]
 from = 2025-01-01T00:00:00Z
-file = "second.txt"
+file = "Säule 2.txt"
 files = "*/ScanPos002*"
 scanner = { model = "riegl-vz-1000", range_sigma_m = 0.3 }
 [scanner]
@@ -65,7 +65,7 @@ def tiled(folder, *, method="joint"):
     """Return a simulated station whose scans wait as tiles, each with a third of the lines, in a folder."""
     tiny_station.build(folder, method=method, hours=4)
     text = (folder / "site.toml").read_text()
-    text = re.sub(r'name = "%y%m%d_%H%M%S".*', 'name = "%Y-%m-%d hut/*_%H%M%S_*"', text)
+    text = re.sub(r'name = "%y%m%d_%H%M%S".*', 'name = "%Y-%m-%d Hütte Süd/*_%H%M%S_*"', text)
     text += '\n[epoch]\nname = "%y%m%d_%H%M%S"\nfiles = 3\nwait_s = 3600\n'
     (folder / "site.toml").write_text(text)
     day = folder / tiny_station.PENDING / DAY
@@ -205,7 +205,7 @@ def test_scan_positions_are_placed_by_their_sops(tmp_path, into):
     that of two instruments, of which each saw its part of the shots of a cell.
     """
     random = np.random.default_rng(3)
-    sops = {"first": sop(30.0, -4.0, -3.0, 2.0), "second": sop(-75.0, 14.0, 12.0, 1.5)}
+    sops = {"first": sop(30.0, -4.0, -3.0, 2.0), "Säule 2": sop(-75.0, 14.0, 12.0, 1.5)}
     day = tmp_path / "inbox" / DAY
     day.mkdir(parents=True)
     on_map, variance_m2 = [], []

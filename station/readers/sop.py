@@ -14,6 +14,7 @@ import numpy as np
 from station.errors import ConfigError, ScanError
 from station.quantities import Floats
 from station.readers.regular_file import read_text
+from station.scan_names import composed
 from station.sections.inputs import SopSection
 
 ROTATION_TOLERANCE = 1e-6  # moves a point 1,000 km away by 1 m; files with nine digits reach 1e-9
@@ -161,7 +162,7 @@ def _orthonormal_rotation(rotation: Floats, path: Path) -> Floats:
 
 def sops_of_file(sops: Sequence[SopSection], name: str) -> list[SopSection]:
     """Return the SOPs for a file of a scan: those whose pattern it matches, else those without one."""
-    own = [sop for sop in sops if sop.files is not None and fnmatchcase(name, sop.files)]
+    own = [sop for sop in sops if sop.files is not None and fnmatchcase(composed(name), composed(sop.files))]
     return own or [sop for sop in sops if sop.files is None]
 
 
