@@ -90,9 +90,9 @@ def _inputs_of_positions(site: Site, scan: OpenScan, each: list[ScanInputs]) -> 
         site, scan.start + (scan.end - scan.start) / 2, transform.position_m[2], warnings
     )
     viewpoints = tuple(
-        Viewpoint(inputs.geometry.scanner, inputs.geometry.position_m)
+        Viewpoint(inputs.geometry.scanner, inputs.pose.frame.position_m)
         for inputs in each
-        if inputs.geometry.position_m is not None
+        if inputs.pose.frame is not None
     )
     geometry = replace(scan_geometry(site, transform.position_m, axis), viewpoints=viewpoints)
     params = parameters.parameter_layout(geometry.grid, transform.position_m, axis)
