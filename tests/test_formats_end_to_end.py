@@ -178,7 +178,7 @@ WITH_LINES = {
 
 def station(*arguments, **env):
     return subprocess.run([sys.executable, "-m", "station", *map(str, arguments)], env=os.environ | env,
-                          capture_output=True, text=True, check=False, timeout=120)  # fmt: skip
+                          capture_output=True, text=True, check=False, timeout=600)  # fmt: skip
 
 
 def processed(folder, lines, formats):

@@ -49,6 +49,7 @@ from station.science.analysis.verdict import NO_BRIGHTNESS
 from station.science.geometry import inclination
 from station.science.geometry.pose import ScannerToMap
 from station.sections.inputs import SopSection
+from station.service.store_repair import require_same_map
 
 Finding = dict[str, str]  # level (ok, warning, fault), what, message
 EPOCH_BYTES_PER_CELL = 16  # typical, uncompressed
@@ -219,6 +220,10 @@ def _folders(site: Site) -> Iterator[Finding]:
     required = 24 * EPOCH_BYTES_PER_CELL * math.prod(series_for(site).grid.shape)
     message = f"{data}: {free / 1e9:.1f} GB free; a day of hourly epochs needs up to {required / 1e9:.2f} GB"
     yield _finding("ok" if free > required else "warning", "data", message)
+    try:
+        require_same_map(site)
+    except StationError as error:
+        yield _finding("fault", "data", str(error))
 
 
 def _flags(site: Site) -> Iterator[Finding]:
