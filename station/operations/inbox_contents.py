@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import shutil
+import stat
 from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
@@ -62,18 +63,26 @@ def inbox_findings(site: Site) -> Iterator[LevelAndMessage]:
 
 
 def files_below(folder: Path) -> Iterator[Path]:
-    """Yield the files of a folder and those below it, by their names; hidden ones are left out."""
+    """Yield the files of a folder and those below it, by their names; hidden ones and links are left out."""
     count = 0
     for parent, folders, names in os.walk(folder):
         depth = len(Path(parent).relative_to(folder).parts)
         folders[:] = sorted(name for name in folders if not name.startswith(".")) if depth < MAX_DEPTH else []
         for name in sorted(names):
-            if name.startswith("."):
+            if name.startswith(".") or not _is_regular(Path(parent) / name):
                 continue
             count += 1
             if count > MAX_FILES:
                 return
             yield Path(parent) / name
+
+
+def _is_regular(path: Path) -> bool:
+    """Return True for a file that can be opened without waiting for another program."""
+    try:
+        return stat.S_ISREG(path.lstat().st_mode)
+    except OSError:  # removed since it was listed
+        return False
 
 
 def _other_formats(site: Site, others: list[Path], *, has_scans: bool) -> Iterator[LevelAndMessage]:

@@ -23,6 +23,7 @@ POSITION, QUATERNION = ("x", "y", "z"), ("qw", "qx", "qy", "qz")
 ANGLES = ("roll_deg", "pitch_deg", "yaw_deg")
 NAMED = re.compile(r"\"?([a-z][a-z_]*)\"?\s*[=:]\s*(\S+?)\s*[,}]*")
 DECIMAL_COMMA = re.compile(r"[-+]?\d*(,\d*)?([eE][-+]?\d+)?")
+MAX_NAMED_LINE = 200  # characters of a line with a name and a number
 MAX_COORDINATE_M = 1e8  # from the origin of any frame or map; the earth's radius is 6.4e6
 
 
@@ -79,7 +80,8 @@ def _xml_matrix(text: str, path: Path) -> str:
 
 def _named_values(text: str) -> dict[str, float]:
     """Return the numbers of lines such as `roll_deg = 1.5`; empty if they are not named."""
-    pairs = [NAMED.fullmatch(line.lower()) for line in text.splitlines()]
+    lines = (line.lower() for line in text.splitlines() if len(line) <= MAX_NAMED_LINE)
+    pairs = [NAMED.fullmatch(line) for line in lines]
     return {pair[1]: float(pair[2].replace(",", ".")) for pair in pairs if pair}
 
 

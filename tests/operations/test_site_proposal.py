@@ -1,5 +1,6 @@
 """`station init --from FOLDER` writes a site file that measures the scans in the folder."""
 
+import os
 import re
 import shutil
 import subprocess
@@ -150,6 +151,18 @@ def test_matrices_with_the_same_name_stay_apart(source, tmp_path):
     site, *matrices = propose_site(source, tmp_path / "site")
     assert sorted(np.loadtxt(path)[0, 3] for path in matrices) == [1.0, 2.0]
     assert len(read_site(site).sop) == 1  # the other one is a comment
+
+
+def test_pipes_links_and_garbage_are_no_finds(source, tmp_path):
+    """A pipe would make whoever opens it wait for ever."""
+    for name in ("a.txt", "b.dat", "c.rsp", "250716_000000.laz"):
+        os.mkfifo(source / name)
+    (source / "d.csv").symlink_to("/dev/zero")
+    (source / "e.dat").write_bytes(np.random.default_rng(1).bytes(10_000))
+    (source / "f.geojson").mkdir()
+    (source / "g.smet").write_text("[" * 100_000)
+    site = read_site(propose_site(source, tmp_path / "site")[0])
+    assert (site.sop, site.weather, site.areas) == ((), None, None)
 
 
 def test_scans_in_folders_and_of_several_files_are_found(source, tmp_path):
