@@ -58,7 +58,7 @@ method = "none"
 
 def station(*arguments):
     return subprocess.run([sys.executable, "-m", "station", *map(str, arguments)],
-                          capture_output=True, text=True, check=False, timeout=120)  # fmt: skip
+                          capture_output=True, text=True, check=False, timeout=600)  # fmt: skip
 
 
 def tiled(folder, *, method="joint"):
@@ -177,7 +177,7 @@ def changes(folder):
     return int(np.isfinite(open_series(folder / "data")["elevation_change"]).any(("y", "x")).sum())
 
 
-def wait_for(condition, folder, seconds=60):
+def wait_for(condition, folder, seconds=180):
     deadline_s = time.monotonic() + seconds
     while time.monotonic() < deadline_s:
         try:
