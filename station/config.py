@@ -20,6 +20,7 @@ from station._version import __version__
 from station.errors import ConfigError
 from station.quantities import Grid, Scanner
 from station.section_types import Section
+from station.sections.inputs import ScannerSection, SopSection
 from station.sections.site_file import SiteFile
 
 PLAIN_MESSAGES = {  # instead of those of pydantic, which name Python classes
@@ -57,8 +58,22 @@ class Site(SiteFile):
 
     @property
     def instrument(self) -> Scanner:
-        """The scanner, angles in radians."""
+        """The scanner of the table `[scanner]`, angles in radians."""
         return self.scanner.instrument
+
+    def scanner_of(self, sop: SopSection | None) -> ScannerSection:
+        """Return the scanner that stands at an SOP: its own, or that of the table `[scanner]`."""
+        return self.scanner if sop is None or sop.scanner is None else sop.scanner
+
+    def with_scanner_of(self, sop: SopSection | None) -> Site:
+        """Return the site with the scanner that stands at an SOP in the table `[scanner]`."""
+        return self.model_copy(update={"scanner": self.scanner_of(sop)})
+
+    @property
+    def scanners(self) -> dict[str, ScannerSection]:
+        """All scanners by their keys in the site file."""
+        own = {f"sop[{i}].scanner": sop.scanner for i, sop in enumerate(self.sop) if sop.scanner is not None}
+        return {"scanner": self.scanner} | own
 
     @property
     def adjusts(self) -> bool:

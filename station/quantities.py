@@ -39,6 +39,7 @@ class Shots:
     xyz_m: Floats  # (3, n)
     time_s: Floats | None  # (n,)
     intensity: Floats | None = None  # (n,) 0-1, 0 if unknown; None if the scan has none
+    viewpoint: int = 0  # its number, in an epoch of several positions
 
     def __len__(self) -> int:
         """Return the number of echoes."""
@@ -141,11 +142,20 @@ class Grid:
 
 
 @dataclass(frozen=True)
+class Viewpoint:
+    """A scanner, and its position on the map."""
+
+    scanner: Scanner
+    position_m: tuple[float, float, float]
+
+
+@dataclass(frozen=True)
 class ScanGeometry:
     """What does not change from scan to scan: scanner, grid, position and settings.
 
     `position_m` is the scanner's position on the map, None if scans in the map frame do not contain it;
-    `axis` is the head's axis of rotation (east, north, up).
+    `axis` is the head's axis of rotation (east, north, up). Scans from several positions have `viewpoints`,
+    and scanner and position are those of the first one of the site file.
     """
 
     scanner: Scanner
@@ -156,6 +166,7 @@ class ScanGeometry:
     published_budget: bool = False  # Voordendag et al. (2023) instead of the corrected form
     registration_sigma_m: float = 0.0  # of the published budget
     store_terms: bool = False
+    viewpoints: tuple[Viewpoint, ...] = ()
 
 
 @dataclass(frozen=True)

@@ -6,6 +6,7 @@ Scans may lie in folders below the inbox: their names then have as many `/` as t
 from __future__ import annotations
 
 import re
+import unicodedata
 from datetime import UTC, datetime
 from functools import lru_cache
 from pathlib import PurePath
@@ -31,6 +32,14 @@ def scan_stem(name: str | PurePath) -> str:
     )  # by hand, ten times as fast as with paths: the page needs those of a year
     outer, _, inner = stem.rpartition(".")
     return outer if outer and f".{inner.lower()}" in INNER_SUFFIXES else stem
+
+
+def composed(name: str) -> str:
+    """Return a name with each letter and its accents as one character, as keyboards write it.
+
+    Files from macOS may have them apart (NFD).
+    """
+    return name if name.isascii() else unicodedata.normalize("NFC", name)
 
 
 def scan_id(name: str) -> str:
@@ -64,8 +73,8 @@ def start_in_name(name: str, pattern: str) -> datetime | None:
     The pattern is one of strptime, in which `*` stands for any characters of one name, also of the folders
     before a `/`. `@` and the name of a time zone may follow; of an hour that occurs twice, the first counts.
     """
-    pattern, _, zone = pattern.partition(ZONE_MARK)
-    stem = scan_id(name_below(PurePath(name), pattern))
+    pattern, _, zone = composed(pattern).partition(ZONE_MARK)
+    stem = composed(scan_id(name_below(PurePath(name), pattern)))
     if ANY in pattern:
         match = _expression(pattern).fullmatch(stem)
         if match is None:

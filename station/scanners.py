@@ -1,6 +1,6 @@
 """The known laser scanner models, by the value of `scanner.model`.
 
-A value that no source was found for is missing; the site file must give it.
+A value that no source was found for is missing; the site file must give it. Of some models no value has one.
 """
 
 from __future__ import annotations
@@ -93,14 +93,18 @@ SCANNERS: dict[str, dict[str, float]] = {
     "riegl-lms-z210ii": {"range_max_m": 650.0},
     "leica-scanstation-p30": _LEICA_P,
     "leica-scanstation-p40": _LEICA_P,
+    "leica-scanstation-p20": {},
+    "leica-scanstation-p50": {},
     "leica-blk360": _LEICA_BLK,
     "leica-blk360-g2": _LEICA_BLK | {"range_max_m": 45.0},
     # Pesci et al. (2011): 0.17 mrad; 12.7 mm at the exit.
     "optech-ilris-3d": {"beam_divergence_mrad": 0.17, "exit_diameter_m": 0.0127},
+    "optech-polaris": {},
     "livox-mid-40": _LIVOX | {"range_max_m": 260.0},
     "livox-mid-70": _LIVOX | {"range_max_m": 260.0},
     "livox-hap": _LIVOX | {"range_max_m": 150.0},  # its manual (2022), table 1.2.1: at 10 % of reflectance
     "livox-horizon": {"range_max_m": 260.0},  # the maker's wiki, page of products
+    "livox-tele-15": {},
     "livox-avia": _LIVOX | {"range_max_m": 450.0},  # HELIOS++, scanners_livox_avia.xml; range: published code
     # Half-angle of 0.3 mrad and 1.5 µm from published code that cites the data sheet; noise of 0.25 mm and
     # 0.004° as in HDMapping (MapsHD); its aperture and its tilt sensor are not known.

@@ -6,11 +6,13 @@ import tomllib
 from datetime import datetime
 from pathlib import Path
 
+import numpy as np
 import pytest
 from pydantic import ValidationError
 
 from station.config import SCHEMA_NAME, read_site, site_schema, write_site
 from station.errors import ConfigError
+from station.processing.scanner_pose import sop_identity
 from station.scanners import KEYS, SCANNERS, missing_values
 from station.sections.inputs import ScannerSection
 
@@ -92,6 +94,14 @@ def test_data_and_inbox_must_be_separate(tmp_path, data):
             "sop.0.from: give a date and time in UTC, as 2025-07-14T23:00:00Z (given: 'yesterday')",
         ),
         ('[[sop]]\nfrom = 2025-07-15T00:00:00Z\nfile = "s"\n' * 2, "two [[sop]] have the same from"),
+        (
+            '[[sop]]\nfrom = 2025-07-15T00:00:00Z\nfile = "s"\nscanner = { model = "vz-400i" }\n',
+            'scanners of different wavelengths see snow and rock differently: set scans.intensity = "none"',
+        ),
+        (
+            '[[sop]]\nfrom = 2025-07-15T00:00:00Z\nfile = "s"\nscanner = { model = "P40" }\n',
+            "sop.0.scanner: not all of leica-scanstation-p40 is known: give ",
+        ),
     ],
 )
 def test_faults_are_told_once_and_without_python_classes(tmp_path, more, message):
@@ -285,6 +295,21 @@ def test_a_scanner_of_which_some_values_are_known_needs_only_the_others_which_th
     for models, keys in rows:
         named = set(re.findall("`(.*?)`", keys))
         described |= dict.fromkeys(
-            re.findall("`(.*?)`", models), set(KEYS) - named if "all but" in keys else named
+            re.findall("`(.*?)`", models), set(KEYS) - named if keys.startswith("all") else named
         )
     assert described == {name: set(missing_values(name)) for name in SCANNERS if missing_values(name)}
+
+
+def test_a_scanner_of_its_own_counts_for_its_sop_alone(tmp_path):
+    """Range, errors and identity; the table [scanner] is for all others."""
+    np.savetxt(tmp_path / "s", np.eye(4))
+    sop = '[[sop]]\nfrom = {year}-01-01T00:00:00Z\nfile = "s"\n'
+    own = 'scanner = { model = "riegl-vz-6000", range_sigma_m = 0.02 }\n'
+    text = GOOD.replace("map", "scanner") + sop.format(year=2024) + sop.format(year=2025) + own
+    site = read(tmp_path, text + '[scanner]\nmodel = "VZ-400i"\nwavelength_um = 1.064\n')
+    first, second = site.sop
+    assert (site.scanner_of(first).model, site.scanner_of(None).model) == ("riegl-vz-400i", "riegl-vz-400i")
+    assert (site.scanner_of(second).range_sigma_m, site.scanner_of(second).range_max_m) == (0.02, 6000.0)
+    assert site.with_scanner_of(second).instrument.beam_divergence_rad == pytest.approx(0.12e-3)
+    assert sop_identity(first) != sop_identity(second)  # epochs of another instrument are stale
+    assert sop_identity(second) == sop_identity(second.model_copy(update={"from_": first.from_}))

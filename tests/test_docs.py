@@ -108,6 +108,8 @@ def test_beams_stated_at_half_maximum_are_converted():
         ("Zoller+Fröhlich 5016", "zf-imager-5016"), ("Leica ScanStation P40", "leica-scanstation-p40"),
         ("P40", "leica-scanstation-p40"), ("BLK360", "leica-blk360"), ("Z420i", "riegl-lms-z420i"),
         ("Teledyne Optech ILRIS 3D", "optech-ilris-3d"), ("VZ-2000i", "riegl-vz-2000i"),
+        ("Leica P20", "leica-scanstation-p20"), ("ScanStation P50", "leica-scanstation-p50"),
+        ("Teledyne Optech Polaris", "optech-polaris"), ("Livox Tele-15", "livox-tele-15"),
     ],
 )  # fmt: skip
 def test_scanners_are_known_by_the_names_that_people_write(name, model):

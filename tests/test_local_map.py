@@ -14,7 +14,7 @@ from support import tiny_station
 import station
 from station.config import read_site
 from station.errors import ConfigError
-from station.operations.site_check import site_findings
+from station.operations.site_check import _folders, site_findings
 from station.processing.pipeline import to_map
 from station.processing.scans.epoch_inputs import load_scan_inputs
 from station.processing.scans.open_scans import open_scan_for
@@ -115,6 +115,9 @@ def test_a_later_sop_needs_a_new_folder(processed):
         ConfigError, match=r"is of a map without an .* new folder and process the scans again"
     ):
         require_same_map(read_site(path))
+    faults = [finding["message"] for finding in _folders(read_site(path)) if finding["level"] == "fault"]
+    assert len(faults) == 1
+    assert "give station.data a new folder" in faults[0]  # `station check` tells it as well
 
 
 @pytest.mark.integration

@@ -50,6 +50,7 @@ def test_stem_is_the_name_without_all_suffixes(name, stem):
         ("/srv/hut/2025-07-15/250715_090005.laz", "*/%y%m%d_%H%M%S"),
         ("2025/07/15/090005.laz", "%Y/%m/%d/%H%M%S"),
         ("ScanPos001.SCNPOS/scans/250715_090005.rxp", "ScanPos*.SCNPOS/scans/%y%m%d_%H%M%S"),
+        ("Hu\u0308tte Süd/Höhe 250715_090005.laz", "H\u00fctte Süd/Ho\u0308he %y%m%d_%H%M%S"),
     ],
 )
 def test_start_is_found_by_patterns_with_wildcards_and_zones(name, pattern):

@@ -22,16 +22,17 @@ from station.simulation.station import simulate
 pytestmark = pytest.mark.integration
 
 TILES = 3
-DAY = "2025-07-15 hut"  # names with spaces are read like others
+DAY = "2025-07-15 Hütte Süd"  # names are of any language, and may have spaces
 COMPARED = ("point_count", "elevation", "elevation_change", "elevation_change_uncertainty")
 CELL_M, SIZE_M, COUNT = 0.5, 10.0, 20_000
+RANGE_SIGMA_M = {"first": 0.003, "Säule 2": 0.3}
 SITE = """
 [station]
 id = "positions"
 data = "data"
 [scans]
 inbox = "inbox"
-name = "%Y-%m-%d hut/ScanPos*"
+name = "%Y-%m-%d Hütte Süd/ScanPos*"
 settle_s = 0
 [epoch]
 name = "%Y-%m-%d"
@@ -42,8 +43,9 @@ file = "first.txt"
 files = "*/ScanPos001*"
 [[sop]]
 from = 2025-01-01T00:00:00Z
-file = "second.txt"
+file = "Säule 2.txt"
 files = "*/ScanPos002*"
+scanner = { model = "riegl-vz-1000", range_sigma_m = 0.3 }
 [scanner]
 model = "riegl-vz-400i"
 [grid]
@@ -56,14 +58,14 @@ method = "none"
 
 def station(*arguments):
     return subprocess.run([sys.executable, "-m", "station", *map(str, arguments)],
-                          capture_output=True, text=True, check=False, timeout=120)  # fmt: skip
+                          capture_output=True, text=True, check=False, timeout=600)  # fmt: skip
 
 
 def tiled(folder, *, method="joint"):
     """Return a simulated station whose scans wait as tiles, each with a third of the lines, in a folder."""
     tiny_station.build(folder, method=method, hours=4)
     text = (folder / "site.toml").read_text()
-    text = re.sub(r'name = "%y%m%d_%H%M%S".*', 'name = "%Y-%m-%d hut/*_%H%M%S_*"', text)
+    text = re.sub(r'name = "%y%m%d_%H%M%S".*', 'name = "%Y-%m-%d Hütte Süd/*_%H%M%S_*"', text)
     text += '\n[epoch]\nname = "%y%m%d_%H%M%S"\nfiles = 3\nwait_s = 3600\n'
     (folder / "site.toml").write_text(text)
     day = folder / tiny_station.PENDING / DAY
@@ -175,7 +177,7 @@ def changes(folder):
     return int(np.isfinite(open_series(folder / "data")["elevation_change"]).any(("y", "x")).sum())
 
 
-def wait_for(condition, folder, seconds=60):
+def wait_for(condition, folder, seconds=180):
     deadline_s = time.monotonic() + seconds
     while time.monotonic() < deadline_s:
         try:
@@ -199,13 +201,14 @@ SHIFT = sop(12.0, 1.0, -2.0, 0.5)
 def test_scan_positions_are_placed_by_their_sops(tmp_path, into):
     """Counts are exact and means right to the storage quantum, by an own transformation with numpy.
 
-    With `into` they are placed by matrices beside the scans, in the frame that it states.
+    With `into` they are placed by matrices beside the scans, in the frame that it states. Random sigma is
+    that of two instruments, of which each saw its part of the shots of a cell.
     """
     random = np.random.default_rng(3)
-    sops = {"first": sop(30.0, -4.0, -3.0, 2.0), "second": sop(-75.0, 14.0, 12.0, 1.5)}
+    sops = {"first": sop(30.0, -4.0, -3.0, 2.0), "Säule 2": sop(-75.0, 14.0, 12.0, 1.5)}
     day = tmp_path / "inbox" / DAY
     day.mkdir(parents=True)
-    on_map = []
+    on_map, variance_m2 = [], []
     for number, (name, matrix) in enumerate(sops.items(), start=1):
         of_file = sop(0.0, 0.0, 0.0, 0.0) if into else matrix
         np.savetxt(tmp_path / f"{name}.txt", of_file if into != "scanner" else SHIFT, fmt="%.12f")
@@ -213,7 +216,7 @@ def test_scan_positions_are_placed_by_their_sops(tmp_path, into):
             beside = matrix if into == "project" else np.linalg.inv(SHIFT) @ matrix
             np.savetxt(day / f"ScanPos{number:03d}.dat", beside, fmt="%.12f")
         x_m, y_m = random.uniform(0.01, SIZE_M - 0.01, (2, COUNT))
-        z_m = 0.3 * np.sin(x_m) + 0.1 * y_m + random.normal(0, 0.005, COUNT)
+        z_m = 0.3 * np.sin(x_m / 4) + 0.1 * y_m + random.normal(0, 0.005, COUNT)
         points_m = np.stack([x_m, y_m, z_m])
         header = laspy.LasHeader(point_format=6, version="1.4")
         header.scales = [0.0001] * 3
@@ -223,6 +226,11 @@ def test_scan_positions_are_placed_by_their_sops(tmp_path, into):
         scan.write(day / f"ScanPos{number:03d}.laz")
         stored_m = np.stack([scan.x, scan.y, scan.z])
         on_map.append(matrix[:3, :3] @ stored_m + matrix[:3, 3:])
+        slope = np.stack([-0.075 * np.cos(x_m / 4), np.full(COUNT, -0.1), np.ones(COUNT)])
+        range_m = np.linalg.norm(stored_m, axis=0)
+        along = ((matrix[:3, :3] @ stored_m) / range_m * slope).sum(axis=0)  # height by meter of range
+        sampling_m2 = CELL_M**2 * (slope[:2] ** 2).sum(axis=0) / 12
+        variance_m2.append((RANGE_SIGMA_M[name] * along) ** 2 + sampling_m2)
     section = f'[registration]\nsuffix = ".dat"\ninto = "{into}"\nsigma_m = 0.01\nsigma_deg = 0.001\n'
     (tmp_path / "site.toml").write_text(SITE + (section if into else ""))
     result = station("process", tmp_path / "site.toml", *day.glob("*.laz"))
@@ -243,6 +251,8 @@ def test_scan_positions_are_placed_by_their_sops(tmp_path, into):
         height_error_m = np.abs(stored["elevation_outside_reference"].to_numpy() - mean_m)
         assert (height_error_m <= rounding_m).all()
         assert float(stored["point_total"]) == 2 * COUNT
+        expected_m2 = np.bincount(cell, np.hstack(variance_m2)).reshape(shape) / count**2
+        assert np.median((total_m**2 - systematic_m**2) / expected_m2) == pytest.approx(1.0, abs=0.05)
         assert "2025-07-15" in str(stored["scan_id"].values)
 
 

@@ -15,11 +15,12 @@ from pathlib import Path
 
 from station.config import Site
 from station.errors import NotReadyError
-from station.scan_names import SEPARATOR, epoch_name, folder_depth, scan_id, start_in_name
+from station.scan_names import SEPARATOR, composed, epoch_name, folder_depth, scan_id, start_in_name
 
-# Names without control characters or wildcards, short enough for `<name>.txt` to be a valid file name.
-_SAFE_PART = r"[A-Za-z0-9](?:[A-Za-z0-9._,+=@~() -]{0,98}[A-Za-z0-9._,+=@~()-])?"
+# Names of letters of any language, without control characters or wildcards.
+_SAFE_PART = r"[^\W_](?:[\w.,+=@~() -]*[\w.,+=@~()-])?"
 _SAFE_NAME = re.compile(rf"{_SAFE_PART}(/{_SAFE_PART})*")
+MAX_NAME_BYTES = 100  # of a file or folder: `<name>.txt` must be a valid file name
 _FILE_TYPES = {
     stat.S_IFLNK: "a link",
     stat.S_IFIFO: "a pipe",
@@ -146,7 +147,7 @@ class ScanListing:
         if not stat.S_ISREG(mode):
             file_type = _FILE_TYPES.get(stat.S_IFMT(mode), "something else")
             return f"is {file_type}: only regular files are read; copy the scan itself into the inbox"
-        if not _SAFE_NAME.fullmatch(name):
+        if not _is_safe(name):
             return "the name has special characters, a space at its end, or is too long: rename it"
         if self._site.epoch is not None and start_in_name(name, self._site.scans.pattern) is None:
             return (
@@ -201,9 +202,16 @@ def is_scan(name: str, suffixes: tuple[str, ...], beside: tuple[str, ...] = ()) 
     return base.lower().endswith(suffixes) and not base.startswith(".") and not base.endswith(beside)
 
 
+def _is_safe(name: str) -> bool:
+    """Return True if a name may stand in the journal and in log lines as it is."""
+    if not _SAFE_NAME.fullmatch(composed(name)):
+        return False
+    return all(len(os.fsencode(part)) <= MAX_NAME_BYTES for part in name.split(SEPARATOR))
+
+
 def safe_name(name: str) -> str:
     """Return a file name escaped for the journal and for log lines; a plain name is returned unchanged."""
-    if _SAFE_NAME.fullmatch(name):
+    if _is_safe(name):
         return name
     escaped = name.encode("unicode_escape").decode("ascii").replace("/", "")
     if len(escaped) <= 100:

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import json
 import os
 import shutil
+import stat
 from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
@@ -26,13 +28,16 @@ PATTERNS = (
     "%y%m%d %H%M%S", "%Y%m%d %H%M%S", "%Y-%m-%d %H-%M-%S", "%Y-%m-%d %H.%M.%S", "%Y-%m-%d %H-%M",
 )  # fmt: skip
 FOLDER_PATTERNS = ("%Y-%m-%d", "%Y%m%d", "%Y_%m_%d", "%y%m%d")
+# Commands that convert formats which the station does not read, by their suffix.
 CONVERTED = {
-    ".rxp": 'suffix = ".rxp" and convert = ["pdal", "translate", "{in}", "{out}", …]',
-    ".zfs": 'suffix = ".zfs" and convert = [COMMAND, "{in}", "{out}"]',
-    ".fls": 'suffix = ".fls" and convert = [COMMAND, "{in}", "{out}"]',
-    ".ptx": 'suffix = ".ptx" and convert = [COMMAND, "{in}", "{out}"]',
-    ".lvx": 'suffix = ".lvx" and convert = [COMMAND, "{in}", "{out}"]',
-}
+    ".rxp": (
+        "pdal", "translate", "{in}", "{out}", "ferry", "--filters.ferry.dimensions=InternalTime=>GpsTime",
+        "--readers.rxp.sync_to_pps=false", "--writers.las.minor_version=4", "--writers.las.dataformat_id=6",
+        "--writers.las.extra_dims=Reflectance=float,Roll=float,Pitch=float",
+        "--writers.las.scale_x=0.00025", "--writers.las.scale_y=0.00025", "--writers.las.scale_z=0.00025",
+    ),
+    **dict.fromkeys((".zfs", ".fls", ".ptx", ".lvx"), ("COMMAND", "{in}", "{out}")),
+}  # fmt: skip
 
 
 def inbox_findings(site: Site) -> Iterator[LevelAndMessage]:
@@ -58,18 +63,26 @@ def inbox_findings(site: Site) -> Iterator[LevelAndMessage]:
 
 
 def files_below(folder: Path) -> Iterator[Path]:
-    """Yield the files of a folder and those below it, by their names; hidden ones are left out."""
+    """Yield the files of a folder and those below it, by their names; hidden ones and links are left out."""
     count = 0
     for parent, folders, names in os.walk(folder):
         depth = len(Path(parent).relative_to(folder).parts)
         folders[:] = sorted(name for name in folders if not name.startswith(".")) if depth < MAX_DEPTH else []
         for name in sorted(names):
-            if name.startswith("."):
+            if name.startswith(".") or not _is_regular(Path(parent) / name):
                 continue
             count += 1
             if count > MAX_FILES:
                 return
             yield Path(parent) / name
+
+
+def _is_regular(path: Path) -> bool:
+    """Return True for a file that can be opened without waiting for another program."""
+    try:
+        return stat.S_ISREG(path.lstat().st_mode)
+    except OSError:  # removed since it was listed
+        return False
 
 
 def _other_formats(site: Site, others: list[Path], *, has_scans: bool) -> Iterator[LevelAndMessage]:
@@ -78,7 +91,8 @@ def _other_formats(site: Site, others: list[Path], *, has_scans: bool) -> Iterat
     beside = tuple(section.suffix for section in sections if section and section.suffix)
     counts = Counter(path.suffix.lower() for path in others if not path.name.endswith(beside))
     for suffix, count in counts.most_common():
-        advice = CONVERTED.get(suffix, "")
+        command = json.dumps(CONVERTED.get(suffix, ())[:4])
+        advice = f'suffix = "{suffix}" and convert = {command[:-1]}, …]' if suffix in CONVERTED else ""
         if suffix in suffixes() or (suffix in TEXT_SUFFIXES and not has_scans and count > 1):
             advice = f'suffix = "{suffix}"'
         if advice:

@@ -137,8 +137,9 @@ def _adjusted(
     if reference is None:
         return inputs, np.zeros(site.grid_cells.shape, np.float32)
     viewing = load_viewing_geometry(site, inputs.geometry, reference)
-    inputs, gridder, _, adjustment = grid_and_adjust(site, scan, inputs, viewing, progress)
-    return inputs, stacking_inputs(gridder, viewing, None if inputs.is_given else adjustment)[1]
+    result = grid_and_adjust(site, scan, inputs, viewing, progress)
+    adjustment = None if inputs.is_given else result.adjustment
+    return result.inputs, stacking_inputs(result.gridder, viewing, adjustment)[1]
 
 
 def _cells(epoch: EpochRef) -> tuple[dict[str, np.ndarray[Any, Any]], str]:

@@ -16,7 +16,7 @@ from station.scanners import SCANNERS, missing_values, scanner_model
 from station.science.geometry import pose
 
 DEFAULT_EXTENT_M = 100.0  # of the grid, if the project does not tell how far its scans reach
-CELLS = 500  # along the grid, about
+CELLS = 500  # along the grid, at least
 MAX_NAME = 32  # characters of a station's id
 SCANS = [
     'inbox = "inbox"                       # check: where the scans arrive',
@@ -26,10 +26,13 @@ SCANS = [
 UTM_NORTH, UTM_SOUTH = 32600, 32700  # EPSG, plus the zone
 
 
-def import_riscan(project_path: Path, folder: Path) -> list[Path]:
+def import_riscan(
+    project_path: Path, folder: Path, scans: list[str] | None = None, more: list[str] | None = None
+) -> list[Path]:
     """Write site file, SOPs and POP of a project to a folder; return their paths, the site file first.
 
-    Raises ConfigError if the project cannot be read or a file exists: nothing is overwritten.
+    `scans` and `more` are lines for `site_text`, of what is known besides the project. Raises ConfigError if
+    the project cannot be read or a file exists: nothing is overwritten.
     """
     project = read_project(project_path)
     matrices = {f"{file_stem(position.name)}-SOP.dat": position.sop for position in project.positions}
@@ -37,7 +40,8 @@ def import_riscan(project_path: Path, folder: Path) -> list[Path]:
         raise ConfigError(f"{project_path}: two scan positions have the same name: rename one")
     if project.pop is not None:
         matrices["POP.dat"] = project.pop
-    texts = {folder / "site.toml": site_text(f"the RiSCAN project {project.name}", project, SCANS)}
+    text = site_text(f"the RiSCAN project {project.name}", project, scans or SCANS, more)
+    texts = {folder / "site.toml": text}
     texts |= {folder / name: matrix_text(matrix) for name, matrix in matrices.items()}
     return write_new(folder, texts)
 
@@ -125,10 +129,11 @@ def _sop_lines(project: Project) -> list[str]:
 
 
 def _map_lines(project: Project, *, has_sop: bool) -> list[str]:
-    """Return map and grid: around the scanner of the last position, if any, as far as its scans reach."""
+    """Return map and grid: around the scanner of the newest position, if any, as far as its scans reach."""
     if not project.positions:
         return []
-    position = project.positions[-1]
+    dated = [position for position in project.positions if position.start_utc]
+    position = dated[-1] if dated else project.positions[0]  # the SOP that is valid now
     east_m, north_m = (float(value) for value in position.sop[:2, 3])
     frame = "POP: the map is the frame of the SOP" if has_sop else "SOP: the map is local, around the scanner"
     lines = [f"# check: there is no {frame}, see docs/how-to/sop.md"]
@@ -137,7 +142,8 @@ def _map_lines(project: Project, *, has_sop: bool) -> list[str]:
         crs_line = f'crs = "{crs}"                    # check: or the CRS of your maps'
         lines = ["[map]", crs_line, 'pop = "POP.dat"']
     half_m = position.extent_m or DEFAULT_EXTENT_M
-    cell_m = max(10.0 ** math.floor(math.log10(2 * half_m / CELLS)), 0.01)
+    power = 10.0 ** math.floor(math.log10(2 * half_m / CELLS))
+    cell_m = max(next(power * step for step in (5, 2, 1) if power * step * CELLS <= 2 * half_m), 0.01)
     edge_m = CELLS / 2 * cell_m * math.ceil(half_m / (CELLS / 2 * cell_m))
     west_m, south_m = (round((value - edge_m) / cell_m) * cell_m for value in (east_m, north_m))
     bounds = {"west": west_m, "south": south_m, "east": west_m + 2 * edge_m, "north": south_m + 2 * edge_m}

@@ -49,6 +49,7 @@ from station.science.analysis.verdict import NO_BRIGHTNESS
 from station.science.geometry import inclination
 from station.science.geometry.pose import ScannerToMap
 from station.sections.inputs import SopSection
+from station.service.store_repair import require_same_map
 
 Finding = dict[str, str]  # level (ok, warning, fault), what, message
 EPOCH_BYTES_PER_CELL = 16  # typical, uncompressed
@@ -170,7 +171,7 @@ def _sop_poses(site: Site) -> Iterator[Finding]:
             max(grid.west_m - east_m, 0.0, east_m - grid.west_m - grid.nx * grid.cell_m),
             max(north_m - grid.north_m, 0.0, grid.north_m - grid.ny * grid.cell_m - north_m),
         )
-        if distance_m > site.scanner.range_max_m:
+        if distance_m > site.scanner_of(sop).range_max_m:
             yield _finding(
                 "fault", "grid", f"begins {distance_m:,.0f} m from the scanner: beyond range_max_m"
             )
@@ -219,6 +220,10 @@ def _folders(site: Site) -> Iterator[Finding]:
     required = 24 * EPOCH_BYTES_PER_CELL * math.prod(series_for(site).grid.shape)
     message = f"{data}: {free / 1e9:.1f} GB free; a day of hourly epochs needs up to {required / 1e9:.2f} GB"
     yield _finding("ok" if free > required else "warning", "data", message)
+    try:
+        require_same_map(site)
+    except StationError as error:
+        yield _finding("fault", "data", str(error))
 
 
 def _flags(site: Site) -> Iterator[Finding]:
@@ -275,7 +280,8 @@ def _inclination(site: Site) -> Iterator[Finding]:
         assert sop is not None  # noqa: S101 - there are some
         rotation = scanner_to_map(site, sop).to_local[:3, :3]
         log_path = scans[-1].with_name(scan_stem(scans[-1]) + site.inclination.suffix)
-        log, _ = inclination.clean(read_inclination(log_path), site.instrument.inclination_range_rad)
+        range_rad = site.scanner_of(sop).instrument.inclination_range_rad
+        log, _ = inclination.clean(read_inclination(log_path), range_rad)
     except StationError:
         return
     if not len(log.time_s):
@@ -285,7 +291,7 @@ def _inclination(site: Site) -> Iterator[Finding]:
     expected = float(expected_deg[0]), float(expected_deg[1])
     if site.inclination.mode == "absolute":
         yield from _named("inclination", double_tilt_findings(sop.file.name, expected, log_deg))
-    elif math.degrees(site.instrument.inclination_range_rad) > max(map(abs, expected)):
+    elif math.degrees(range_rad) > max(map(abs, expected)):
         yield from _named("inclination", [tilt_findings(sop.file.name, expected, log_deg)])
 
 

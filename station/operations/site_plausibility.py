@@ -78,11 +78,12 @@ def setting_findings(site: Site) -> Iterator[LevelAndMessage]:
             yield "warning", f"map.vertical_datum = {datum!r}: no datum of EPSG, as other programs expect"
         elif known != datum:
             yield "warning", f"map.vertical_datum = {datum!r}: write its name in EPSG, {known!r}"
-    for key, typical in SCANNERS.get(site.scanner.model, {}).items():
-        value = getattr(site.scanner, key)
-        is_number = isinstance(typical, (int, float)) and isinstance(value, (int, float)) and typical > 0
-        if is_number and not typical / MAX_OVERRIDE_RATIO <= value <= typical * MAX_OVERRIDE_RATIO:
-            yield "warning", f"scanner.{key} = {value:g}, but a {site.scanner.model} has {typical:g}"
+    for name, scanner in site.scanners.items():
+        for key, typical in SCANNERS.get(scanner.model, {}).items():
+            value = getattr(scanner, key)
+            is_number = isinstance(typical, (int, float)) and isinstance(value, (int, float)) and typical > 0
+            if is_number and not typical / MAX_OVERRIDE_RATIO <= value <= typical * MAX_OVERRIDE_RATIO:
+                yield "warning", f"{name}.{key} = {value:g}, but a {scanner.model} has {typical:g}"
 
 
 def tilt_findings(

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import json
 import os
+import re
 from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,8 +14,8 @@ from pyproj.exceptions import CRSError
 
 from station.errors import ConfigError, StationError
 from station.inbox.listing import is_scan
-from station.operations.inbox_contents import epoch_advice, files_below, fitting_pattern
-from station.operations.riscan_import import import_riscan, matrix_text, site_text, write_new
+from station.operations.inbox_contents import CONVERTED, MANUAL, epoch_advice, files_below, fitting_pattern
+from station.operations.riscan_import import file_stem, import_riscan, matrix_text, site_text, write_new
 from station.processing.workers import isolation
 from station.quantities import Floats
 from station.readers.formats.conversion import open_site_scan
@@ -28,6 +30,7 @@ from station.sections.inputs import ScansSection
 
 LOG_SUFFIX = "-incl.txt"
 MATRIX_SUFFIXES = (".dat", ".txt", ".sop")
+SOP_WORD = re.compile(r"[-_ ]*sop$", re.IGNORECASE)  # at the end of names
 MAX_MATRIX_BYTES = 1 << 14
 GEOCENTRIC_M = 6e6  # a POP leads to the centre of the Earth
 MAX_SCANNER_FRAME_M = 20_000.0  # farther from the origin, points are on a map
@@ -39,7 +42,7 @@ MEMORY_GB, TIMEOUT_S = 4.0, 300.0  # to look at one scan
 class _Found:
     """What lies in a folder."""
 
-    scan: Path  # the newest
+    scan: Path | None  # the newest; None if there is none
     pattern: str  # of the names, "" if none of the usual ones fits
     epoch: str  # name of epochs, if several scans have the same start; else ""
     has_logs: bool
@@ -48,42 +51,52 @@ class _Found:
     weather: tuple[Path, str] | None  # and its dialect
     polygons: Path | None
 
+    @property
+    def is_converted(self) -> bool:
+        """True if a command must convert the scans."""
+        return self.scan is not None and self.scan.suffix.lower() in CONVERTED
+
 
 def propose_site(source: Path, folder: Path) -> list[Path]:
     """Write a site file for what lies in `source` to a folder; return the files written, it first.
 
     Without an SOP the map is local: its origin is the scanner, and the inclination log makes it level. Raises
-    ConfigError if there is no scan that can be read, or a file exists already.
+    ConfigError if there is no scan, the newest cannot be read, or a file exists already.
     """
+    found = _look_into(source)
     projects = [path for path in files_below(source) if path.suffix.lower() == ".rsp"]
     if projects:
-        return import_riscan(projects[0], folder)
-    found = _look_into(source)
-    try:
-        header = isolation.TaskRunner().run(_header, found.scan, memory_gb=MEMORY_GB, timeout_s=TIMEOUT_S)
-    except StationError as error:
-        raise ConfigError(f"{found.scan}: cannot be read: {error}") from error
-    on_map = float(np.abs([header.low_m[:2], header.high_m[:2]]).min()) > MAX_SCANNER_FRAME_M
-    lines = [
-        f'inbox = "{source.resolve()}"',
-        *_name_lines(found),
-        f'frame = "{"map" if on_map else "scanner"}"',
-    ]
+        scans = None if found.scan is None else _scan_lines(source, found, "scanner")
+        return import_riscan(projects[0], folder, scans, _more_lines(found, None, mode="relative"))
+    if found.scan is None:
+        raise ConfigError(f"{source}: no scan lies in it, nor in its folders: see {MANUAL}")
+    header = None if found.is_converted else _read_header(found.scan)
+    on_map = header is not None and float(np.abs(_horizontal_m(header)).min()) > MAX_SCANNER_FRAME_M
     texts: dict[Path, str] = {}
-    if on_map:
+    if on_map and header is not None:
         project = Project(source.resolve().name, None, ())
         more = [*_map_frame_lines(header), *_more_lines(found, header, mode="relative")]
     else:
-        sop = read_matrix(found.sops[0]) if found.sops else np.eye(4)
-        project = _project(source.resolve().name, sop, found, header)
+        project = _project(source.resolve().name, found, header)
         if found.sops:
-            texts[folder / "SOP-SOP.dat"] = matrix_text(sop)
+            texts |= {
+                folder / f"{file_stem(position.name)}-SOP.dat": matrix_text(position.sop)
+                for position in project.positions
+            }
         if project.pop is not None:
             texts[folder / "POP.dat"] = matrix_text(project.pop)
         more = _more_lines(found, header, mode="relative" if found.sops else "absolute")
-    has_sop = on_map or bool(found.sops)
-    site = site_text(f"what lies in {source}", project, lines, more, has_sop=has_sop)
+    scans, has_sop = _scan_lines(source, found, "map" if on_map else "scanner"), on_map or bool(found.sops)
+    site = site_text(f"what lies in {source}", project, scans, more, has_sop=has_sop)
     return write_new(folder, {folder / "site.toml": site, **texts})
+
+
+def _read_header(scan: Path) -> ScanHeader:
+    """Return the header of a scan, read in a worker process; raise ConfigError if that is impossible."""
+    try:
+        return isolation.TaskRunner().run(_header, scan, memory_gb=MEMORY_GB, timeout_s=TIMEOUT_S)
+    except StationError as error:
+        raise ConfigError(f"{scan}: cannot be read: {error}") from error
 
 
 def _header(path: Path, _progress: object) -> ScanHeader:
@@ -93,18 +106,23 @@ def _header(path: Path, _progress: object) -> ScanHeader:
         return reader.header
 
 
+def _horizontal_m(header: ScanHeader) -> Floats:
+    """Return the corners (2, 2) of a scan on the plane [m]."""
+    return np.array([header.low_m[:2], header.high_m[:2]])
+
+
 def _look_into(source: Path) -> _Found:
     files = list(files_below(source))
     scans = [path for path in files if is_scan(path.name, suffixes())]
+    scans = scans or [path for path in files if is_scan(path.name, tuple(CONVERTED))]
     depth = min((len(path.relative_to(source).parts) for path in scans), default=0)
     scans = [path for path in scans if len(path.relative_to(source).parts) == depth]
-    if not scans:
-        raise ConfigError(f"{source}: no scan that can be read lies in it: see docs/how-to/your-own-files.md")
-    common = Counter(path.suffix.lower() for path in scans).most_common(1)[0][0]
-    scans = [path for path in scans if path.suffix.lower() == common]
-    names = {path.relative_to(source).as_posix(): path for path in scans}
-    pattern = fitting_pattern(list(names)) or ""
-    newest = max(names, key=lambda name: (start_in_name(name, pattern) or 0) if pattern else name)
+    common = next(iter(Counter(path.suffix.lower() for path in scans).most_common(1)), ("", 0))[0]
+    names = {path.relative_to(source).as_posix(): path for path in scans if path.suffix.lower() == common}
+    pattern = (fitting_pattern(list(names)) if names else None) or ""
+    newest = max(
+        names, key=lambda name: (start_in_name(name, pattern) or 0) if pattern else name, default=None
+    )
     matrices = {
         path: matrix
         for path in files
@@ -112,12 +130,12 @@ def _look_into(source: Path) -> _Found:
     }
     pops = [path for path, matrix in matrices.items() if np.linalg.norm(matrix[:3, 3]) > GEOCENTRIC_M]
     return _Found(
-        scan=names[newest],
+        scan=None if newest is None else names[newest],
         pattern=pattern,
         epoch=epoch_advice(list(names), pattern)[1] if pattern else "",
         has_logs=any(path.name.endswith(LOG_SUFFIX) for path in files),
         sops=[path for path in matrices if path not in pops],
-        pop=pops[0] if pops else None,
+        pop=pops[-1] if pops else None,
         weather=next(((path, kind) for path in files if (kind := _dialect(path))), None),
         polygons=next((path for path in files if path.suffix.lower() in {".geojson", ".gpkg", ".shp"}), None),
     )
@@ -142,26 +160,48 @@ def _dialect(path: Path) -> str:
         return recognise_dialect(file)
 
 
-def _name_lines(found: _Found) -> list[str]:
-    if not found.pattern:
-        return [f'name = "%y%m%d_%H%M%S"   # check: names such as {found.scan.name} do not match it']
-    return [f'name = "{found.pattern}"', 'zone = "UTC"   # check: of the times in names']
+def _scan_lines(source: Path, found: _Found, frame: str) -> list[str]:
+    """Return the lines of the table [scans]."""
+    assert found.scan is not None  # noqa: S101 - checked by the callers
+    lines = [f"inbox = {_quoted(source.resolve())}"]
+    if found.pattern:
+        lines += [f"name = {_quoted(found.pattern)}", 'zone = "UTC"   # check: of the times in names']
+    else:
+        lines += [f'name = "%y%m%d_%H%M%S"   # check: names such as {found.scan.name} do not match it']
+    if found.is_converted:
+        suffix = found.scan.suffix.lower()
+        lines += [f'suffix = "{suffix}"', f"convert = {json.dumps(CONVERTED[suffix])}   # check"]
+    return [*lines, f'frame = "{frame}"']
 
 
-def _project(name: str, sop: Floats, found: _Found, header: ScanHeader) -> Project:
-    """Return a project of one scan position, as far as its scan reaches."""
-    extent_m = float(np.abs([header.low_m[:2], header.high_m[:2]]).max())
-    position = ScanPosition("SOP", sop, _model_for(extent_m), None, "", None, extent_m)
-    pop = read_matrix(found.pop) if found.pop and found.sops else None
-    return Project(name, pop, (position,))
+def _quoted(value: str | Path) -> str:
+    """Return a text as TOML has it."""
+    return json.dumps(str(value), ensure_ascii=False)
+
+
+def _project(name: str, found: _Found, header: ScanHeader | None) -> Project:
+    """Return a project of the SOPs, the newest by its name first, as far as its scan reaches."""
+    extent_m = 0.0 if header is None else float(np.abs(_horizontal_m(header)).max())
+    names = [SOP_WORD.sub("", path.stem) or "SOP" for path in reversed(found.sops)] or ["SOP"]
+    if len({file_stem(sop) for sop in names}) < len(names):
+        names = [f"SOP{number}" for number in range(1, len(names) + 1)]
+    matrices = [read_matrix(path) for path in reversed(found.sops)] or [np.eye(4)]
+    positions = tuple(
+        ScanPosition(sop, matrix, _model_for(extent_m), None, "", None, extent_m)
+        for sop, matrix in zip(names, matrices, strict=True)
+    )
+    return Project(name, read_matrix(found.pop) if found.pop and found.sops else None, positions)
 
 
 def _model_for(range_m: float) -> str:
-    """Return the RIEGL that reaches no farther than it must: a file does not tell which scanner it is."""
+    """Return the RIEGL VZ that reaches no farther than it must: a file does not tell which scanner it is."""
     reaching = [
         name
         for name, values in SCANNERS.items()
-        if name.startswith("riegl-") and not missing_values(name) and values["range_max_m"] >= range_m
+        if range_m
+        and name.startswith("riegl-vz-")
+        and not missing_values(name)
+        and values["range_max_m"] >= range_m
     ]
     return min(reaching, key=lambda name: SCANNERS[name]["range_max_m"], default="riegl-vz-6000")
 
@@ -194,12 +234,15 @@ def _code(header: ScanHeader) -> str:
     return f"EPSG:{code or '…'}"
 
 
-def _more_lines(found: _Found, header: ScanHeader, *, mode: str) -> list[str]:
+def _more_lines(found: _Found, header: ScanHeader | None, *, mode: str) -> list[str]:
+    """Return the lines of all tables that a project does not tell; `header` is that of a scan, if known."""
     lines: list[str] = []
+    from_rxp = found.scan is not None and found.scan.suffix.lower() == ".rxp"
+    in_points = from_rxp if header is None else header.has_inclination
     if found.epoch:
         note = "# check: files with the same start; scan positions need an [[sop]] each, with files"
         lines += [f"[epoch]   {note}", f'name = "{found.epoch}"', ""]
-    if found.has_logs or header.has_inclination:
+    if found.has_logs or in_points:
         note = "   # check: without an SOP, the log makes the map level" if mode == "absolute" else ""
         source = (
             f'suffix = "{LOG_SUFFIX}"' if found.has_logs else "wait_s = 0   # the points carry roll and pitch"
@@ -207,7 +250,7 @@ def _more_lines(found: _Found, header: ScanHeader, *, mode: str) -> list[str]:
         lines += ["[inclination]", source, f'mode = "{mode}"{note}', ""]
     if found.weather is not None:
         path, kind = found.weather
-        weather = ["[weather]", f'file = "{path.resolve()}"', f'format = "{kind}"']
+        weather = ["[weather]", f"file = {_quoted(path.resolve())}", f'format = "{kind}"']
         if kind == "davis":  # day or month first, as the computer was set
             weather += ['time_format = "%d/%m/%y %H:%M"   # check: as in the file']
         if kind in ("davis", "lufft"):
@@ -218,5 +261,5 @@ def _more_lines(found: _Found, header: ScanHeader, *, mode: str) -> list[str]:
             weather = [f"# {line}" for line in (*weather, f"columns = {{ {names} }}   # check")]
         lines += [*weather, ""]
     if found.polygons is not None:
-        lines += ["[areas]", f'file = "{found.polygons.resolve()}"', ""]
+        lines += ["[areas]", f"file = {_quoted(found.polygons.resolve())}", ""]
     return lines

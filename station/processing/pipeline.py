@@ -93,10 +93,11 @@ def reference_viewing_geometry(
 def new_gridder(scan_geometry: ScanGeometry, viewing: ViewingGeometry | None) -> Gridder:
     """Return an empty gridder, of residuals to the reference surface if there is one."""
     datum_m = scan_geometry.position_m[2] if scan_geometry.position_m else 0.0
+    viewpoints = max(len(scan_geometry.viewpoints), 1)
     if viewing is None:
-        return Gridder(scan_geometry.grid, None, datum_m)
+        return Gridder(scan_geometry.grid, None, datum_m, viewpoints=viewpoints)
     thickness = viewing.layer_thickness(published=scan_geometry.published_budget)
-    return Gridder(scan_geometry.grid, viewing.surface(), datum_m, thickness)
+    return Gridder(scan_geometry.grid, viewing.surface(), datum_m, thickness, viewpoints)
 
 
 def grid_scan(gridder: Gridder, blocks: Iterable[Shots], pose: Pose, progress: Callable[[], None]) -> int:
@@ -110,7 +111,7 @@ def add_blocks(gridder: Gridder, blocks: Iterable[Shots], pose: Pose, progress: 
     """Add all shots of a scan to the grid; return their number."""
     count = 0
     for shots in blocks:
-        add_shots(gridder, to_map(shots, pose), shots.intensity)
+        add_shots(gridder, to_map(shots, pose), shots.intensity, shots.viewpoint)
         count += len(shots)
         progress()
     return count
@@ -124,12 +125,14 @@ def to_map(shots: Shots, pose: Pose) -> Floats:
     return pose.frame.to_map(pose.rotation.rotate(shots.xyz_m, time_s))
 
 
-def add_shots(gridder: Gridder, points_m: Floats, intensity: Floats | None = None) -> None:
+def add_shots(
+    gridder: Gridder, points_m: Floats, intensity: Floats | None = None, viewpoint: int = 0
+) -> None:
     """Add map points (3, n) to the grid, as residuals to the reference where it has a height."""
     inside, column, row = gridder.locate(points_m[0], points_m[1])
     cell_index = gridder.cell_indices(column, row)
     residual_m = points_m[2][inside] - gridder.datum_height(cell_index, column, row)
-    gridder.add(cell_index, residual_m, None if intensity is None else intensity[inside])
+    gridder.add(cell_index, residual_m, None if intensity is None else intensity[inside], viewpoint)
 
 
 @dataclass(frozen=True)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -46,6 +46,7 @@ from station.science.gridding.gridder import Gridder
 from station.science.gridding.reference_surface import build_surface, centre_reference, update_reference
 from station.science.gridding.scan_stack import ScanStack
 from station.science.gridding.viewing_geometry import ViewingGeometry
+from station.science.gridding.viewpoints import seen_from_viewpoints
 
 UPDATE_FACTOR = 4  # each version needs four times the scans of the previous one
 MAX_UPDATE_SCANS = 32  # scans read for one update
@@ -230,6 +231,7 @@ class _GeometryCache:
         """Return the viewing geometry for a scan geometry, None if there is no surface yet."""
         if self._surface is None:
             return None
+        geometry = replace(geometry, viewpoints=())  # one is missing in some scans
         if self._last is None or self._last[0] != geometry:
             stable = stable_cells(self._site, self._surface)
             self._last = geometry, reference_viewing_geometry(self._surface, geometry, stable)
@@ -252,9 +254,12 @@ def _add_scan(
         start, end = opened.start, opened.end
         inputs = load_scan_inputs(site, opened)
         viewing = geometry_cache(inputs.geometry)
-        gridder = shared[0] if shared else new_gridder(inputs.geometry, viewing)
+        geometry = inputs.geometry if viewing else replace(inputs.geometry, viewpoints=())  # any number
+        gridder = shared[0] if shared else new_gridder(geometry, viewing)
         blocks = inputs.shots(opened, site.scans.intensity)
         (add_blocks if viewing is None else grid_scan)(gridder, blocks, inputs.pose, progress)
+    if viewing is not None:
+        viewing = seen_from_viewpoints(viewing, gridder, inputs.geometry)
     adjustment = adjust_scan(site, gridder, inputs, viewing)
     if viewing is None:
         shared[:] = [gridder]

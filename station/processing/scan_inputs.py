@@ -85,9 +85,9 @@ class ScanInputs:
         return self._shots_on_map(scan, intensity)
 
     def _shots_on_map(self, scan: OpenScan, intensity: IntensityScale) -> Iterator[Shots]:
-        for position, pose in zip(scan.positions, self.position_poses, strict=True):
+        for number, (position, pose) in enumerate(zip(scan.positions, self.position_poses, strict=True)):
             for shots in position.reader.blocks(intensity=intensity):
-                yield Shots(to_map(shots, pose), shots.time_s, shots.intensity)
+                yield Shots(to_map(shots, pose), shots.time_s, shots.intensity, number)
 
     @property
     def can_rotate(self) -> bool:
@@ -129,6 +129,7 @@ def position_inputs(
 ) -> ScanInputs:
     """Return the inputs of what was scanned from one position; raises as `load_scan_inputs`."""
     reader, start, end, sop = position.reader, position.start, position.end, position.sop
+    site = site.with_scanner_of(sop)
     transform, sop_id = scanner_to_map(site, sop), sop_identity(sop)
     warnings: list[str] = []
     registered = registration(site, position, warnings)

@@ -221,8 +221,9 @@ def _compute_epoch(
         )
         viewing = load_viewing_geometry(site, inputs.geometry, reference) if reference else None
         progress()
-        inputs, gridder, gridded_points, adjustment = grid_and_adjust(site, opened, inputs, viewing, progress)
-        point_counts = opened.point_count, gridded_points
+        scan_on_grid = grid_and_adjust(site, opened, inputs, viewing, progress)
+        inputs, viewing, gridder = scan_on_grid.inputs, scan_on_grid.viewing, scan_on_grid.gridder
+        point_counts, adjustment = (opened.point_count, scan_on_grid.point_count), scan_on_grid.adjustment
     brightness_known = not site.adjusts or has_brightness(gridder, viewing)
     flag = exclusion_reason(site, start.timestamp(), end.timestamp())
     attempt = adjustment[1] if adjustment else None

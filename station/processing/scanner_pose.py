@@ -39,10 +39,12 @@ def scan_geometry(
 
 
 def sop_identity(sop: SopSection | None) -> str:
-    """Return an identifier that changes with the content of the SOP file and with `sop.scan`."""
+    """Return an identifier that changes with the content of the SOP file, `sop.scan` and `sop.scanner`."""
     if sop is None:
         return NO_SOP
     content = sop.file.read_bytes() + (f"\n{sop.scan}".encode() if sop.scan else b"")
+    if sop.scanner is not None:
+        content += f"\n{sop.scanner.model_dump_json()}".encode()
     return f"{sop.file.stem}-{hashlib.sha256(content).hexdigest()[:8]}"
 
 
@@ -71,7 +73,7 @@ def scanner_to_map(site: Site, sop: SopSection | None, matrix: Floats | None = N
     if sop is None:
         return pose.scanner_to_local_map(np.eye(4) if matrix is None else matrix)
     matrix = read_matrix(sop.file) if matrix is None else matrix
-    radius_m = site.scanner.range_max_m
+    radius_m = site.scanner_of(sop).range_max_m
     if site.map.crs is None:
         return pose.scanner_to_local_map(matrix)
     if site.map.pop is not None:

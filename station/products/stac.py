@@ -183,7 +183,7 @@ def _topo4d(site: Site, series: Series, table: EpochTable, row: int) -> dict[str
         transformation["registration_error"] = round(float(error_m), 6)
     return {
         "title": f"{site.station.name or series.station_id}, {_iso(table.start_s[row])}",
-        "instruments": [site.scanner.model],
+        "instruments": list(dict.fromkeys(scanner.model for scanner in site.scanners.values())),
         "topo4d:data_type": "raster",
         "topo4d:tz": "UTC",
         "topo4d:acquisition_mode": "TLS",

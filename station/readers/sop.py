@@ -14,6 +14,7 @@ import numpy as np
 from station.errors import ConfigError, ScanError
 from station.quantities import Floats
 from station.readers.regular_file import read_text
+from station.scan_names import composed
 from station.sections.inputs import SopSection
 
 ROTATION_TOLERANCE = 1e-6  # moves a point 1,000 km away by 1 m; files with nine digits reach 1e-9
@@ -22,6 +23,7 @@ POSITION, QUATERNION = ("x", "y", "z"), ("qw", "qx", "qy", "qz")
 ANGLES = ("roll_deg", "pitch_deg", "yaw_deg")
 NAMED = re.compile(r"\"?([a-z][a-z_]*)\"?\s*[=:]\s*(\S+?)\s*[,}]*")
 DECIMAL_COMMA = re.compile(r"[-+]?\d*(,\d*)?([eE][-+]?\d+)?")
+MAX_NAMED_LINE = 200  # characters of a line with a name and a number
 MAX_COORDINATE_M = 1e8  # from the origin of any frame or map; the earth's radius is 6.4e6
 
 
@@ -78,7 +80,8 @@ def _xml_matrix(text: str, path: Path) -> str:
 
 def _named_values(text: str) -> dict[str, float]:
     """Return the numbers of lines such as `roll_deg = 1.5`; empty if they are not named."""
-    pairs = [NAMED.fullmatch(line.lower()) for line in text.splitlines()]
+    lines = (line.lower() for line in text.splitlines() if len(line) <= MAX_NAMED_LINE)
+    pairs = [NAMED.fullmatch(line) for line in lines]
     return {pair[1]: float(pair[2].replace(",", ".")) for pair in pairs if pair}
 
 
@@ -159,6 +162,12 @@ def _orthonormal_rotation(rotation: Floats, path: Path) -> Floats:
     return np.asarray(u @ vt)
 
 
+def sops_of_file(sops: Sequence[SopSection], name: str) -> list[SopSection]:
+    """Return the SOPs for a file of a scan: those whose pattern it matches, else those without one."""
+    own = [sop for sop in sops if sop.files is not None and fnmatchcase(composed(name), composed(sop.files))]
+    return own or [sop for sop in sops if sop.files is None]
+
+
 def valid_sop(sops: Sequence[SopSection], time_utc: datetime, name: str = "") -> SopSection | None:
     """Return the SOP valid at a time: the latest that has begun; None if there are none at all.
 
@@ -171,8 +180,7 @@ def valid_sop(sops: Sequence[SopSection], time_utc: datetime, name: str = "") ->
     if not started:
         raise ScanError(f"no [[sop]] of the site file has begun by {time_utc:%Y-%m-%d %H:%M:%S} UTC")
     if name:
-        own = [sop for sop in started if sop.files is not None and fnmatchcase(name, sop.files)]
-        started = own or [sop for sop in started if sop.files is None]
+        started = sops_of_file(started, name)
         if not started:
             raise ScanError(f"no [[sop]] of the site file is for {name}: see sop.files")
     else:

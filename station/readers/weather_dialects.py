@@ -13,6 +13,7 @@ from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta, timezone
+from functools import lru_cache
 from typing import BinaryIO
 from zoneinfo import ZoneInfo
 
@@ -20,6 +21,7 @@ from station.errors import ScanError
 from station.sections.inputs import WeatherSection
 
 MAX_LINE_BYTES = 1 << 16
+MAX_COLUMN_NAME = 200  # characters; in a longer one no unit is looked for, which would take long
 MAX_HEADER_LINES = 100
 DELIMITERS = (";", "\t", ",", "")  # '': any white space
 QUANTITIES = ("temperature_c", "pressure_hpa", "humidity_pct")
@@ -250,9 +252,10 @@ def _index_of(wanted: str, names: Sequence[str]) -> int | None:
     return None
 
 
+@lru_cache(1 << 12)
 def name_and_unit(text: str) -> tuple[str, str]:
     """Return the name of a column and the unit that stands behind it, '' if there is none."""
-    match = NAME_AND_UNIT.fullmatch(text)
+    match = NAME_AND_UNIT.fullmatch(text) if len(text) <= MAX_COLUMN_NAME else None
     if match is None:
         return text, ""
     return match[1], next(unit for unit in match.groups()[1:] if unit is not None)

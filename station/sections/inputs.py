@@ -150,6 +150,7 @@ class SopSection(Section):
     file: Path
     scan: str | None = None
     files: str | None = None
+    scanner: ScannerSection | None = None
 
 
 class InclinationSection(Section):

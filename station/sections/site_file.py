@@ -74,6 +74,12 @@ class SiteFile(Section):
         starts = [(sop.from_, sop.files) for sop in self.sop]
         if len(set(starts)) < len(starts):
             raise ValueError("two [[sop]] have the same from: which of them is valid then?")
+        wavelengths_um = {sop.scanner.wavelength_um for sop in self.sop if sop.scanner is not None}
+        if wavelengths_um - {self.scanner.wavelength_um} and self.scans.intensity != "none":
+            raise ValueError(
+                "scanners of different wavelengths see snow and rock differently: set scans.intensity ="
+                ' "none", or give all of them the same wavelength_um'
+            )
         if any(sop.files for sop in self.sop) and self.epoch is None:
             raise ValueError("sop.files, for several scan positions, needs [epoch]")
         if self.registration and (self.registration.suffix is None) != (self.scans.frame == "map"):

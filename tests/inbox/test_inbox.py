@@ -369,7 +369,10 @@ def test_irregular_files_are_set_aside(make_inbox, drop, journal, tmp_path):
         "a\nb.laz",
         " a.laz",
         "\x1b[31m.laz",
-        "ä.laz",
+        "a\u202eb.laz",  # right to left from there on
+        "a\u200bb.laz",  # no width
+        "ä" * 60 + ".laz",  # 124 bytes, which `<name>.txt` and a suffix may make too many
+        "?[ab]*.laz",
         os.fsdecode(b"\xff\xfe.laz"),
         "-rf.laz",
         "x" * 250 + ".laz",
@@ -387,6 +390,16 @@ def test_unsafe_names_are_set_aside_under_a_printable_name(make_inbox, drop, jou
     assert "rename" in row.reason
     state = inbox.poll()
     assert (state.first, state.new) == (None, 0)
+
+
+@pytest.mark.parametrize(
+    "name", ["Höhe 12 m 1.laz", "Ho\u0308he.laz", "Écrins (2).laz", "Норд_1.laz", "氷河.laz"]
+)
+def test_names_of_any_language_are_queued_as_they_are(make_inbox, drop, journal, name):
+    inbox = make_inbox(settle_s=0)
+    drop(name)
+    assert inbox.poll().first.path.name == name
+    assert [(row.state, row.name) for row in journal.rows(State.WAITING)] == [(State.WAITING, name)]
 
 
 def test_other_files_and_incomplete_transfers_are_ignored(make_inbox, drop, journal):

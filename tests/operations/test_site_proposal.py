@@ -1,8 +1,12 @@
 """`station init --from FOLDER` writes a site file that measures the scans in the folder."""
 
+import os
+import re
 import shutil
 import subprocess
 import sys
+import tomllib
+from pathlib import Path
 from types import SimpleNamespace
 
 import laspy
@@ -16,6 +20,8 @@ from station.errors import ConfigError
 from station.operations.site_proposal import _code, propose_site
 from station.processing.scans.scan_files import inbox_scans
 from station.readers.weather import read_weather
+
+ROOT = Path(__file__).parents[2]
 
 
 @pytest.fixture(scope="module")
@@ -55,13 +61,16 @@ def test_the_proposed_site_measures_the_scans(source, tmp_path):
 
 
 def test_matrices_weather_and_polygons_are_found(source, tmp_path, shared_data):
-    for name in ("SOP", "POP"):
-        shutil.copy(shared_data / f"mammoth/2020-2021-{name}.dat", source)
+    for path in sorted(shared_data.glob("mammoth/*.dat"))[:4]:
+        shutil.copy(path, source)
     (source / "weather.txt").write_text(
         "STATIONS_ID;MESS_DATUM;  QN;PP_10;TT_10;TM5_10;RF_10;TD_10;eor\n"
         "3;202507150010;3;684.5;-1.5;-1.0;51.0;-1.6;eor\n"
     )
-    site = read_site(propose_site(source, tmp_path / "site")[0])
+    path, *matrices = propose_site(source, tmp_path / "site")
+    assert [path.name for path in matrices] == ["2020-2021-SOP.dat", "2019-2020-SOP.dat", "POP.dat"]
+    assert '# file = "2019-2020-SOP.dat"' in path.read_text()
+    site = read_site(path)
     assert CRS.from_user_input(site.map.crs).to_epsg() == 32611  # Mammoth Mountain
     assert site.weather.format == "dwd"
     assert site.inclination.mode == "relative"
@@ -103,8 +112,57 @@ def test_scans_on_the_map_and_other_names(tmp_path):
 
 
 def test_a_folder_without_scans_is_refused(tmp_path):
-    with pytest.raises(ConfigError, match="no scan that can be read"):
+    with pytest.raises(ConfigError, match="no scan lies in it"):
         propose_site(tmp_path, tmp_path / "site")
+
+
+def test_scans_that_must_be_converted_get_the_recipe_of_the_manual(tmp_path):
+    source = tmp_path / "Hütte Süd" / "hut.PROJ" / "ScanPos001.SCNPOS" / "scans"
+    source.mkdir(parents=True)
+    for hour in range(3):
+        (source / f"250715_{hour:02d}0000.rxp").touch()
+    site = read_site(propose_site(tmp_path / "Hütte Süd", tmp_path / "site")[0])
+    assert (site.scans.suffix, site.scans.name) == (".rxp", "*/*/*/%y%m%d_%H%M%S")
+    assert (site.inclination.wait_s, site.inclination.mode) == (0.0, "absolute")
+    manual = (ROOT / "docs/how-to/your-own-files.md").read_text()
+    recipe = next(text for text in re.findall(r"```toml\n(.*?)```", manual, re.DOTALL) if "pdal" in text)
+    assert site.scans.convert == tuple(tomllib.loads(recipe)["scans"]["convert"])
+    assert len(inbox_scans(site)) == 3
+
+
+def test_scans_and_logs_of_a_riscan_project_lie_where_the_project_does(tmp_path, shared_data):
+    scans = tmp_path / "site.RiSCAN" / "SCANS"
+    scans.mkdir(parents=True)
+    shutil.copy(shared_data / "riegl/project.rsp", scans.parent)
+    shutil.copy(shared_data / "riegl/140123_202748-incl.txt", scans / "151120_150227-incl.txt")
+    (scans / "151120_150227.laz").touch()
+    site = read_site(propose_site(scans.parent, tmp_path / "site")[0])
+    assert (site.scans.inbox, site.scans.name) == (scans.parent, "*/%y%m%d_%H%M%S")
+    assert (site.inclination.suffix, site.inclination.mode) == ("-incl.txt", "relative")
+    assert [sop.scan for sop in site.sop] == ["151120_150227", "151120_155528"]
+
+
+def test_matrices_with_the_same_name_stay_apart(source, tmp_path):
+    for folder, x_m in (("Süd", 1.0), ("Nörd", 2.0)):
+        matrix = np.eye(4)
+        matrix[0, 3] = x_m
+        (source / folder).mkdir()
+        np.savetxt(source / folder / "sop.dat", matrix)
+    site, *matrices = propose_site(source, tmp_path / "site")
+    assert sorted(np.loadtxt(path)[0, 3] for path in matrices) == [1.0, 2.0]
+    assert len(read_site(site).sop) == 1  # the other one is a comment
+
+
+def test_pipes_links_and_garbage_are_no_finds(source, tmp_path):
+    """A pipe would make whoever opens it wait for ever."""
+    for name in ("a.txt", "b.dat", "c.rsp", "250716_000000.laz"):
+        os.mkfifo(source / name)
+    (source / "d.csv").symlink_to("/dev/zero")
+    (source / "e.dat").write_bytes(np.random.default_rng(1).bytes(10_000))
+    (source / "f.geojson").mkdir()
+    (source / "g.smet").write_text("[" * 100_000)
+    site = read_site(propose_site(source, tmp_path / "site")[0])
+    assert (site.sop, site.weather, site.areas) == ((), None, None)
 
 
 def test_scans_in_folders_and_of_several_files_are_found(source, tmp_path):

@@ -199,3 +199,11 @@ def test_entities_do_not_expand_without_limit(tmp_path):
     path.write_text(f'<!DOCTYPE s [<!ENTITY a0 "1 ">{entities}]><sop><matrix>&a11;</matrix></sop>')
     with pytest.raises(ConfigError, match="not valid XML"):
         read_matrix(path)
+
+
+@pytest.mark.parametrize("text", ["x=" + "," * 1_000_000 + " x", "x = " + "1" * 1_000_000, "\n" * 1_000_000])
+def test_a_long_line_is_refused_at_once(tmp_path, text):
+    """An expression that tries all of its parts would take hours."""
+    (tmp_path / "sop.dat").write_text(text)
+    with pytest.raises(ConfigError, match="needs 4 rows of 4 numbers"):
+        read_matrix(tmp_path / "sop.dat")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -25,19 +26,34 @@ from station.quantities import Bools, Reference, ScanGeometry
 from station.science.adjustment.joint import Adjustment
 from station.science.gridding.gridder import Gridder
 from station.science.gridding.viewing_geometry import ViewingGeometry
+from station.science.gridding.viewpoints import seen_from_viewpoints
 
 # Estimated rotation that the points of a scan may lack, 0.35 m at 1 km; beyond, they are gridded again.
 MAX_UNAPPLIED_RAD = np.radians(0.02)
 UNUSABLE_REJECTED_SHARE = 0.6  # of the stable ground; above it the filtered log alone is safer
 
 
+@dataclass(frozen=True)
+class AdjustedScan:
+    """A gridded scan with its adjustment to the reference, if there is one.
+
+    `inputs` have the pose, and `viewing` the variances of shots, with which it was gridded and adjusted.
+    """
+
+    inputs: ScanInputs
+    viewing: ViewingGeometry | None
+    gridder: Gridder
+    point_count: int
+    adjustment: tuple[AdjustmentInputs, Adjustment] | None
+
+
 def grid_and_adjust(
     site: Site, opened: OpenScan, inputs: ScanInputs, viewing: ViewingGeometry | None, progress: Progress
-) -> tuple[ScanInputs, Gridder, int, tuple[AdjustmentInputs, Adjustment] | None]:
-    """Return the inputs of a scan, its grid, the number of its points, and its adjustment to the reference.
+) -> AdjustedScan:
+    """Return a scan on the grid, adjusted to the reference as `viewing` shows it.
 
     If the scanner turned so far that its points lie beside the ground they hit, as after a season, they are
-    gridded a second time, at the estimated pose, which the returned inputs have: ground does not respond to a
+    gridded a second time, at the estimated pose: ground does not respond to a
     motion of the beams as the slope of the reference tells, so that the first estimate is off.
     Raises ScanError if no point falls on the grid.
     """
@@ -51,20 +67,22 @@ def grid_and_adjust(
     if gridder.is_empty():
         raise ScanError("no point falls on the grid: wrong scans.frame, SOP, CRS or units?")
     progress()
+    if viewing is not None:
+        viewing = seen_from_viewpoints(viewing, gridder, inputs.geometry)
     first = adjust_scan(site, gridder, inputs, viewing, even_if_given=True)
     if first is None or not inputs.can_rotate or not is_usable(first[1]):
-        return inputs, gridder, count, first
+        return AdjustedScan(inputs, viewing, gridder, count, first)
     unapplied_rad = first[1].unapplied_rad
     if np.linalg.norm(unapplied_rad) <= MAX_UNAPPLIED_RAD:
-        return inputs, gridder, count, first
+        return AdjustedScan(inputs, viewing, gridder, count, first)
     del gridder  # the memory of a worker does not hold two
     rotated = inputs.rotated(unapplied_rad)
     gridder, count = gridded(rotated)
     second = adjust_scan(site, gridder, rotated, viewing)
     if second is not None and is_usable(second[1]):
-        return rotated, gridder, count, second
+        return AdjustedScan(rotated, viewing, gridder, count, second)
     del gridder
-    return inputs, *gridded(inputs), first
+    return AdjustedScan(inputs, viewing, *gridded(inputs), first)
 
 
 def is_usable(adjustment: Adjustment) -> bool:

@@ -17,6 +17,7 @@ from station.processing.scan_inputs import MEAN_TILT, ScanInputs, inputs_in_map_
 from station.processing.scanner_pose import scan_geometry, scanner_to_map, sop_identity_at
 from station.processing.scans.open_scans import OpenScan
 from station.processing.scans.registration import registered_covariance
+from station.quantities import Viewpoint
 from station.readers.sop import valid_sop
 from station.science.adjustment import prior
 from station.science.geometry.inclination import NO_CYCLIC_ERROR
@@ -74,6 +75,7 @@ def _inputs_of_positions(site: Site, scan: OpenScan, each: list[ScanInputs]) -> 
     The first position of the site file is that of the adjustment, whichever positions a scan has.
     """
     sop = valid_sop(site.sop, scan.start)
+    site = site.with_scanner_of(sop)
     transform = scanner_to_map(site, sop)
     rotation = transform.to_local[:3, :3]
     axis = (float(rotation[0, 2]), float(rotation[1, 2]), float(rotation[2, 2]))
@@ -87,7 +89,12 @@ def _inputs_of_positions(site: Site, scan: OpenScan, each: list[ScanInputs]) -> 
     air, weather_known = air_of_scan(
         site, scan.start + (scan.end - scan.start) / 2, transform.position_m[2], warnings
     )
-    geometry = scan_geometry(site, transform.position_m, axis)
+    viewpoints = tuple(
+        Viewpoint(inputs.geometry.scanner, inputs.pose.frame.position_m)
+        for inputs in each
+        if inputs.pose.frame is not None
+    )
+    geometry = replace(scan_geometry(site, transform.position_m, axis), viewpoints=viewpoints)
     params = parameters.parameter_layout(geometry.grid, transform.position_m, axis)
     lines = prior.line_times(params, rotation, None)
     covariance = partial(

@@ -15,7 +15,7 @@ from station.inbox.listing import ScanFile
 from station.readers.formats.conversion import open_site_scan
 from station.readers.formats.several_files import as_one
 from station.readers.scan import ScanReader, utc_interval
-from station.readers.sop import valid_sop
+from station.readers.sop import sops_of_file, valid_sop
 from station.scan_names import scan_id, start_in_name
 from station.science.geometry.pose import horizontal_crs, is_same_map
 from station.sections.inputs import SopSection
@@ -72,7 +72,7 @@ def open_scan_for(site: Site, scan: ScanFile) -> Iterator[OpenScan]:
             if file.path not in kept:
                 continue
             try:
-                reader = stack.enter_context(_open_file(site, file.path))
+                reader = stack.enter_context(_open_file(site, file))
                 start, _, _ = utc_interval(reader, site.scans.pattern, file.name)
                 is_on_map = site.scans.frame == "map"
                 sop = None if is_on_map else valid_sop(site.sop, start, file.name)
@@ -101,15 +101,18 @@ def _position(
 def open_files(site: Site, files: Sequence[ScanFile]) -> Iterator[ScanReader]:
     """Yield a reader of files of one position; raises as `open_scan_for`."""
     with ExitStack() as stack:
-        yield as_one([stack.enter_context(_open_file(site, file.path)) for file in files])
+        yield as_one([stack.enter_context(_open_file(site, file)) for file in files])
 
 
 @contextmanager
-def _open_file(site: Site, path: Path) -> Iterator[ScanReader]:
+def _open_file(site: Site, file: ScanFile) -> Iterator[ScanReader]:
     """Yield a reader of a file with the settings of the site; raises ScanError or NotReadyError."""
-    range_max_m = site.scanner.range_max_m if site.scans.frame == "scanner" else None
+    range_max_m = None
+    if site.scans.frame == "scanner":  # the time, which tells the SOP, is not known before the file is open
+        sops: Sequence[SopSection | None] = sops_of_file(site.sop, file.name) or (None,)
+        range_max_m = max(site.scanner_of(sop).range_max_m for sop in sops)
     work_folder = site.station.data
-    with open_site_scan(path, site.scans, range_max_m=range_max_m, work_folder=work_folder) as reader:
+    with open_site_scan(file.path, site.scans, range_max_m=range_max_m, work_folder=work_folder) as reader:
         if site.scans.frame == "map" and site.map.crs and reader.header.crs_wkt:
             _require_same_map(reader.header.crs_wkt, site.map.crs)
         yield reader

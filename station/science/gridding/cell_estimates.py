@@ -20,6 +20,7 @@ from station.quantities import (
     Reals,
     ScanGeometry,
     SharedParameters,
+    Viewpoint,
 )
 from station.science.adjustment.ground_classes import SnowTest
 from station.science.geometry.observation import Observation
@@ -28,6 +29,7 @@ from station.science.gridding import significance
 from station.science.gridding.gridder import CellSums, Gridder, slope_sampling_variance
 from station.science.gridding.reference_cells import HIGH_INCIDENCE_COS, CellClass
 from station.science.gridding.viewing_geometry import AzimuthSector, ViewingGeometry
+from station.science.gridding.viewpoints import mean_shot_variance
 from station.science.uncertainty import budget, parameters, shot_noise
 from station.science.uncertainty.jacobian import HeightJacobian, height_jacobian
 from station.science.uncertainty.variance_factors import class_with_excess
@@ -104,7 +106,9 @@ def estimate_cells(
             builder.write(cell_index, sums, estimator.in_reference(cell_index, sector, sums, viewing))
     for outside in _iter_cells_outside(gridder, scan_geometry, viewing):
         sums = gridder.take(outside.cell_index)
-        builder.write(outside.cell_index, sums, estimator.outside_reference(outside, sums, gridder.datum_m))
+        shares = gridder.viewpoint_shares(outside.cell_index)
+        estimates = estimator.outside_reference(outside, sums, shares, gridder.datum_m)
+        builder.write(outside.cell_index, sums, estimates)
     return Measurement(
         scan_geometry.grid,
         gridder.cell_index,
@@ -335,8 +339,13 @@ class CellEstimator:
         elevation_m = viewing.datum_m + (height_m + change_m)
         return _CellEstimates(elevation_m, change_m, sigma_m, np.sqrt(random_m2), flags, terms)
 
-    def outside_reference(self, outside: _CellsOutside, sums: CellSums, datum_m: float) -> _CellEstimates:
-        """Return estimates for cells (n,) outside the reference, whose sums are above a datum."""
+    def outside_reference(
+        self, outside: _CellsOutside, sums: CellSums, shares: Floats, datum_m: float
+    ) -> _CellEstimates:
+        """Return estimates for cells (n,) outside the reference, whose sums are above a datum.
+
+        `shares` (k, n) are those of the viewpoints in their points.
+        """
         scan_geometry = self.scan_geometry
         count, height_m = sums.count.astype(np.float64), sums.mean_residual() + datum_m
         flags = Quality.FEW_POINTS * (sums.count < FEW_POINTS).view(np.uint8)
@@ -354,13 +363,14 @@ class CellEstimator:
         )
         flags |= Quality.HIGH_INCIDENCE * (observation.cos_incidence < HIGH_INCIDENCE_COS).view(np.uint8)
         sampling_m2 = slope_sampling_variance(scan_geometry.grid.cell_m, observation.tan_slope, count)
-        random_m2 = (
-            shot_noise.height_variance(
-                observation, scan_geometry.scanner, published=scan_geometry.published_budget
-            )
-            / count
-            + sampling_m2
+        shot_m2 = mean_shot_variance(
+            shares,
+            points,
+            (outside.east_gradient, outside.north_gradient),
+            scan_geometry.viewpoints or (Viewpoint(scan_geometry.scanner, scan_geometry.position_m),),
+            published=scan_geometry.published_budget,
         )
+        random_m2 = shot_m2 / count + sampling_m2
         params = parameters.parameter_layout(scan_geometry.grid, scan_geometry.position_m, scan_geometry.axis)
         east_m, north_m, up_m = (axis_m.astype(np.float32) for axis_m in observation.offset_m)
         east, north = (

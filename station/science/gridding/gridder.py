@@ -87,10 +87,12 @@ class Gridder:
         surface: BilinearSurface | None,
         datum_m: float,
         thickness: NDArray[np.uint8] = NO_THICKNESS,
+        viewpoints: int = 1,
     ) -> None:
         """Create an empty grid; heights in cells without reference count from `datum_m`, for small sums.
 
-        `thickness` (n,) are the codes of the layers of the reference cells: see `thickness_code`.
+        `thickness` (n,) are the codes of the layers of the reference cells: see `thickness_code`. Points from
+        more than one of the `viewpoints` are also counted for each.
         """
         self.grid = grid
         self._surface = surface
@@ -105,6 +107,7 @@ class Gridder:
         self._count = np.zeros(cells + 1, np.int32)
         self._moments = np.zeros((cells + 1, 2), np.int64)
         self._intensity_sum = np.zeros(cells + 1, np.uint32)
+        self._count_by_viewpoint = np.zeros((viewpoints, cells + 1 if viewpoints > 1 else 0), np.int32)
         if not len(thickness):
             thickness = np.ones(self.reference_cells, np.uint8)
         self._layers: EchoLayers | None = EchoLayers(cells, grid.cell_m, thickness)
@@ -256,9 +259,13 @@ class Gridder:
         total = int(self.count.sum(dtype=np.int64)) + self.rejected
         return points / total if total else 0.0
 
-    def add(self, cell_index: Ints32, residual_m: Floats, intensity: Floats | None) -> None:
+    def add(
+        self, cell_index: Ints32, residual_m: Floats, intensity: Floats | None, viewpoint: int = 0
+    ) -> None:
         """Add points (n,): cell index, height above reference or datum [m], and intensity, 0-1."""
         position = cell_index.astype(np.intp)
+        if self._count_by_viewpoint.size:
+            np.add.at(self._count_by_viewpoint[viewpoint], position, np.int32(1))
         rounded = np.rint(residual_m * UNITS_PER_M)
         units = rounded.astype(np.int64)
         squares = np.rint(rounded * rounded * (1 / UNITS_PER_M)).astype(np.int64)
@@ -322,6 +329,17 @@ class Gridder:
         """Return the mean intensity of reference cells (n,) by index, 0-1; NaN where it is unknown."""
         sums = self.sums(0, self.reference_cells)
         return sums.take(cell_index).intensity()
+
+    def viewpoint_shares(self, cell_index: Ints32) -> Floats:
+        """Return the share of each viewpoint (k, n) in all points of cells (n,) by index.
+
+        That of the first is 1 if there is no other, and in cells without points.
+        """
+        if not self._count_by_viewpoint.size:
+            return np.ones((1, len(cell_index)))
+        count = self._count_by_viewpoint.take(cell_index, axis=1)
+        count[0] += count.sum(axis=0) == 0
+        return np.asarray(count / count.sum(axis=0))
 
     def take(self, cell_index: Ints32) -> CellSums:
         """Return a copy of the sums of cells (n,) by index, without intensity."""

@@ -1,0 +1,107 @@
+"""Random sigma of scans from two positions, whose instruments differ, against simulated shots."""
+
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from station.processing.pipeline import (
+    Pose,
+    grid_scan,
+    measure,
+    new_gridder,
+    reference_viewing_geometry,
+    stacking_inputs,
+)
+from station.quantities import Grid, Reference, ScanGeometry, Scanner, Shots, Viewpoint
+from station.science.gridding.viewpoints import seen_from_viewpoints
+
+GRID = Grid(west_m=0.0, north_m=80.0, cell_m=1.0, nx=90, ny=80)
+GRADIENT = 0.02, -0.03
+JITTER_RAD = np.radians(0.0008)  # of lines, equations.md 6.4
+PRECISE = Viewpoint(Scanner("a", 1.55, 0.3e-3, 0.0, 0.005, 0.0, 1e-4, 0.2, 900.0), (-60.0, 20.0, 40.0))
+NOISY = Viewpoint(Scanner("b", 1.55, 3e-3, 0.0, 0.040, 0.0, 1e-4, 0.2, 900.0), (160.0, 90.0, 25.0))
+ZONES = {"first": (0, 30), "both": (30, 60), "second": (60, 90)}
+
+
+def ground(x_m, y_m):
+    return 10.0 + GRADIENT[0] * x_m + GRADIENT[1] * y_m
+
+
+def shots_from(viewpoint, number, random, west_m, east_m, count):
+    """Return shots on the map with normal errors of range and of both angles, as the instrument has them."""
+    x_m, y_m = random.uniform(west_m, east_m, count), random.uniform(0.0, 80.0, count)
+    offset_m = np.stack([x_m, y_m, ground(x_m, y_m)]).T - viewpoint.position_m
+    range_m = np.linalg.norm(offset_m, axis=1, keepdims=True)
+    direction = offset_m / range_m
+    sideways = np.cross(direction, [0.0, 0.0, 1.0])
+    sideways /= np.linalg.norm(sideways, axis=1, keepdims=True)
+    angle_rad = np.hypot(viewpoint.scanner.beam_divergence_rad / 4, JITTER_RAD)
+    noise = random.normal(0, 1, (3, count, 1))
+    direction = direction + angle_rad * (noise[0] * sideways + noise[1] * np.cross(sideways, direction))
+    range_m = range_m + viewpoint.scanner.range_sigma_m * noise[2]
+    return Shots((viewpoint.position_m + range_m * direction).T, None, None, number)
+
+
+def scan(seed):
+    """Return the shots of both: the first sees the western two thirds, the second the eastern ones."""
+    random = np.random.default_rng(seed)
+    first = shots_from(PRECISE, 0, random, 0.0, 60.0, 20_000)
+    return [first, shots_from(NOISY, 1, random, 30.0, 90.0, 10_000)]
+
+
+def truth():
+    return Reference.from_elevation(GRID, "truth", ground(*np.meshgrid(GRID.x_m, GRID.y_m)))
+
+
+@pytest.fixture(scope="module", params=["on a reference", "without one"])
+def case(request):
+    return SimpleNamespace(reference=truth() if request.param == "on a reference" else None, shots=scan(2))
+
+
+def z_by_zone(case, viewpoints):
+    """Return the standard deviation of error over random sigma, by the instruments that saw the cells."""
+    geometry = ScanGeometry(PRECISE.scanner, GRID, PRECISE.position_m, viewpoints=viewpoints)
+    viewing = case.reference and reference_viewing_geometry(
+        case.reference, replace(geometry, viewpoints=()), np.zeros(GRID.shape, bool)
+    )
+    gridder = new_gridder(geometry, viewing)
+    grid_scan(gridder, case.shots, Pose(None, None), lambda: None)
+    viewing = viewing and seen_from_viewpoints(viewing, gridder, geometry)
+    measured = measure(gridder, geometry, None, viewing)
+    height_m, sigma_m = measured.to_rasters("elevation_m", "uncertainty_m")
+    z = (height_m - ground(*np.meshgrid(GRID.x_m, GRID.y_m))) / sigma_m
+    return {zone: np.nanstd(z[2:-2, first + 2 : end - 2]) for zone, (first, end) in ZONES.items()}
+
+
+def test_sigma_is_that_of_the_instrument_that_saw_the_cell(case):
+    for zone, z in z_by_zone(case, (PRECISE, NOISY)).items():
+        assert z == pytest.approx(1.0, abs=0.06), zone
+
+
+def test_sigma_of_one_instrument_for_both_is_wrong(case):
+    one = replace(NOISY, scanner=PRECISE.scanner)
+    assert z_by_zone(case, (PRECISE, one))["second"] > 3.0
+
+
+def test_variance_of_a_cell_is_that_of_its_shots():
+    """Weighted by their numbers: here three of the first and one of the second, in two cells."""
+    geometry = ScanGeometry(PRECISE.scanner, GRID, PRECISE.position_m, viewpoints=(PRECISE, NOISY))
+    viewing = reference_viewing_geometry(truth(), geometry, np.zeros(GRID.shape, bool))
+    centre_m = np.array([[40.5, 41.5], [40.5, 40.5], [ground(40.5, 40.5), ground(41.5, 40.5)]])
+    gridder = new_gridder(geometry, viewing)
+    blocks = [Shots(np.repeat(centre_m, 3, axis=1), None), Shots(centre_m, None, None, 1)]
+    grid_scan(gridder, blocks, Pose(None, None), lambda: None)
+    seen, _ = stacking_inputs(gridder, seen_from_viewpoints(viewing, gridder, geometry), None)
+    normal = np.array([-GRADIENT[0], -GRADIENT[1], 1.0])  # e @ normal is the height error of a shift e
+    expected_m2 = 0.0
+    for weight, viewpoint in ((0.75, PRECISE), (0.25, NOISY)):
+        offset_m = centre_m[:, 0] - viewpoint.position_m
+        range_m = np.linalg.norm(offset_m)
+        along = (offset_m / range_m) @ normal
+        angle_rad = np.hypot(viewpoint.scanner.beam_divergence_rad / 4, JITTER_RAD)
+        across_m2 = (range_m * angle_rad) ** 2 * (normal @ normal - along**2)
+        expected_m2 += weight * ((viewpoint.scanner.range_sigma_m * along) ** 2 + across_m2)
+    assert seen[39, 40] == pytest.approx(expected_m2, rel=1e-4)
+    assert np.count_nonzero(seen) == 2
