@@ -29,7 +29,8 @@ from station.products.gallery import (
 )
 from station.products.maps import ASSETS, map_box
 from station.products.overview import Overview
-from station.products.viewer.block_curves import CurveEpoch, curve_tiers, update_curves
+from station.products.viewer.block_codes import CurveEpoch
+from station.products.viewer.block_curves import curve_tiers, update_curves
 from station.products.viewer.overlays import area_outlines, browser_scales, event_outlines
 from station.products.viewer.value_tiles import describe_levels, value_codes
 from station.products.web.page_areas import newest_value, usable_area_series

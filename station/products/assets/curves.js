@@ -71,10 +71,11 @@ const stationCurves = (() => {
           tier.time_s.forEach((time_s, t) => {
             const i = t * tier.blocks + at;
             if (at < 0 || !tier.usable[t]) return;
-            values.set(time_s, tier.coverage[i] ? {
+            const coverage = tier.coverage[i] / about.full;
+            values.set(time_s, coverage ? {
               change: tier.change[i] * about.quantum_m,
-              random: sigma(tier.random[i]), systematic: sigma(tier.systematic[i]),
-              coverage: tier.coverage[i] / about.full, box: sigma(tier.box[t]),
+              random: sigma(tier.random[i]) / Math.sqrt(coverage), systematic: sigma(tier.systematic[i]),
+              coverage, box: sigma(tier.box[t]),
             } : null);
           });
         }
