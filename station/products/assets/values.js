@@ -97,9 +97,12 @@ const stationValues = (() => {
     });
   };
 
-  // Layers: the value that the scale shows, the scale, and whether what is not significant is grey.
+  // Layers: the value that the scale shows, the scale, whether what is not significant is grey, and the source
+  // of the values if it is not the scan.
   const LAYERS = {
     change: { value: (t, i) => t.change[i], scale: "change", grey: true },
+    level: { value: (t, i) => t.change[i], scale: "change", grey: true, source: "level" },
+    rate: { value: (t, i) => t.change[i], scale: "rate", grey: true, source: "rate" },
     significance: { value: (t, i) => t.change[i] / t.sigma[i], scale: "significance" },
     sigma: { value: (t, i) => t.sigma[i], scale: "sigma" },
     coverage: { value: (t, i) => t.observed[i], scale: "coverage" },
