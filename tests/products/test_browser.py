@@ -252,8 +252,8 @@ def test_areas_have_the_mean_and_sigma_of_the_store(tab, folder):
     rows, columns = np.nonzero(np.isfinite(aggregates.reference().elevation_m))
     tab.open(folder.as_uri() + "/index.html")
     cells = round(tab.run("STATION.curves.block_m") / grid.cell_m)
-    rng, ratios = np.random.default_rng(3), []
-    for size in (1, 1, 3, 8):  # blocks
+    rng, ratios, pair_ratios = np.random.default_rng(3), [], []
+    for size in (1, 1, 3, 8, 1, 1, 1, 3, 3):  # blocks
         place = rng.integers(len(rows))
         top, left = (int(k[place]) // cells * cells for k in (rows, columns))
         side = size * cells
@@ -263,7 +263,12 @@ def test_areas_have_the_mean_and_sigma_of_the_store(tab, folder):
         )
         side_m = (side - 0.002) * grid.cell_m
         corners = [[west_m + e * side_m, north_m - s * side_m] for e, s in ((0, 0), (1, 0), (1, 1), (0, 1))]
-        answer = tab.run(f"stationCurves.reader(STATION.curves).area({json.dumps(corners)})")
+        answer = tab.run(
+            f"stationCurves.reader(STATION.curves).area({json.dumps(corners)}).then((a) => {{"
+            " const c = a.curve.filter((p) => p.observed > 0.9);"
+            " const pairs = c.slice(1).map((p, i) => [c[i].time_s, p.time_s, stationCurves.between(p, c[i]).sigma]);"
+            " return { ...a, pairs }; })"
+        )
         mask = np.zeros(grid.shape, bool)
         mask[top : top + side, left : left + side] = True
         for point in answer["curve"]:
@@ -273,8 +278,13 @@ def test_areas_have_the_mean_and_sigma_of_the_store(tab, folder):
             ratios.append(point["sigma"] / aggregates.variance(mask, epoch) ** 0.5)
             stored_m = np.nanmean(aggregates.read_cells(epoch, mask).change_m)
             assert point["change"] == pytest.approx(stored_m, abs=0.0011)
+        for before_s, after_s, sigma_m in answer["pairs"] if size < 8 else ():
+            before, after = (index[int(np.argmin(np.abs(index.start_s - t)))] for t in (before_s, after_s))
+            pair_ratios.append(sigma_m / aggregates.variance(mask, after, before) ** 0.5)
     assert len(ratios) >= 4
     assert 0.9 < min(ratios) <= max(ratios) < 1.1
+    assert len(pair_ratios) >= 4
+    assert 0.9 < min(pair_ratios) <= max(pair_ratios) < 1.1
     assert tab.errors() == []
 
 

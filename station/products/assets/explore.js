@@ -262,8 +262,8 @@
     if (!at) { list.append(make("p", { textContent: text.not_observed })); return; }
     const from = layers.before() && known.filter((p) => p.time_s <= layers.before().time_s + 1).at(-1);
     if (from) {
-      const change = withHalf(at.change - from.change, Math.hypot(at.sigma, from.sigma), 3, "m");
-      list.append(make("div", {}, make("dt", { textContent: fill(text.since_scan, { time: page.utc(from.time_s) }) }), make("dd", { textContent: change, title: text.pair_sigma })));
+      const { change, sigma } = stationCurves.between(at, from);
+      list.append(make("div", {}, make("dt", { textContent: fill(text.since_scan, { time: page.utc(from.time_s) }) }), make("dd", { textContent: withHalf(change, sigma, 3, "m"), title: text.pair_sigma })));
     }
     for (const [name, value] of current.rows(at)) list.append(make("div", {}, make("dt", { textContent: name }), make("dd", { textContent: value })));
     list.append(make("div", {}, make("dt", { textContent: "UTC" }), make("dd", { textContent: page.utc(at.time_s) })));

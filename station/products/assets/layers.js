@@ -43,7 +43,8 @@ function stationLayers(data, shownIndex, redraw) {
     const values = after && await tiles.values(after, level, name);
     if (!pair.before || !values) return values;
     const subtracted = other && await tiles.values(other, level, name);
-    return subtracted && stationValues.difference(values, subtracted);
+    const ground = await tiles.heights(pair.after.version, level, name);
+    return subtracted && ground && stationValues.difference(values, subtracted, ground);
   }
 
   async function lightAt(pair, level, name) {

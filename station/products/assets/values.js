@@ -34,21 +34,22 @@ const stationValues = (() => {
     }
 
     async function heights(version, level, name) {
-      const tile = await stationTiles.load(`heights/${version}/${level}/${name}`, "");
+      const tile = await stationTiles.load(`ground/${version}/${level}/${name}`, "");
       if (!tile) return null;
-      const { where, steps: codes, size } = unpack(tile, 0), height = empty(size);
-      where.forEach((i, k) => { height[i] = codes[k] * tile.head.step; });
-      return { rows: tile.head.rows, columns: tile.head.columns, height };
+      const { where, planes, steps: codes, size } = unpack(tile, 1), height = empty(size), sigma = empty(size);
+      where.forEach((i, k) => { height[i] = codes[k] * tile.head.step; sigma[i] = sigmas[planes[0][k]]; });
+      return { rows: tile.head.rows, columns: tile.head.columns, height, sigma };
     }
 
     return { values, heights };
   }
 
-  // Of two scans, the change between them; its sigma as if nothing were common to both, which is the most.
-  function difference(after, before) {
+  // Of two scans, the change between them. The random error of the reference `ground` is in both, and cancels.
+  function difference(after, before, ground) {
+    const independent = (tile, i) => tile.sigma[i] ** 2 - ground.sigma[i] ** 2 / tile.observed[i];
     return {
       ...after, change: after.change.map((value, i) => value - before.change[i]),
-      sigma: after.sigma.map((sigma, i) => Math.hypot(sigma, before.sigma[i])),
+      sigma: after.sigma.map((_, i) => Math.sqrt(Math.max(independent(after, i) + independent(before, i), 0))),
       observed: after.observed.map((share, i) => Math.min(share, before.observed[i])),
     };
   }

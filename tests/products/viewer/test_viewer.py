@@ -3,6 +3,7 @@
 import importlib.util
 import re
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +12,7 @@ import pytest
 from station.archive.areas import update_areas
 from station.archive.derived import level_files
 from station.archive.netcdf_layout import Series
+from station.archive.reference_files import write_reference
 from station.archive.series.index import SeriesIndex
 from station.config import read_site
 from station.products import page
@@ -20,6 +22,7 @@ from station.readers.polygons import cells_inside, read_polygons
 pytestmark = pytest.mark.integration
 PLACE = 30, 20  # column and row
 LEVEL_SIGMA_M = 0.006, 0.008  # random and systematic
+REFERENCE_M = 0.014  # random sigma of its cells
 
 
 @pytest.fixture(scope="module")
@@ -36,12 +39,17 @@ def tab(tmp_path_factory):
 
 
 @pytest.fixture(scope="module")
-def series(stored, tmp_path_factory):
+def series(stored, small, tmp_path_factory):
     """The small archive, with the outlines of its areas and the levels of a day."""
     folder = tmp_path_factory.mktemp("viewer")
     shutil.copytree(stored, folder, dirs_exist_ok=True)
     site = read_site(folder / "site.toml")
     series = Series(site.station.data, "hef", site.grid_cells, "EPSG:32632", name="hef")
+    reference = small.make_reference()
+    variance_m2 = np.where(
+        np.isfinite(reference.random_variance_m2), np.float32(REFERENCE_M**2), np.float32(np.nan)
+    )
+    write_reference(series, replace(reference, random_variance_m2=variance_m2))
     polygons = read_polygons(site.areas.file, site.map.crs)
     areas = {name: cells_inside(polygon, series.grid) for name, polygon in polygons.items()}
     update_areas(series, areas, Aggregates(series), lambda: None, polygons=polygons)
@@ -118,15 +126,24 @@ def test_values_under_the_pointer_are_those_of_the_store(tab, address, series, s
     assert change == pytest.approx(change_m[-1], abs=sigma_m[-1] / 8 + 0.0006)
     assert half == pytest.approx(1.96 * sigma_m[-1], rel=0.06)
 
-    # since an earlier scan: the difference, and at most the sum of the variances
+    # since an earlier scan: the difference, without the error of the reference
     slider = "document.getElementById('since')"
     tab.run(f"{slider}.value = 1; {slider}.dispatchEvent(new Event('input'))")
-    assert "upper bound" in tab.run("document.getElementById('map-key').textContent")
+    assert "left out of σ" in tab.run("document.getElementById('map-key').textContent")
     tab.run("document.getElementById('map-hover').textContent = ''")
     change, half = value_under_the_pointer(tab, east_m + 0.1, north_m)
     expected_m, bound_m = change_m[-1] - change_m[1], np.hypot(sigma_m[-1], sigma_m[1])
-    assert change == pytest.approx(expected_m, abs=bound_m / 4 + 0.0006)
-    assert half == pytest.approx(1.96 * bound_m, rel=0.06)
+    pair_m = (bound_m**2 - 2 * REFERENCE_M**2) ** 0.5
+    assert pair_m < 0.9 * bound_m
+    assert change == pytest.approx(expected_m, abs=pair_m / 4 + 0.0006)
+    assert half == pytest.approx(1.96 * pair_m, rel=0.07)
+
+    # the curve of the place says the same
+    panel = tab.await_("document.querySelector('#asked-values dd')?.textContent")
+    change, half = (float(n) for n in re.findall(r"[-\d.]+", panel.replace("−", "-"))[:2])
+    assert change == pytest.approx(expected_m, abs=0.0021)
+    stored_m = Aggregates(series).variance(mask, index[-1], index[1]) ** 0.5  # has no systematic part here
+    assert half == pytest.approx(1.96 * stored_m, rel=0.03, abs=0.0006)
     assert "since=2025-11-21T01:00Z" in tab.run("location.hash")
 
     # swiped: the earlier scan on the left, the later one on the right, each since the reference
