@@ -266,8 +266,8 @@ def test_areas_have_the_mean_and_sigma_of_the_store(tab, folder):
         answer = tab.run(
             f"stationCurves.reader(STATION.curves).area({json.dumps(corners)}).then((a) => {{"
             " const c = a.curve.filter((p) => p.observed > 0.9);"
-            " const pairs = c.slice(1).map((p, i) => [c[i].time_s, p.time_s, stationCurves.between(p, c[i]).sigma]);"
-            " return { ...a, pairs }; })"
+            " const sigma = (p, i) => stationCurves.between(p, c[i]).sigma;"
+            " return { ...a, pairs: c.slice(1).map((p, i) => [c[i].time_s, p.time_s, sigma(p, i)]) }; })"
         )
         mask = np.zeros(grid.shape, bool)
         mask[top : top + side, left : left + side] = True
