@@ -2,7 +2,7 @@
 const stationCurves = (() => {
   const SMALL = 3;  // blocks along a side, up to which the sigma of each block sets the scale; else that of its box
   const MAX_BLOCKS = 1600;
-  const HEIGHT = 0, RANGE = 1, INCIDENCE = 2, REFERENCE = 3, JACOBIAN = 4, JACOBIAN_ROWS = 14;
+  const HEIGHT = 0, RANGE = 1, INCIDENCE = 2, REFERENCE = 3, NEAR = 4, JACOBIAN = 5, JACOBIAN_ROWS = 14;
 
   function reader(about) {
     const sigma = (code) => code ? about.sigma_min_m * Math.exp((code - 1) * about.sigma_step) : 0;
@@ -82,7 +82,7 @@ const stationCurves = (() => {
         const jacobian = place.values > JACOBIAN + 1
           ? Array.from({ length: JACOBIAN_ROWS }, (_, k) => place.column(JACOBIAN + k, index)) : null;
         found.push({
-          row, column, weight, values, jacobian, reference_m: place.column(REFERENCE, index), height_m: place.column(HEIGHT, index), range_m: place.column(RANGE, index),
+          row, column, weight, values, jacobian, reference_m: place.column(REFERENCE, index), near: place.column(NEAR, index), height_m: place.column(HEIGHT, index), range_m: place.column(RANGE, index),
           incidence_deg: place.column(INCIDENCE, index), box_m: place.column(place.values - 1, index),
         });
       }
@@ -112,9 +112,9 @@ const stationCurves = (() => {
         const reference2 = dot((w, v, i) => w * w * seen[i].reference_m ** 2 / v.coverage);  // the part that all times share
         let systematic2;
         if (seen.length === 1) {
-          systematic2 = (weights[0] * at[0].systematic) ** 2;
+          systematic2 = (weights[0] * at[0].systematic * seen[0].near) ** 2;
         } else if (model && seen.every((block) => block.own_m)) {
-          const scaled = seen.map((block, i) => weights[i] *
+          const scaled = seen.map((block, i) => weights[i] * (isDifference ? block.near : 1) *
             (small || !at[i].box || !block.box_m ? at[i].systematic / block.own_m : at[i].box / block.box_m));
           systematic2 = stationCovariance.variance(model, seen.map((block) => block.jacobian), scaled);
         } else {

@@ -27,7 +27,7 @@ QUANTUM_M = 0.001  # of the change
 SIGMA_MIN_M, SIGMA_STEP = 1e-5, 0.02  # code of a sigma: 1 + ln(sigma / minimum) / step
 MAX_COVERAGE = 255  # code of a block that was observed completely, unless it has fewer cells
 MAX_CHANGE = 2**21  # code of a change of 1 km; a difference of two has 3 bytes
-FORMAT = 3  # of the codes: others are computed again
+FORMAT = 4  # of the codes: others are computed again
 MAX_READ = 24  # epochs read at once; a store older than the page is read over several calls
 DTYPES = {"change": np.int32, "random": np.uint16, "systematic": np.uint16, "coverage": np.uint8}
 
@@ -98,7 +98,6 @@ class BlockCodes:
         systematic_m2 = np.zeros(blocks.count.shape)
         if blocks.jacobian is not None and blocks.shared is not None:
             systematic_m2[blocks.observed] = blocks.jacobian.variance(blocks.shared)
-            systematic_m2[self.surface.known] *= self._near_ratio**2
         coverage = blocks.count / self._queries.cells**2
         values = {
             "change": np.round(blocks.change_m / QUANTUM_M),
@@ -120,7 +119,7 @@ class BlockCodes:
         return codes
 
     @cached_property
-    def _near_ratio(self) -> Floats:
+    def near_ratio(self) -> Floats:
         """Return the systematic sigma (n,) of each block in sigmas of its middle, once for a reference."""
         path, jacobian = self._cache / "near.bin", self.surface.jacobian
         with suppress(OSError, ValueError):

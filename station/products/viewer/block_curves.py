@@ -1,9 +1,10 @@
 """Curves of the page: change of each block of about 10 m over time with its sigma, in tiles.
 
 Three tiers of tiles have the values: `latest` is rewritten with each scan, `recent` with every eighth,
-`older` once a day. `places` has what no scan changes. Times are thinned as the maps are. The systematic
-errors of an area are propagated in the browser: from the Jacobian of its blocks, the mean covariance of the
-retained epochs in `systematic`, and how the sigma of an epoch differs from it. Source: equations.md, 6.2.
+`older` once a day. `places` has what no scan changes, renewed each month. Times are thinned as the maps are.
+The systematic errors of an area are propagated in the browser: from the Jacobian of its blocks, the mean
+covariance of the retained epochs in `systematic`, and how the sigma of an epoch differs from it. Source:
+equations.md, 6.2.
 """
 
 from __future__ import annotations
@@ -14,6 +15,7 @@ import json
 import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from datetime import UTC, datetime
 from functools import cached_property
 from pathlib import Path
 
@@ -94,9 +96,9 @@ def update_curves(
         name: [epoch for epoch in tier if epoch.ref.epoch_file in known] for name, tier in tiers.items()
     }
     on_disk, keys = tiles.read_keys(), dict[str, str]()
-    # The geometry and the mean covariance change with the older epochs, and as a short series grows.
-    names = [epoch.ref.epoch_file for epoch in wanted["older"]]
-    keys["places"] = tiles.key([*names, str(len(known).bit_length())])
+    # The mean covariance is renewed each month, and as a short series grows.
+    month = f"{datetime.fromtimestamp(epochs[-1].start_s, UTC):%Y-%m}"
+    keys["places"] = tiles.key([month, str(len(known).bit_length())])
     if on_disk.get("places") != keys["places"]:
         tiles.write_places(_mean_shared(queries, [epoch for tier in wanted.values() for epoch in tier]))
         progress()
@@ -225,6 +227,7 @@ class _Tiles:
             surface.observation.range_m,
             np.degrees(np.arccos(surface.observation.cos_incidence)),
             np.sqrt(reference_m2),
+            self._codes.near_ratio,
         ]
         box_m = np.zeros(len(grouping.order))
         if jacobian is not None and base is not None:

@@ -166,6 +166,6 @@ def test_a_tap_of_250_epochs_is_within_30_kb(noise_m):
         ]
         heads = rng.integers(0, 256, (count, 3)).astype(np.uint8).tobytes() + bytes(4 * count)
         size += len(tile_script("recent/10_10", {}, heads + np.concatenate(planes).tobytes()))
-    places = rng.normal(size=(19, 25)).astype("<f4").tobytes()
+    places = rng.normal(size=(20, 25)).astype("<f4").tobytes()
     size += len(tile_script("places/10_10", {}, places))
     assert 10_000 < size <= 30_000
