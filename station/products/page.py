@@ -29,7 +29,9 @@ from station.products.gallery import (
 )
 from station.products.maps import ASSETS, map_box
 from station.products.overview import Overview
-from station.products.viewer.block_curves import CurveEpoch, curve_tiers, update_curves
+from station.products.viewer.block_codes import CurveEpoch
+from station.products.viewer.block_curves import curve_tiers, update_curves
+from station.products.viewer.level_tiles import level_at
 from station.products.viewer.overlays import area_outlines, browser_scales, event_outlines
 from station.products.viewer.value_tiles import describe_levels, value_codes
 from station.products.web.page_areas import newest_value, usable_area_series
@@ -55,6 +57,8 @@ STATIC = {  # the parts of each file; what the first words do not need is loaded
         "map.js",
         "values.js",
         "layers.js",
+        "controls.js",
+        "drawing.js",
         "explore.js",
     ),
     "uplot.js": ("uplot.js",),
@@ -101,7 +105,7 @@ def write_page(
     table = read_epoch_table(series) if series.path.is_file() else None
     all_areas = usable_area_series(series, table) if table is not None else []
     areas = all_areas[:MAX_AREAS]
-    gallery, curves = Gallery([], None, (0, 0)), None
+    gallery, curves = Gallery([], [], None, (0, 0)), None
     if table is not None:
         style = Style(context.name or series.station_id, width_px, limit_m)
         measured = _measured_epochs(series, table, context.overviews)
@@ -121,9 +125,11 @@ def write_page(
                 "version": image.version,
                 "values": Path(image.epoch_file).stem,
                 "finest": image.finest,
+                "level": level_at(gallery.levels, image.start.timestamp(), image.version),
             }
             for image in gallery.change
         ],
+        "level_times": {level.name: level.time_s for level in gallery.levels},
         "frames": _frames(series, folder, gallery, width_px),
         "values": value_codes(),
         "scales": browser_scales(gallery.limit_m) if gallery.limit_m else {},
@@ -222,7 +228,8 @@ def _frames(series: Series, folder: Path, gallery: Gallery, width_px: int) -> di
         extent = {"west": grid.west_m, "east": grid.west_m + grid.nx * grid.cell_m, "north": grid.north_m}
         extent["south"] = grid.north_m - grid.ny * grid.cell_m
         box = [round(share, 6) for share in map_box(base, width_px)]
-        frames[version] = {"box": box, "extent": extent, "levels": describe_levels(base)}
+        means = int(base.factor > 1)  # the first level of means
+        frames[version] = {"box": box, "extent": extent, "levels": describe_levels(base), "means": means}
     return frames
 
 

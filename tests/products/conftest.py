@@ -143,7 +143,7 @@ def series(site):
     return Series(site.station.data, "hef", GRID, "EPSG:32632", name=EVIL)
 
 
-@pytest.fixture
+@pytest.fixture(scope="session")
 def small():
     """The constants and functions that the archive was built with."""
     return SimpleNamespace(

@@ -2,7 +2,7 @@
 const stationCurves = (() => {
   const SMALL = 3;  // blocks along a side, up to which the sigma of each block sets the scale; else that of its box
   const MAX_BLOCKS = 1600;
-  const HEIGHT = 0, RANGE = 1, INCIDENCE = 2, JACOBIAN = 4, JACOBIAN_ROWS = 14;
+  const HEIGHT = 0, RANGE = 1, INCIDENCE = 2, REFERENCE = 3, NEAR = 4, JACOBIAN = 5, JACOBIAN_ROWS = 14;
 
   function reader(about) {
     const sigma = (code) => code ? about.sigma_min_m * Math.exp((code - 1) * about.sigma_step) : 0;
@@ -71,17 +71,18 @@ const stationCurves = (() => {
           tier.time_s.forEach((time_s, t) => {
             const i = t * tier.blocks + at;
             if (at < 0 || !tier.usable[t]) return;
-            values.set(time_s, tier.coverage[i] ? {
+            const coverage = tier.coverage[i] / about.full;
+            values.set(time_s, coverage ? {
               change: tier.change[i] * about.quantum_m,
-              random: sigma(tier.random[i]), systematic: sigma(tier.systematic[i]),
-              coverage: tier.coverage[i] / about.full, box: sigma(tier.box[t]),
+              random: sigma(tier.random[i]) / Math.sqrt(coverage), systematic: sigma(tier.systematic[i]),
+              coverage, box: sigma(tier.box[t]),
             } : null);
           });
         }
         const jacobian = place.values > JACOBIAN + 1
           ? Array.from({ length: JACOBIAN_ROWS }, (_, k) => place.column(JACOBIAN + k, index)) : null;
         found.push({
-          row, column, weight, values, jacobian, height_m: place.column(HEIGHT, index), range_m: place.column(RANGE, index),
+          row, column, weight, values, jacobian, reference_m: place.column(REFERENCE, index), near: place.column(NEAR, index), height_m: place.column(HEIGHT, index), range_m: place.column(RANGE, index),
           incidence_deg: place.column(INCIDENCE, index), box_m: place.column(place.values - 1, index),
         });
       }
@@ -108,11 +109,12 @@ const stationCurves = (() => {
         const total = isDifference ? 1 : raw.reduce((a, b) => a + b, 0), weights = raw.map((w) => w / total);
         const dot = (f) => weights.reduce((sum, w, i) => sum + f(w, at[i], i), 0);
         const random2 = dot((w, v) => w * w * v.random ** 2);
+        const reference2 = dot((w, v, i) => w * w * seen[i].reference_m ** 2 / v.coverage);  // the part that all times share
         let systematic2;
         if (seen.length === 1) {
-          systematic2 = (weights[0] * at[0].systematic) ** 2;
+          systematic2 = (weights[0] * at[0].systematic * seen[0].near) ** 2;
         } else if (model && seen.every((block) => block.own_m)) {
-          const scaled = seen.map((block, i) => weights[i] *
+          const scaled = seen.map((block, i) => weights[i] * (isDifference ? block.near : 1) *
             (small || !at[i].box || !block.box_m ? at[i].systematic / block.own_m : at[i].box / block.box_m));
           systematic2 = stationCovariance.variance(model, seen.map((block) => block.jacobian), scaled);
         } else {
@@ -120,7 +122,7 @@ const stationCurves = (() => {
         }
         const inside = blocks.reduce((sum, block) => sum + Math.abs(block.weight), 0);
         return {
-          time_s, change: dot((w, v) => w * v.change), random: Math.sqrt(random2), systematic: Math.sqrt(systematic2),
+          time_s, change: dot((w, v) => w * v.change), random: Math.sqrt(random2), systematic: Math.sqrt(systematic2), reference2,
           sigma: Math.sqrt(random2 + systematic2), observed: isDifference ? 1 : total / inside,
         };
       });
@@ -177,6 +179,12 @@ const stationCurves = (() => {
     return { place, difference, area, maxArea_m2: MAX_BLOCKS * about.block_m ** 2 };
   }
 
+  // The change between two times of a curve. The error of the reference is in both, and cancels.
+  function between(after, before) {
+    const variance = after.sigma ** 2 + before.sigma ** 2 - after.reference2 - before.reference2;
+    return { change: after.change - before.change, sigma: Math.sqrt(Math.max(variance, 0)) };
+  }
+
   function contains(polygon, east, north) {
     let inside = false;
     polygon.forEach(([e, n], i) => {
@@ -191,5 +199,5 @@ const stationCurves = (() => {
     return sum + (e - e0) * (m - n0) - (f - e0) * (n - n0);
   }, 0)) / 2;
 
-  return { reader, contains, areaOf };
+  return { reader, between, contains, areaOf };
 })();

@@ -5,17 +5,12 @@
   const image = byId("map-image");
   if (!image || !data.curves || !("DecompressionStream" in window)) return;
   const page = window.stationPage, about = data.curves, reader = stationCurves.reader(about);
-  const fill = (template, values) => template.replace(/\{(\w+)\}/g, (_, key) => values[key]);
-  const number = page.formatNumber, HALF_95 = 1.959964, SNAP_PX = 14, PLAY_MS = 800;
+  const { make, fill } = page, number = page.formatNumber;
+  const HALF_95 = 1.959964, SNAP_PX = 14, PLAY_MS = 800;
   const colour = (name) => getComputedStyle(document.documentElement).getPropertyValue(name).trim();
 
   // ---- elements
 
-  const make = (tag, properties = {}, ...children) => {
-    const element = Object.assign(document.createElement(tag), properties);
-    element.append(...children);
-    return element;
-  };
   const canvas = make("canvas", { tabIndex: 0, id: "map-canvas" });
   canvas.setAttribute("role", "application");
   canvas.setAttribute("aria-label", text.map_label);
@@ -24,7 +19,6 @@
   panel.setAttribute("aria-live", "polite");
   const tools = make("div", { id: "map-tools" });
   tools.setAttribute("role", "toolbar");
-  const frame = make("div", { id: "map-frame" }, canvas, hover, bar);
   let tool = "place";
   const buttons = ["place", "compare", "box", "polygon"].map((name) => {
     const button = make("button", { type: "button", textContent: text[`tool_${name}`] });
@@ -51,15 +45,17 @@
   tools.append(...buttons, command("+", text.zoom_in, () => map.zoom(1.5)), command("−", text.zoom_out, () => map.zoom(1 / 1.5)),
     command("⤢", text.whole_map, () => map.home()), form);
   const figure = image.closest("figure");
-  const key = make("div", { id: "map-key" });
   let shown = data.maps.length - 1;
-  const layers = stationLayers(data, text, () => shown, () => map.draw());
-  const { row: layerRow, sinceRow, playButton } = layerControls();
-  figure.prepend(tools, hint, frame, key, layerRow);
+  const layers = stationLayers(data, () => shown, () => map.draw());
+  const controls = stationControls(data, text, layers, page, () => { map.draw(); link(); showValues(); });
+  const drawing = stationDrawing(about, data.outlines, text);
+  const frame = make("div", { id: "map-frame" }, canvas, controls.swipe, hover, bar);
+  figure.prepend(tools, hint, frame, controls.key, controls.row);
   image.loading = "eager";  // a hidden picture would never be loaded
   image.parentElement.hidden = true;  // the picture itself is drawn on the canvas
-  byId("slider-row").append(playButton);
-  byId("slider-row").after(sinceRow, panel);
+  byId("map-caption").hidden = true;  // says the same of the picture, for readers without scripts
+  byId("slider-row").append(playButton());
+  byId("slider-row").after(controls.sinceRow, panel);
 
   // ---- what is drawn
 
@@ -67,200 +63,28 @@
   let places = [], polygon = [], closed = false;
 
   const map = stationMap(canvas, extent, (context, now) => {
+    const frameOf = data.frames[data.maps[shown].version];
     context.clearRect(0, 0, now.width, now.height);
-    if (layers.isPicture(now)) drawPicture(context, now); else layers.draw(context, now);
+    if (!layers.isPicture(now)) layers.draw(context, now);
+    else if (image.complete && image.naturalWidth) drawing.picture(context, now, image, frameOf);
     context.globalCompositeOperation = "destination-over";
     context.fillStyle = colour("--card");
     context.fillRect(0, 0, now.width, now.height);
     context.globalCompositeOperation = "source-over";
-    drawOutlines(context, now);
-    if (polygon.length) drawShape(context, now, polygon, closed);
+    controls.drawKey(now);
+    if (controls.shown.outlines) drawing.areasAndEvents(context, now);
+    if (polygon.length) drawing.shape(context, now, polygon, closed);
     if (map.box()) {
       const [a, b] = map.box();
-      drawShape(context, now, [a, [b[0], a[1]], b, [a[0], b[1]]], true);
+      drawing.shape(context, now, [a, [b[0], a[1]], b, [a[0], b[1]]], true);
     }
-    if (about.scanner_m) drawScanner(context, now, about.scanner_m);
-    places.forEach((place, i) => drawPlace(context, now, place, "AB"[i]));
+    drawing.scanner(context, now);
+    places.forEach((place, i) => drawing.place(context, now, place, "AB"[i]));
+    if (layers.isSwiped()) {
+      drawing.border(context, now, layers.border_px(now), controls.timeOf(layers.before()), controls.timeOf(data.maps[shown]));
+    }
     drawScale(now);
   });
-
-  function drawPicture(context, now) {
-    const frameOf = data.frames[data.maps[shown].version];
-    if (!frameOf || !image.complete || !image.naturalWidth) return;
-    const [left, top, width, height] = frameOf.box, e = frameOf.extent;
-    const [x0, y0] = now.toPixel([e.west, e.north]), [x1, y1] = now.toPixel([e.east, e.south]);
-    context.imageSmoothingEnabled = x1 - x0 < width * image.naturalWidth;
-    context.drawImage(image, left * image.naturalWidth, top * image.naturalHeight, width * image.naturalWidth,
-      height * image.naturalHeight, x0, y0, x1 - x0, y1 - y0);
-  }
-
-  // The colour bar and the legend in words.
-  let keyShown = "";
-  byId("map-caption").hidden = true;  // says the same of the picture, for readers without scripts
-  function drawKey() {
-    const { layer, contours } = layers.state, scale = data.scales[stationValues.LAYERS[layer].scale];
-    const since = layers.before() ? `${page.utc(layers.before().time_s)} UTC` : text.the_reference;
-    const every_m = contours ? layers.every_m() : 0, now = [layer, since, every_m, layers.isComparable()].join();
-    if (now === keyShown) return;
-    keyShown = now;
-    const bar = make("canvas", { width: 256, height: 1 }), context = bar.getContext("2d");
-    layers.scales[stationValues.LAYERS[layer].scale].table.forEach((rgb, i) => {
-      context.fillStyle = `rgb(${rgb.join()})`;
-      context.fillRect(i, 0, 1, 1);
-    });
-    bar.setAttribute("aria-hidden", "true");
-    const { position } = layers.scales[stationValues.LAYERS[layer].scale];
-    const ticks = scale.ticks.map((tick) => {
-      const mark = make("span", { textContent: String(Number(tick.toPrecision(3))).replace("-", "−") });
-      mark.style.left = `${100 * position(tick)}%`;
-      return mark;
-    });
-    const entry = (name) => make("span", { className: `swatch ${name}`, textContent: text[`key_${name}`] });
-    key.replaceChildren(
-      make("p", { textContent: fill(text[`key_${layer}`], { since }) }), make("div", { className: "bar" }, bar, ...ticks),
-      make("p", {}, ...(layer === "change" ? [entry("grey")] : []), entry("unseen"),
-        ...(every_m ? [make("span", { className: "swatch contour", textContent: fill(text.key_contour, { every: every_m }) })] : [])),
-      ...(layers.before() ? [make("p", { className: "note", textContent: layers.isComparable() ? text.pair_sigma : text.pair_reference })] : []));
-  }
-
-  // ---- layers, and the scan that the change is counted from
-
-  function layerControls() {
-    const choice = make("select", { id: "layer" }, ...Object.keys(stationValues.LAYERS).map((name) =>
-      make("option", { value: name, textContent: text[`layer_${name}`] })));
-    const box = (name, checked, act) => {
-      const input = make("input", { type: "checkbox", id: `show-${name}`, checked });
-      input.addEventListener("change", () => { act(input.checked); update(); });
-      return make("label", {}, input, ` ${text[`show_${name}`]}`);
-    };
-    const update = () => { map.draw(); link(); };
-    choice.addEventListener("change", () => { layers.state.layer = choice.value; update(); });
-    const row = make("div", { id: "map-layers" }, make("label", {}, `${text.layer} `, choice),
-      box("outlines", true, (on) => { outlined = on; }), box("contours", false, (on) => { layers.state.contours = on; }));
-    const since = make("input", { type: "range", id: "since", min: -1, max: data.maps.length - 1, value: -1 });
-    const output = make("output", { id: "since-time" });
-    const sinceRow = make("div", { className: "slider", hidden: data.maps.length < 2 }, make("label", { htmlFor: "since", textContent: text.since }), since, output);
-    const showSince = () => {
-      layers.state.since = Number(since.value);
-      const words = layers.before() ? `${page.utc(layers.before().time_s)} UTC` : text.the_reference;
-      output.textContent = words;
-      since.setAttribute("aria-valuetext", words);
-    };
-    since.addEventListener("input", () => { showSince(); update(); showValues(); });
-    showSince();
-    layers.choose = (layer, index) => {
-      layers.state.layer = choice.value = layer;
-      since.value = index;
-      showSince();
-      map.draw();
-    };
-    const playButton = make("button", { type: "button", textContent: text.play });
-    let timer = 0;
-    const stop = () => { clearInterval(timer); timer = 0; playButton.textContent = text.play; };
-    playButton.addEventListener("click", () => {
-      if (timer) { stop(); return; }
-      playButton.textContent = text.pause;
-      if (shown === data.maps.length - 1) page.showTime(data.maps[0].time_s);
-      timer = setInterval(() => {
-        if (shown === data.maps.length - 1) stop(); else page.showTime(data.maps[shown + 1].time_s);
-      }, PLAY_MS);
-    });
-    return { row, sinceRow, playButton };
-  }
-
-  let outlined = true;
-  function drawOutlines(context, now) {
-    drawKey();
-    if (!outlined) return;
-    const written = [];  // a name that would cover another is left out: the tables have all
-    const draw = (rings, name, dash = []) => {
-      if (!rings.length) return;
-      context.setLineDash(dash);
-      for (const ring of rings) drawShape(context, now, ring, true, 1.2);
-      context.setLineDash([]);
-      const end = rings[0].reduce((a, b) => b[1] > a[1] === !dash.length ? b : a), [x, y] = now.toPixel(end);
-      label(context, name, x + 4, dash.length ? y + 15 : y - 5, written);  // areas above, events below
-    };
-    for (const area of data.outlines.areas) draw(area.rings, area.name);
-    for (const event of data.outlines.events) draw(event.rings, text[`event_${event.kind}`] || event.kind, [5, 4]);
-  }
-
-  // A row of the table of events shows the event: its change, from the scan before it to its last, and its curve.
-  for (const event of data.outlines.events) {
-    const row = document.querySelector(`tr[data-event="${CSS.escape(event.id)}"]`);
-    if (!row || !event.rings.length) continue;
-    const button = command(text.event_show, text.event_show, () => {
-      const at = (utc) => data.maps.findLastIndex((m) => m.time_s <= Date.parse(utc) / 1000);
-      page.showTime(Date.parse(event.end) / 1000);
-      layers.choose("change", Math.max(at(event.after), -1));
-      const ring = event.rings[0], middle = [0, 1].map((k) => ring.reduce((sum, p) => sum + p[k], 0) / ring.length);
-      const side_m = Math.max(...[0, 1].map((k) => Math.max(...ring.map((p) => p[k])) - Math.min(...ring.map((p) => p[k]))));
-      map.centre(middle, 3 * side_m / canvas.clientWidth);
-      askArea(ring.slice(0, -1));
-      byId("map").scrollIntoView();
-    });
-    row.cells[0].append(" ", button);
-  }
-
-  function drawShape(context, now, corners, isClosed, width = 2.5) {
-    context.beginPath();
-    corners.forEach((corner, i) => context[i ? "lineTo" : "moveTo"](...now.toPixel(corner)));
-    if (isClosed) context.closePath();
-    stroke(context, "#000", width);
-    if (!isClosed) for (const corner of corners) {
-      const [x, y] = now.toPixel(corner);
-      context.fillRect(x - 3, y - 3, 6, 6);
-    }
-  }
-
-  function stroke(context, ink, width) {  // dark on white: seen on any ground
-    context.strokeStyle = "#fff";
-    context.lineWidth = width + 3;
-    context.stroke();
-    context.strokeStyle = context.fillStyle = ink;
-    context.lineWidth = width;
-    context.stroke();
-  }
-
-  function drawPlace(context, now, place, name) {
-    const [x, y] = now.toPixel(place), size = Math.max(about.block_m / now.view.scale / 2, 4);
-    if (about.scanner_m) {  // the line of sight
-      context.setLineDash([6, 5]);
-      context.beginPath();
-      context.moveTo(...now.toPixel(about.scanner_m));
-      context.lineTo(x, y);
-      stroke(context, "#444", 1);
-      context.setLineDash([]);
-    }
-    context.beginPath();
-    context.rect(x - size, y - size, 2 * size, 2 * size);
-    stroke(context, "#000", 2);
-    label(context, name, x + size + 5, y - size - 3);
-  }
-
-  function drawScanner(context, now, position) {
-    const [x, y] = now.toPixel(position);
-    context.beginPath();
-    context.moveTo(x, y - 8);
-    context.lineTo(x + 7, y + 5);
-    context.lineTo(x - 7, y + 5);
-    context.closePath();
-    stroke(context, "#000", 2);
-    context.fill();
-  }
-
-  // Write words, unless they would cover one of the boxes [left, top, right, bottom] of those written before.
-  function label(context, words, x, y, written = []) {
-    context.font = "600 14px system-ui, sans-serif";
-    const box = [x, y - 14, x + context.measureText(words).width, y + 4];
-    if (written.some((other) => [0, 1].every((k) => box[k] < other[k + 2] && other[k] < box[k + 2]))) return;
-    written.push(box);
-    context.lineWidth = 4;
-    context.strokeStyle = "#fff";
-    context.fillStyle = "#000";
-    context.strokeText(words, x, y);
-    context.fillText(words, x, y);
-  }
 
   function drawScale(now) {
     const { west, east, south, north } = extent, [x0, y1] = now.toPixel([west, south]), [x1, y0] = now.toPixel([east, north]);
@@ -271,16 +95,48 @@
     bar.textContent = length_m >= 1000 ? `${length_m / 1000} km` : `${length_m} m`;
   }
 
+  function playButton() {
+    const button = make("button", { type: "button", textContent: text.play });
+    let timer = 0;
+    const stop = () => { clearInterval(timer); timer = 0; button.textContent = text.play; };
+    button.addEventListener("click", () => {
+      if (timer) { stop(); return; }
+      button.textContent = text.pause;
+      if (shown === data.maps.length - 1) page.showTime(data.maps[0].time_s);
+      timer = setInterval(() => {
+        if (shown === data.maps.length - 1) stop(); else page.showTime(data.maps[shown + 1].time_s);
+      }, PLAY_MS);
+    });
+    return button;
+  }
+
+  // A row of the table of events shows the event: its change, from the scan before it to its last, and its curve.
+  for (const event of data.outlines.events) {
+    const row = document.querySelector(`tr[data-event="${CSS.escape(event.id)}"]`);
+    if (!row || !event.rings.length) continue;
+    const button = command(text.event_show, text.event_show, () => {
+      const at = (utc) => data.maps.findLastIndex((m) => m.time_s <= Date.parse(utc) / 1000);
+      page.showTime(Date.parse(event.end) / 1000);
+      controls.choose("change", Math.max(at(event.after), -1));
+      const ring = event.rings[0], middle = [0, 1].map((k) => ring.reduce((sum, p) => sum + p[k], 0) / ring.length);
+      const side_m = Math.max(...[0, 1].map((k) => Math.max(...ring.map((p) => p[k])) - Math.min(...ring.map((p) => p[k]))));
+      map.centre(middle, 3 * side_m / canvas.clientWidth);
+      askArea(ring.slice(0, -1));
+      byId("map").scrollIntoView();
+    });
+    row.cells[0].append(" ", button);
+  }
+
   const grouped = (value, digits = 0) => number(value, digits).replace(/\B(?=(\d{3})+(?!\d))/g, "\u202f");
   let hovered = 0;
   map.on.hover = async (position) => {
     const mine = ++hovered, words = position ? `${grouped(position[0])} E, ${grouped(position[1])} N` : "";
     hover.textContent = words;
     if (!position || map.isMoving() || layers.isPicture(map.now())) return;
-    const at = await layers.at(position);
+    const at = await layers.at(map.now(), position);
     if (mine !== hovered || !at) return;
     const height = Number.isFinite(at.height) ? `, ${grouped(at.height, 1)} m` : "";
-    hover.textContent = `${words}${height}: ${at.isObserved ? withHalf(at.change, at.sigma, 3, "m") : text.key_unseen}`;
+    hover.textContent = `${words}${height}: ${at.isObserved ? withHalf(at.change, at.sigma, 3, at.unit) : text.key_unseen}`;
   };
 
   // ---- tools
@@ -406,8 +262,8 @@
     if (!at) { list.append(make("p", { textContent: text.not_observed })); return; }
     const from = layers.before() && known.filter((p) => p.time_s <= layers.before().time_s + 1).at(-1);
     if (from) {
-      const change = withHalf(at.change - from.change, Math.hypot(at.sigma, from.sigma), 3, "m");
-      list.append(make("div", {}, make("dt", { textContent: fill(text.since_scan, { time: page.utc(from.time_s) }) }), make("dd", { textContent: change, title: text.pair_sigma })));
+      const { change, sigma } = stationCurves.between(at, from);
+      list.append(make("div", {}, make("dt", { textContent: fill(text.since_scan, { time: page.utc(from.time_s) }) }), make("dd", { textContent: withHalf(change, sigma, 3, "m"), title: text.pair_sigma })));
     }
     for (const [name, value] of current.rows(at)) list.append(make("div", {}, make("dt", { textContent: name }), make("dd", { textContent: value })));
     list.append(make("div", {}, make("dt", { textContent: "UTC" }), make("dd", { textContent: page.utc(at.time_s) })));
@@ -436,7 +292,7 @@
     const isPoint = (p) => p.length === 2 && p.every(Number.isFinite);
     if (hash.get("time")) page.showTime(Date.parse(hash.get("time")) / 1000);
     const since_s = Date.parse(hash.get("since")) / 1000, layer = hash.get("layer");
-    layers.choose(layer in stationValues.LAYERS ? layer : "change", data.maps.findLastIndex((m) => m.time_s <= since_s + 59));
+    controls.choose(layer, data.maps.findLastIndex((m) => m.time_s <= since_s + 59));
     const area = hash.get("area")?.split(";").map(read), at = hash.get("at") && read(hash.get("at"));
     const other = hash.get("minus") && read(hash.get("minus"));
     if (area && area.length > 2 && area.every(isPoint)) askArea(area);

@@ -1,15 +1,21 @@
 // The layers of the map: which values are shown, of which scan and since when, drawn from tiles as they arrive.
-function stationLayers(data, text, shownIndex, redraw) {
+function stationLayers(data, shownIndex, redraw) {
   const tiles = stationValues.reader(data.values), size = data.values.tile;
   const scales = Object.fromEntries(Object.entries(data.scales).map(([name, scale]) => [name, stationValues.scaleOf(scale)]));
-  const state = { layer: "change", since: -1, contours: false };  // since: index of a map, -1 the reference
+  const state = { layer: "change", since: -1, contours: false, swipe: null };  // since: index of a map, -1 the reference
   const painted = new Map(), KEPT = 240, DETAIL = 0.75;  // values per pixel from which a finer level is used
   let every_m = 0;
 
-  const shown = () => data.maps[shownIndex()];
+  const shown = () => data.maps[shownIndex()], source = () => stationValues.LAYERS[state.layer].source;
   const before = () => state.since < 0 ? null : data.maps[state.since];
-  const isComparable = () => !before() || before().version === shown().version;
-  const levels = () => data.frames[shown().version].levels;
+  const isSwiped = () => state.swipe !== null && Boolean(before());
+  const isComparable = ({ after, before: other }) => !other || other.version === after.version;
+  const border_px = (now) => state.swipe * now.width;
+  // What is drawn from one pixel to another: a map since the reference or another map; two beside each other if swiped.
+  const pairs = (now) => isSwiped()
+    ? [{ after: before(), before: null, from: 0, to: border_px(now) }, { after: shown(), before: null, from: border_px(now), to: now.width }]
+    : [{ after: shown(), before: source() === "rate" ? null : before(), from: 0, to: now.width }];
+  const levels = ({ after }) => data.frames[after.version].levels;
   const isPicture = (now) => {  // the picture is enough, and smaller
     const frame = data.frames[shown().version];
     return state.layer === "change" && !before() && !state.contours &&
@@ -30,30 +36,34 @@ function stationLayers(data, text, shownIndex, redraw) {
     return null;
   }
 
-  async function valuesAt(level, name) {
-    const after = await tiles.values(shown().values, level, name);
-    if (!before() || !after) return after;
-    const other = await tiles.values(before().values, level, name);
-    return other && stationValues.difference(after, other);
+  const folderOf = (map) => source() ? map.level && `${source()}_${map.level}` : map.values;
+
+  async function valuesAt(pair, level, name) {
+    const [after, other] = [pair.after, pair.before].map((map) => map && folderOf(map));
+    const values = after && await tiles.values(after, level, name);
+    if (!pair.before || !values) return values;
+    const subtracted = other && await tiles.values(other, level, name);
+    const ground = await tiles.heights(pair.after.version, level, name);
+    return subtracted && ground && stationValues.difference(values, subtracted, ground);
   }
 
-  async function lightAt(version, level, name) {
-    const ground = await tiles.heights(version, level, name);
-    return ground && { ground, light: stationValues.hillshade(ground, levels()[level].value_m) };
+  async function lightAt(pair, level, name) {
+    const ground = await tiles.heights(pair.after.version, level, name);
+    return ground && { ground, light: stationValues.hillshade(ground, levels(pair)[level].value_m) };
   }
 
-  const finest = () => Math.max(shown().finest, before()?.finest || 0);
+  const finest = (pair) => source() ? data.frames[pair.after.version].means : Math.max(pair.after.finest, pair.before?.finest || 0);
 
-  function levelFor(now) {
-    const all = levels(), wanted_m = now.view.scale * DETAIL;
+  function levelFor(now, pair) {
+    const all = levels(pair), wanted_m = now.view.scale * DETAIL;
     const level = all.findLastIndex((candidate) => candidate.value_m <= wanted_m);
-    return Math.max(level, finest());
+    return Math.max(level, finest(pair));
   }
 
   // Tiles of a level that are in sight, as [name, west, north, width_m, height_m].
-  function inSight(now, level) {
-    const { value_m, rows, columns, tiles: known } = levels()[level], { extent } = data.frames[shown().version];
-    const [west, north] = now.toMap(0, 0), [east, south] = now.toMap(now.width, now.height), side_m = size * value_m;
+  function inSight(now, pair, level) {
+    const { value_m, rows, columns, tiles: known } = levels(pair)[level], { extent } = data.frames[pair.after.version];
+    const [west, north] = now.toMap(pair.from, 0), [east, south] = now.toMap(pair.to, now.height), side_m = size * value_m;
     const found = [];
     known.forEach((bits, row) => [...bits].forEach((bit, column) => {
       const left = extent.west + column * side_m, top = extent.north - row * side_m;
@@ -64,8 +74,8 @@ function stationLayers(data, text, shownIndex, redraw) {
     return found;
   }
 
-  function drawTiles(context, now, level, canvasOf) {
-    for (const [name, west, north, width_m, height_m] of inSight(now, level)) {
+  function drawTiles(context, now, pair, level, canvasOf) {
+    for (const [name, west, north, width_m, height_m] of inSight(now, pair, level)) {
       const canvas = canvasOf(name);
       if (!canvas) continue;
       const [x0, y0] = now.toPixel([west, north]), [x1, y1] = now.toPixel([west + width_m, north - height_m]);
@@ -74,34 +84,44 @@ function stationLayers(data, text, shownIndex, redraw) {
     }
   }
 
-  // Ground hatched where nothing was observed, values, contours: coarse tiles first, so that there is soon something.
   function draw(context, now) {
-    const fine = levelFor(now), top = levels().length - 1, order = fine === top ? [top] : [top, fine];
-    const { version } = shown(), pair = [shown().values, before()?.values, state.layer].join(" ");
+    for (const pair of pairs(now)) {
+      context.save();
+      context.beginPath();
+      context.rect(pair.from, 0, pair.to - pair.from, now.height);
+      context.clip();
+      drawPair(context, now, pair);
+      context.restore();
+    }
+  }
+
+  // Ground hatched where nothing was observed, values, contours: coarse tiles first, so that there is soon something.
+  function drawPair(context, now, pair) {
+    const fine = levelFor(now, pair), top = levels(pair).length - 1, order = fine === top ? [top] : [top, fine];
+    const { version } = pair.after, names = [folderOf(pair.after), pair.before && folderOf(pair.before), state.layer].join(" ");
     for (const level of order) {
-      drawTiles(context, now, level, (name) => kept(`ground ${version} ${level} ${name}`, async () => {
-        const found = await lightAt(version, level, name);
+      drawTiles(context, now, pair, level, (name) => kept(`ground ${version} ${level} ${name}`, async () => {
+        const found = await lightAt(pair, level, name);
         return found && stationValues.paintGround(found.ground, found.light);
       }));
     }
     context.globalCompositeOperation = "source-atop";
     hatch(context, now);
     context.globalCompositeOperation = "source-over";
-    if (isComparable()) for (const level of order) {
-      drawTiles(context, now, level, (name) => kept(`values ${pair} ${level} ${name}`, async () => {
-        const [tile, found] = await Promise.all([valuesAt(level, name), lightAt(version, level, name)]);
+    if (isComparable(pair)) for (const level of order) {
+      drawTiles(context, now, pair, level, (name) => kept(`values ${names} ${level} ${name}`, async () => {
+        const [tile, found] = await Promise.all([valuesAt(pair, level, name), lightAt(pair, level, name)]);
         return tile && stationValues.paintValues(tile, found?.light, state.layer, scales[stationValues.LAYERS[state.layer].scale]);
       }));
     }
     if (!state.contours) return;
     every_m = niceStep(12 * now.view.scale);
-    drawTiles(context, now, fine, (name) => kept(`contours ${version} ${level_m(fine)} ${every_m} ${name}`, async () => {
-      const found = await lightAt(version, fine, name);
+    drawTiles(context, now, pair, fine, (name) => kept(`contours ${version} ${fine} ${every_m} ${name}`, async () => {
+      const found = await lightAt(pair, fine, name);
       return found && stationValues.paintContours(found.ground, every_m);
     }));
   }
 
-  const level_m = (level) => levels()[level].value_m;
   const niceStep = (value) => {
     const decade = 10 ** Math.floor(Math.log10(value));
     return [1, 2, 5, 10].map((k) => k * decade).find((step) => step >= value);
@@ -118,17 +138,21 @@ function stationLayers(data, text, shownIndex, redraw) {
     context.stroke();
   }
 
-  // The values at a place at the finest level; null if nothing was observed there.
-  async function at([east, north]) {
-    const level = finest(), { extent } = data.frames[shown().version], { value_m, tiles: known } = levels()[level];
+  // The values at a place at the finest level; null if nothing is known there.
+  async function at(now, [east, north]) {
+    const x = now.toPixel([east, north])[0], pair = pairs(now).find(({ to }) => x <= to) || pairs(now)[0];
+    const level = finest(pair), { extent } = data.frames[pair.after.version], { value_m, tiles: known } = levels(pair)[level];
     const column = Math.floor((east - extent.west) / value_m), row = Math.floor((extent.north - north) / value_m);
     const name = [row, column].map((k) => Math.floor(k / size)).join("_");
     if (row < 0 || column < 0 || known[Math.floor(row / size)]?.[Math.floor(column / size)] !== "1") return null;
-    const tile = await valuesAt(level, name), ground = await tiles.heights(shown().version, level, name);
+    const unit = source() === "rate" ? "m/d" : "m";
+    const tile = await valuesAt(pair, level, name), ground = await tiles.heights(pair.after.version, level, name);
     const width = (tile || ground)?.columns, i = row % size * width + column % size;
     const change = tile ? tile.change[i] : NaN;
-    return { height: ground?.height[i], change, sigma: tile?.sigma[i], isObserved: Number.isFinite(change) };
+    return { height: ground?.height[i], change, sigma: tile?.sigma[i], isObserved: Number.isFinite(change), unit };
   }
 
-  return { state, draw, at, isPicture, isComparable, scales, before, every_m: () => every_m };
+  const levelTime = (map) => data.level_times[map.level];
+
+  return { state, draw, at, pairs, isPicture, isComparable, isSwiped, border_px, levelTime, scales, before, every_m: () => every_m };
 }

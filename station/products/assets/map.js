@@ -21,13 +21,13 @@ function stationMap(canvas, extent, redraw) {
   }
 
   function resize() {
-    const ratio = devicePixelRatio || 1, first = !width;
+    const ratio = devicePixelRatio || 1, isWhole = !width || view.scale === fitted;  // stays so: styles may come late
     width = canvas.clientWidth;
     height = canvas.clientHeight;
     canvas.width = Math.round(width * ratio);
     canvas.height = Math.round(height * ratio);
     fitted = Math.max((extent.east - extent.west) / width, (extent.north - extent.south) / height);
-    if (first) home(); else draw();
+    if (isWhole) home(); else draw();
   }
 
   function home() {

@@ -2,7 +2,12 @@
 // The page is complete without this script, which adds the status light, the slider and the curves.
 (() => {
   const data = window.STATION, text = data.text;
-  const fill = (key, values) => text[key].replace(/\{(\w+)\}/g, (_, name) => values[name]);
+  const fill = (template, values) => template.replace(/\{(\w+)\}/g, (_, name) => values[name]);
+  const make = (tag, properties = {}, ...children) => {
+    const element = Object.assign(document.createElement(tag), properties);
+    element.append(...children);
+    return element;
+  };
   const byId = (id) => document.getElementById(id);
   const pad = (n) => String(n).padStart(2, "0");
   const utc = (s) => {
@@ -28,8 +33,8 @@
     const word = age_s < -FUTURE_S ? text.js_clock_error
       : text[`js_${state}`];
     const words = age_s < -FUTURE_S ? text.js_clock_wrong
-      : fill("js_written_ago", { age: span(age_s), every: span(every_s) }) +
-        (state === "stale" ? fill("js_check_service", { station: data.station }) : "");
+      : fill(text.js_written_ago, { age: span(age_s), every: span(every_s) }) +
+        (state === "stale" ? fill(text.js_check_service, { station: data.station }) : "");
     const lamp = byId("lamp");
     if (lamp.className !== `lamp ${state}`) lamp.className = `lamp ${state}`;
     if (byId("lamp-word").textContent !== word) byId("lamp-word").textContent = word;
@@ -200,7 +205,7 @@
     if (areas) areas.replaceChildren();
     health.replaceChildren();
     for (const area of data.areas) {
-      curve(areas, fill("js_area_curve", { area: area.name }), data.area_time_s, [
+      curve(areas, fill(text.js_area_curve, { area: area.name }), data.area_time_s, [
         { values: area.mean_m, half: area.sigma_m.map((s) => s == null ? null : 1.959964 * s), digits: 3 }]);
     }
     if (data.health) drawHealth(health, data.health);
@@ -223,7 +228,7 @@
     };
     const [roll, pitch] = [medianOf(h.platform_roll), medianOf(h.platform_pitch)];
     const subtract = (values, m) => values.map((v) => v == null ? null : v - m);
-    curve(health, fill("js_tilt", { roll: formatNumber(roll, 3), pitch: formatNumber(pitch, 3) }), t, [
+    curve(health, fill(text.js_tilt, { roll: formatNumber(roll, 3), pitch: formatNumber(pitch, 3) }), t, [
       { label: text.js_roll, values: subtract(h.platform_roll, roll), digits: 4 },
       { label: text.js_pitch, values: subtract(h.platform_pitch, pitch), digits: 4, colour: "--second" }]);
     curve(health, text.js_temperature, t, [{ values: h.air_temperature, digits: 1 }]);
@@ -240,7 +245,7 @@
   document.head.append(Object.assign(document.createElement("link"), { rel: "stylesheet", href: "explore.css" }));
   addEventListener("DOMContentLoaded", () => { load("uplot.js").then(draw); load("explore.js"); });
   matchMedia("(prefers-color-scheme: dark)").addEventListener("change", draw);
-  window.stationPage = { curve, flush, formatNumber, utc, showTime: (time_s) => showTime(time_s) };
+  window.stationPage = { make, fill, curve, flush, formatNumber, utc, showTime: (time_s) => showTime(time_s) };
   let width = innerWidth;
   addEventListener("resize", () => {
     if (innerWidth === width) return;

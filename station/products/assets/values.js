@@ -34,21 +34,22 @@ const stationValues = (() => {
     }
 
     async function heights(version, level, name) {
-      const tile = await stationTiles.load(`heights/${version}/${level}/${name}`, "");
+      const tile = await stationTiles.load(`ground/${version}/${level}/${name}`, "");
       if (!tile) return null;
-      const { where, steps: codes, size } = unpack(tile, 0), height = empty(size);
-      where.forEach((i, k) => { height[i] = codes[k] * tile.head.step; });
-      return { rows: tile.head.rows, columns: tile.head.columns, height };
+      const { where, planes, steps: codes, size } = unpack(tile, 1), height = empty(size), sigma = empty(size);
+      where.forEach((i, k) => { height[i] = codes[k] * tile.head.step; sigma[i] = sigmas[planes[0][k]]; });
+      return { rows: tile.head.rows, columns: tile.head.columns, height, sigma };
     }
 
     return { values, heights };
   }
 
-  // Of two scans, the change between them; its sigma as if nothing were common to both, which is the most.
-  function difference(after, before) {
+  // Of two scans, the change between them. The random error of the reference `ground` is in both, and cancels.
+  function difference(after, before, ground) {
+    const independent = (tile, i) => tile.sigma[i] ** 2 - ground.sigma[i] ** 2 / tile.observed[i];
     return {
       ...after, change: after.change.map((value, i) => value - before.change[i]),
-      sigma: after.sigma.map((sigma, i) => Math.hypot(sigma, before.sigma[i])),
+      sigma: after.sigma.map((_, i) => Math.sqrt(Math.max(independent(after, i) + independent(before, i), 0))),
       observed: after.observed.map((share, i) => Math.min(share, before.observed[i])),
     };
   }
@@ -97,9 +98,12 @@ const stationValues = (() => {
     });
   };
 
-  // Layers: the value that the scale shows, the scale, and whether what is not significant is grey.
+  // Layers: the value that the scale shows, the scale, whether what is not significant is grey, and the source
+  // of the values if it is not the scan.
   const LAYERS = {
     change: { value: (t, i) => t.change[i], scale: "change", grey: true },
+    level: { value: (t, i) => t.change[i], scale: "change", grey: true, source: "level" },
+    rate: { value: (t, i) => t.change[i], scale: "rate", grey: true, source: "rate" },
     significance: { value: (t, i) => t.change[i] / t.sigma[i], scale: "significance" },
     sigma: { value: (t, i) => t.sigma[i], scale: "sigma" },
     coverage: { value: (t, i) => t.observed[i], scale: "coverage" },

@@ -1,9 +1,10 @@
 """Curves of the page: change of each block of about 10 m over time with its sigma, in tiles.
 
 Three tiers of tiles have the values: `latest` is rewritten with each scan, `recent` with every eighth,
-`older` once a day. `places` has what no scan changes. Times are thinned as the maps are. The systematic
-errors of an area are propagated in the browser: from the Jacobian of its blocks, the mean covariance of the
-retained epochs in `systematic`, and how the sigma of an epoch differs from it. Source: equations.md, 6.2.
+`older` once a day. `places` has what no scan changes, renewed each month. Times are thinned as the maps are.
+The systematic errors of an area are propagated in the browser: from the Jacobian of its blocks, the mean
+covariance of the retained epochs in `systematic`, and how the sigma of an epoch differs from it. Source:
+equations.md, 6.2.
 """
 
 from __future__ import annotations
@@ -12,22 +13,25 @@ import base64
 import hashlib
 import json
 import os
-import zipfile
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import replace
+from datetime import UTC, datetime
 from functools import cached_property
 from pathlib import Path
 
 import numpy as np
 from scipy import sparse
 
-from station.archive.derived.boxes import BOXES, DAY_S, read_entry
-from station.archive.derived.computed_rasters import CHANGE, RANDOM
-from station.archive.epochs import EpochRef
+from station.archive.derived.boxes import DAY_S
 from station.archive.netcdf_layout import Series
-from station.errors import StoreError
-from station.products.viewer.near_blocks import sigma_ratio
+from station.products.viewer.block_codes import (
+    FORMAT,
+    QUANTUM_M,
+    SIGMA_MIN_M,
+    SIGMA_STEP,
+    BlockCodes,
+    CurveEpoch,
+)
 from station.products.viewer.tiles import (
     Array,
     TileFolder,
@@ -38,39 +42,16 @@ from station.products.viewer.tiles import (
 )
 from station.quantities import Bools, Floats, Ints, SharedParameters
 from station.queries.block_sums import Sums
-from station.queries.blocks import BlockQueries, SurfaceBlocks
+from station.queries.blocks import BlockQueries
 from station.science.analysis.calibration import SparseJacobian
 from station.science.uncertainty.jacobian import HeightJacobian
 
-TILE_BLOCKS = {"latest": 10, "recent": 5, "older": 5, "places": 5}  # along each side of a tile
+TILE_BLOCKS = {"latest": 12, "recent": 5, "older": 5, "places": 5}  # along each side of a tile
 LATEST = 8  # epochs before they go to the recent tier
 RECENT_DAYS = 2  # before the last one, of which all epochs are in the recent tier
-QUANTUM_M = 0.001  # of the change
-SIGMA_MIN_M, SIGMA_STEP = 1e-5, 0.02  # code of a sigma: 1 + ln(sigma / minimum) / step
-MAX_COVERAGE = 255  # code of a block that was observed completely, unless it has fewer cells
 MAX_RECENT, MAX_OLDER = 132, 110  # epochs of a curve
-MAX_READ = 24  # epochs read at once; a store older than the page is read over several calls
 MAX_BASE = 24  # epochs whose covariance is averaged
-MAX_CHANGE = 2**21  # code of a change of 1 km; a difference of two has 3 bytes
 CODE_BYTES = {"change": 3, "random": 2, "systematic": 2, "coverage": 1}  # of a value, by name
-DTYPES = {"change": np.int32, "random": np.uint16, "systematic": np.uint16, "coverage": np.uint8}
-FORMAT = 2
-
-
-@dataclass(frozen=True)
-class CurveEpoch:
-    """An epoch of the curves."""
-
-    ref: EpochRef
-    start_s: float
-    is_usable: bool
-
-
-def sigma_code(sigma_m: Floats) -> Ints:
-    """Return codes of sigmas [m], to 1 %; 0 for no error."""
-    with np.errstate(divide="ignore"):
-        code = 1 + np.log(np.maximum(sigma_m, 0) / SIGMA_MIN_M) / SIGMA_STEP
-    return np.clip(np.round(np.nan_to_num(code, neginf=0)), 0, 65535).astype(np.int64)
 
 
 def curve_tiers(start_s: Floats, retained: Sequence[int]) -> dict[str, list[int]]:
@@ -108,24 +89,23 @@ def update_curves(
 
     All epochs have one reference. Raises StoreError if something cannot be read or written.
     """
-    epochs = [epoch for tier in tiers.values() for epoch in tier]
-    queries = BlockQueries(series)
-    tiles = _Tiles(series, folder, queries, epochs[-1].ref)
-    known = tiles.read(epochs, progress)
+    epochs, queries = [epoch for tier in tiers.values() for epoch in tier], BlockQueries(series)
+    codes = BlockCodes(series, folder / ".curves", queries, epochs[-1].ref)
+    tiles, known = _Tiles(series, folder, queries, codes), codes.keep(epochs, progress)
     wanted = {
         name: [epoch for epoch in tier if epoch.ref.epoch_file in known] for name, tier in tiers.items()
     }
     on_disk, keys = tiles.read_keys(), dict[str, str]()
-    # The geometry and the mean covariance change with the older epochs, and as a short series grows.
-    names = [epoch.ref.epoch_file for epoch in wanted["older"]]
-    keys["places"] = tiles.key([*names, str(len(known).bit_length())])
+    # The mean covariance is renewed each month, and as a short series grows.
+    month = f"{datetime.fromtimestamp(epochs[-1].start_s, UTC):%Y-%m}"
+    keys["places"] = tiles.key([month, str(len(known).bit_length())])
     if on_disk.get("places") != keys["places"]:
         tiles.write_places(_mean_shared(queries, [epoch for tier in wanted.values() for epoch in tier]))
         progress()
     for name, tier in wanted.items():
         keys[name] = tiles.key([epoch.ref.epoch_file for epoch in tier])
         if on_disk.get(name) != keys[name]:
-            tiles.write_curves(name, tier, known)
+            tiles.write_curves(name, tier)
             progress()
     if on_disk.get("places") != keys["places"]:
         os.sync()  # before the keys that say that the tiles are there
@@ -179,15 +159,10 @@ class _Grouping:
 class _Tiles:
     """The tiles of one version of the reference."""
 
-    def __init__(self, series: Series, folder: Path, queries: BlockQueries, newest: EpochRef) -> None:
-        self._series, self._folder, self._queries, self._newest = series, folder, queries, newest
-        blocks = queries.read(newest)
-        self._version = blocks.cells.reference.version
-        self._newest_blocks = blocks
-        self.surface: SurfaceBlocks = queries.surface(newest, blocks.rock > 0.5)
+    def __init__(self, series: Series, folder: Path, queries: BlockQueries, codes: BlockCodes) -> None:
+        self._series, self._folder, self._queries, self._codes = series, folder, queries, codes
+        self.surface = codes.surface
         self._groupings = {size: _Grouping(self.surface.known, size) for size in set(TILE_BLOCKS.values())}
-        self._cache = folder / ".curves" / self._version
-        self._max_coverage = min(queries.cells**2, MAX_COVERAGE)
 
     @cached_property
     def _box(self) -> Array:
@@ -196,28 +171,9 @@ class _Tiles:
         size = self._queries.blocks_per_box
         return np.asarray(row // size * -(-self.surface.known.shape[1] // size) + column // size)
 
-    @cached_property
-    def _near_ratio(self) -> Floats:
-        """Return the systematic sigma (n,) of each block in sigmas of its middle, once for a reference."""
-        path, jacobian = self._cache / "near.bin", self.surface.jacobian
-        with suppress(OSError, ValueError):
-            ratio = np.fromfile(path)
-            if len(ratio) == np.count_nonzero(self.surface.known):
-                return ratio
-        shared = self._newest_blocks.shared
-        if jacobian is None or shared is None:
-            return np.ones(np.count_nonzero(self.surface.known))
-        offset_m = self.surface.observation.offset_m
-        block_m = self._queries.cells * self._series.grid.cell_m
-        ratio = sigma_ratio(jacobian, shared, (offset_m[0], offset_m[1]), block_m)
-        with suppress(StoreError, OSError):
-            path.parent.mkdir(parents=True, exist_ok=True)
-            replace_file(path, ratio.tobytes())
-        return ratio
-
     def key(self, names: list[str]) -> str:
         """Return a text that changes with what a tier is made of."""
-        return hashlib.sha256(json.dumps([FORMAT, self._version, *names]).encode()).hexdigest()
+        return hashlib.sha256(json.dumps([FORMAT, self._codes.version, *names]).encode()).hexdigest()
 
     def read_keys(self) -> dict[str, str]:
         """Return the keys of the tiers on disk; none if they are missing or damaged."""
@@ -231,60 +187,14 @@ class _Tiles:
         """Write the keys of the tiers on disk."""
         replace_file(self._folder / ".curves" / "keys.json", json.dumps(keys).encode())
 
-    def read(self, epochs: Sequence[CurveEpoch], progress: Callable[[], None]) -> dict[str, Sums]:
-        """Return the codes of epochs by file name, newest first; at most MAX_READ that are not cached."""
-        known: dict[str, Sums] = {}
-        read_count = 0
-        for epoch in reversed(epochs):
-            name = epoch.ref.epoch_file
-            codes = _load(self._cache / f"{name}.npz", int(np.count_nonzero(self.surface.known)))
-            if codes is None:
-                if read_count == MAX_READ:
-                    continue
-                read_count += 1
-                codes = self._codes(epoch)
-                _save(self._cache / f"{name}.npz", codes)
-                progress()
-            known[name] = codes
-        for path in (self._folder / ".curves").glob("*/*.npz"):
-            if path.parent != self._cache or path.name.removesuffix(".npz") not in known:
-                path.unlink(missing_ok=True)
-        return known
-
-    def _codes(self, epoch: CurveEpoch) -> Sums:
-        """Return the values of an epoch as integers, those of blocks (n,) row by row."""
-        is_newest = epoch.ref == self._newest
-        blocks = self._newest_blocks if is_newest else self._queries.read(epoch.ref)
-        systematic_m2 = np.zeros(blocks.count.shape)
-        if blocks.jacobian is not None and blocks.shared is not None:
-            systematic_m2[blocks.observed] = blocks.jacobian.variance(blocks.shared)
-            systematic_m2[self.surface.known] *= self._near_ratio**2
-        full = self._queries.cells**2
-        values = {
-            "change": np.round(blocks.change_m / QUANTUM_M),
-            "random": sigma_code(np.sqrt(blocks.random_m2)),
-            "systematic": sigma_code(np.sqrt(systematic_m2)),
-            "coverage": np.ceil(blocks.count / full * self._max_coverage),
-        }
-        codes = {
-            name: np.clip(raster, -MAX_CHANGE, MAX_CHANGE)[self.surface.known].astype(DTYPES[name])
-            for name, raster in values.items()
-        }
-        boxes = read_entry(self._series, BOXES, epoch.start_s)
-        if boxes is not None:
-            systematic_m2 = boxes[f"{CHANGE}_uncertainty"] ** 2 - boxes[RANDOM] ** 2
-            sigma_m = np.sqrt(np.maximum(np.nan_to_num(systematic_m2), 0))
-            codes["boxes"] = sigma_code(sigma_m).astype(np.uint16)
-        return codes
-
-    def write_curves(self, tier: str, epochs: Sequence[CurveEpoch], known: dict[str, Sums]) -> None:
+    def write_curves(self, tier: str, epochs: Sequence[CurveEpoch]) -> None:
         """Write the tiles of a tier."""
         folder, grouping = TileFolder(self._folder / tier), self._groupings[TILE_BLOCKS[tier]]
         if epochs:
-            codes = [known[epoch.ref.epoch_file] for epoch in epochs]
+            codes = [self._codes.read(epoch) for epoch in epochs]
             planes = np.concatenate(
                 [
-                    byte_planes(zigzag_differences(_filled(codes, name)[:, grouping.order]), size)
+                    byte_planes(encoded(codes, name)[:, grouping.order], size)
                     for name, size in CODE_BYTES.items()
                 ]
             )
@@ -293,10 +203,9 @@ class _Tiles:
                 byte_planes(np.diff(start_s, prepend=0), 4).tobytes(),
                 np.array([epoch.is_usable for epoch in epochs], np.uint8).tobytes(),
             ]
-            boxes = self._box_of_tiles(codes, grouping)
+            boxes = byte_planes(self._box_of_tiles(codes, grouping), 2)
             for position, (number, first, end) in enumerate(grouping.tiles):
-                box = byte_planes(boxes[:, position], 2).tobytes()
-                values = planes[:, :, first:end].tobytes()
+                box, values = boxes[:, :, position].tobytes(), planes[:, :, first:end].tobytes()
                 data = b"".join([grouping.local[first:end].tobytes(), *heads, box, values])
                 folder.write(grouping.name(number), {"times": len(epochs), "blocks": end - first}, data)
         folder.delete_others()
@@ -318,6 +227,7 @@ class _Tiles:
             surface.observation.range_m,
             np.degrees(np.arccos(surface.observation.cos_incidence)),
             np.sqrt(reference_m2),
+            self._codes.near_ratio,
         ]
         box_m = np.zeros(len(grouping.order))
         if jacobian is not None and base is not None:
@@ -344,7 +254,7 @@ class _Tiles:
 
     def description(self) -> dict[str, object]:
         """Return what a browser must know to read the tiles."""
-        grid, position_m = self._series.grid, self._newest_blocks.cells.scanner[:3]
+        grid, position_m = self._series.grid, self._codes.newest_blocks.cells.scanner[:3]
         is_known = bool(np.isfinite(position_m).all())
         grouping = self._groupings[TILE_BLOCKS["places"]]
         has_tile = np.zeros(grouping.rows * grouping.columns, bool)
@@ -359,18 +269,21 @@ class _Tiles:
             "quantum_m": QUANTUM_M,
             "sigma_min_m": SIGMA_MIN_M,
             "sigma_step": SIGMA_STEP,
-            "full": self._max_coverage,
+            "full": self._codes.max_coverage,
             "scanner_m": [round(value, 3) for value in position_m] if is_known else None,
         }
 
 
-def _filled(codes: list[Sums], name: str) -> Array:
-    """Return the codes (t, n) of a quantity; where a block was not observed, those of the epoch before."""
+def encoded(codes: list[Sums], name: str) -> Array:
+    """Return the codes (t, n) of a quantity as non-negative steps from epoch to epoch, as a tile has them.
+
+    Where a block was not observed, the code is that of the epoch before.
+    """
     values = np.array([epoch[name] for epoch in codes], np.int32)
     if name != "coverage":
         for previous, row, epoch in zip(values, values[1:], codes[1:], strict=False):
             np.copyto(row, previous, where=epoch["coverage"] == 0)
-    return values
+    return zigzag_differences(values)
 
 
 def _write_systematic(path: Path, jacobian: HeightJacobian | None, base: SharedParameters | None) -> None:
@@ -387,23 +300,3 @@ def _write_systematic(path: Path, jacobian: HeightJacobian | None, base: SharedP
         }
         data = np.concatenate([lower, base.line_tilt_variance]).astype("<f4").tobytes()
     replace_file(path, tile_script("systematic", head, data))
-
-
-def _load(path: Path, count: int) -> Sums | None:
-    """Return cached codes; None if there are none, or if they are damaged."""
-    try:
-        with path.open("rb") as opened, np.load(opened) as file:
-            codes = {name: file[name] for name in file.files}
-    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile):
-        return None
-    return codes if all(len(codes.get(name, ())) == count for name in CODE_BYTES) else None
-
-
-def _save(path: Path, codes: Sums) -> None:
-    """Cache codes; skipped without an error if that fails."""
-    tmp_path = path.with_name(f".{path.name}.part")
-    with suppress(OSError):
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with tmp_path.open("wb") as file:
-            np.savez(file, **codes)  # type: ignore[arg-type]
-        tmp_path.replace(path)

@@ -12,6 +12,7 @@ from station.archive.netcdf_layout import Series
 from station.products.colours import ColourScale, change_scale, points_scale, sigma_scale
 
 MAX_SIGNIFICANCE = 5.0  # sigmas at the end of the colour scale
+RATE_SHARE = 0.2  # of the limit of the change [m], for rates [m/d]: about the ratio of their sigmas
 
 
 def browser_scales(limit_m: float) -> dict[str, dict[str, Any]]:
@@ -20,6 +21,7 @@ def browser_scales(limit_m: float) -> dict[str, dict[str, Any]]:
     end = MAX_SIGNIFICANCE
     return {
         "change": change,
+        "rate": _browser_scale(change_scale(RATE_SHARE * limit_m, "")),
         "significance": {**change, "low": -end, "high": end, "ticks": [-end, -2.0, 0.0, 2.0, end]},
         "sigma": _browser_scale(sigma_scale(limit_m)),
         "coverage": {

@@ -22,10 +22,12 @@ Array = np.ndarray[Any, Any]
 
 LEVEL = 2  # of ISA-L
 
+to_json = json.JSONEncoder(separators=(",", ":"), allow_nan=False).encode
+
 
 def tile_script(name: str, head: Mapping[str, object], data: bytes) -> bytes:
     """Return a tile as a script of plain ASCII."""
-    arguments = [json.dumps(part, separators=(",", ":"), allow_nan=False).encode() for part in (name, head)]
+    arguments = [to_json(part).encode() for part in (name, head)]
     packed = binascii.b2a_base64(isal_zlib.compress(data, LEVEL), newline=False)
     return b'STATION_TILE(%s,%s,"%s");\n' % (*arguments, packed)
 
@@ -35,20 +37,17 @@ class TileFolder:
 
     def __init__(self, folder: Path) -> None:
         """Create the folder if it is missing; raise StoreError if that fails."""
-        self._folder = folder
+        self._folder, self.name = str(folder), folder.name
         try:
             folder.mkdir(parents=True, exist_ok=True)
         except OSError as error:
             raise StoreError(f"{folder}: cannot be written: {error}") from error
-        self.name = folder.name
         self._written: set[str] = set()
 
     def write(self, name: str, head: Mapping[str, object], data: bytes) -> None:
         """Write the tile of a name; raise StoreError if that fails."""
-        script = tile_script(f"{self.name}/{name}", head, data)
-        path = self._folder / f"{name}.js"
-        replace_file(path, script)
-        self._written.add(path.name)
+        replace_file(f"{self._folder}/{name}.js", tile_script(f"{self.name}/{name}", head, data))
+        self._written.add(f"{name}.js")
 
     def delete_others(self) -> None:
         """Delete the tiles that were not written since this object was created."""
@@ -69,9 +68,10 @@ def zigzag_differences(codes: Array) -> Array:
     return np.asarray(np.left_shift(steps, 1) ^ np.right_shift(steps, 31))
 
 
-def replace_file(path: Path, content: bytes) -> None:
+def replace_file(path: Path | str, content: bytes) -> None:
     """Replace a file atomically, without a sync; raise StoreError if that fails."""
-    tmp_path = f"{path.parent}/.{path.name}.part"
+    parent, _, name = str(path).rpartition("/")
+    tmp_path = f"{parent}/.{name}.part"
     try:
         descriptor = os.open(tmp_path, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o666)
         try:

@@ -1,4 +1,4 @@
-"""Maps of values for the page: change and sigma of an epoch, and heights of the reference, in square tiles.
+"""Maps of values for the page: change and sigma of an epoch, heights and sigma of the reference, in tiles.
 
 Level 0 has the cells of the grid; the levels after it have means of more and more cells, down to a few tiles
 for the whole map. A change is rounded to an eighth of its sigma or less, a sigma to 4 %. Cells that were not
@@ -35,7 +35,7 @@ SIGMA_MIN_M, SIGMA_STEP = 5e-4, 0.08  # code of a sigma: 1 + ln(sigma / minimum)
 MAX_CODE = 255
 SHARE = 255  # code of a value of which all cells were observed
 HEIGHT_STEPS = 32  # of a height, in a length of a value
-VALUES, HEIGHTS = "values", "heights"  # folders
+VALUES, HEIGHTS = "values", "ground"  # folders
 CELLS = "0"  # the level of cells
 DELETE_GRACE_S = 3600.0  # an open page may still read a map that is no longer kept
 
@@ -63,11 +63,12 @@ def value_tile(
     return _masked_tile(name, seen, steps, parts, {"share": int(share is not None)})
 
 
-def height_tile(name: str, height_m: Floats32, step_m: float) -> bytes:
-    """Return a tile of heights (r, c) [m], NaN where unknown, rounded to steps."""
+def height_tile(name: str, height_m: Floats32, sigma_m: Floats32, step_m: float) -> bytes:
+    """Return a tile of heights (r, c) [m], NaN where unknown, rounded to steps, and their random sigmas."""
     known = np.isfinite(height_m)
     steps = np.rint(height_m[known] / step_m).astype(np.int32)
-    return _masked_tile(name, known, steps, [], {"step": step_m})
+    sigmas = sigma_codes(np.nan_to_num(sigma_m[known]))
+    return _masked_tile(name, known, steps, [sigmas.tobytes()], {"step": step_m})
 
 
 def _masked_tile(
@@ -212,27 +213,37 @@ def write_heights(series: Series, folder: Path, base: BaseMap) -> None:
     target, all_levels = folder / HEIGHTS / base.version, levels(base)
     if (target / str(len(all_levels) - 1)).is_dir():
         return
-    surface = open_raster(reference_path(series, base.version), "reference_elevation", None)
-    elevation = np.asarray(surface[base.rows, base.columns])
+    path = reference_path(series, base.version)
+    elevation, sigma_m = (
+        np.asarray(open_raster(path, name, None)[base.rows, base.columns])
+        for name in ("reference_elevation", "reference_random_uncertainty")
+    )
     known = elevation < FILL / 2
-    sums = [known.astype(np.float32), np.where(known, elevation, np.float32(0))]
+    sums = [
+        known.astype(np.float32),
+        np.where(known, elevation, np.float32(0)),
+        np.where(known & (sigma_m < FILL / 2), sigma_m, np.float32(0)) ** 2,
+    ]
     if base.factor > 1:
-        _write_height_level(target, 0, all_levels[0], sums)
-    step = base.factor
+        _write_height_level(target, 0, all_levels[0], sums, 1)
+    step, cells = base.factor, base.factor**2
     for number, level in enumerate(all_levels[int(base.factor > 1) :], int(base.factor > 1)):
         sums = [_block_sums(values, step) for values in sums] if step > 1 else sums
-        _write_height_level(target, number, level, sums)
-        step = STEP
+        _write_height_level(target, number, level, sums, cells)
+        step, cells = STEP, cells * STEP**2
 
 
-def _write_height_level(target: Path, number: int, level: Level, sums: list[Floats32]) -> None:
+def _write_height_level(target: Path, number: int, level: Level, sums: list[Floats32], cells: int) -> None:
+    """Write a level: mean heights, and the random sigma of the reference in the mean of `cells` cells."""
     with np.errstate(invalid="ignore", divide="ignore"):
         height_m = sums[1] / sums[0]
+        sigma_m = np.sqrt(sums[2] / sums[0] / cells)
     step_m = 2.0 ** np.floor(np.log2(level.value_m / HEIGHT_STEPS))
-    scripts = {
-        f"{row}_{column}": height_tile(f"{number}/{row}_{column}", _part(height_m, row, column), step_m)
-        for row, column in level.tiles
-    }
+    scripts = {}
+    for row, column in level.tiles:
+        name = f"{row}_{column}"
+        part_m, part_sigma_m = (_part(values, row, column) for values in (height_m, sigma_m))
+        scripts[name] = height_tile(f"{number}/{name}", part_m, part_sigma_m, step_m)
     _write_level(target / str(number), scripts)
 
 

@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 from station.archive.series.index import SeriesIndex
-from station.products.viewer.block_curves import CurveEpoch, curve_tiers, sigma_code, update_curves
+from station.products.viewer.block_codes import CurveEpoch, sigma_code
+from station.products.viewer.block_curves import curve_tiers, update_curves
 from station.queries.aggregates import Aggregates
 
 
@@ -80,7 +81,7 @@ def test_epochs_are_in_their_tiers(series, curve_epochs, tmp_path):
     assert set(about["versions"]) == {"places", "older", "recent", "latest"}
     times_s = [round(epoch.start_s) for epoch in curve_epochs]
     for name, expected_s in {
-        "older/1_2": times_s[:1], "recent/1_2": times_s[1:4], "latest/0_1": times_s[4:],
+        "older/1_2": times_s[:1], "recent/1_2": times_s[1:4], "latest/0_0": times_s[4:],
     }.items():  # fmt: skip
         np.testing.assert_array_equal(decode(tmp_path / f"{name}.js")[1], expected_s)
 
@@ -116,14 +117,18 @@ def test_a_new_epoch_rewrites_the_latest_tier_only(series, curve_epochs, tmp_pat
     assert all(latest[name] != before["latest"][name] for name in latest)
 
 
-def test_a_damaged_cache_is_read_from_the_store_again(series, curve_epochs, tmp_path):
+def test_a_damaged_cache_is_read_from_the_store_again_and_an_old_one_goes(series, curve_epochs, tmp_path):
     update_curves(series, tmp_path, tiers(curve_epochs[:5]), lambda: None)
     for path in (tmp_path / ".curves").rglob("*.npz"):
         path.write_bytes(path.read_bytes()[:100])
+    replaced = tmp_path / ".curves" / "0" / "near.bin"  # of an earlier reference
+    replaced.parent.mkdir()
+    replaced.write_bytes(bytes(8))
     update_curves(series, tmp_path, tiers(curve_epochs), lambda: None)
+    assert not replaced.parent.exists()
     fresh = tmp_path / "fresh"
     update_curves(series, fresh, tiers(curve_epochs), lambda: None)
-    assert (tmp_path / "latest" / "0_1.js").read_bytes() == (fresh / "latest" / "0_1.js").read_bytes()
+    assert (tmp_path / "latest" / "0_0.js").read_bytes() == (fresh / "latest" / "0_0.js").read_bytes()
 
 
 def test_codes_of_sigmas_are_within_one_percent():
@@ -136,7 +141,7 @@ def test_codes_of_sigmas_are_within_one_percent():
 @pytest.mark.parametrize("noise_m", [0.005, 0.05])
 def test_a_tap_of_250_epochs_is_within_30_kb(noise_m):
     from station.products.viewer import block_curves
-    from station.products.viewer.tiles import byte_planes, tile_script, zigzag_differences
+    from station.products.viewer.tiles import byte_planes, tile_script
 
     rng, size = np.random.default_rng(1), 0
     counts = {
@@ -150,16 +155,17 @@ def test_a_tap_of_250_epochs_is_within_30_kb(noise_m):
         cells = rng.poisson(60, shape)
         codes = {
             "change": np.round(rng.normal(-0.002 * np.arange(count)[:, None], noise_m, shape) / 0.001),
-            "random": sigma_code(noise_m * np.sqrt(60 / cells) * rng.normal(1, 0.02, shape)),
+            "random": sigma_code(noise_m * np.sqrt(60 / 100) * rng.normal(1, 0.02, shape)),
             "systematic": sigma_code(0.02 * rng.normal(1, 0.1, (count, 1)) * np.ones(shape)),
             "coverage": np.minimum(cells, 100),
         }
+        epochs = [{name: values[k].astype(int) for name, values in codes.items()} for k in range(count)]
         planes = [
-            byte_planes(zigzag_differences(codes[name]), width)
+            byte_planes(block_curves.encoded(epochs, name), width)
             for name, width in block_curves.CODE_BYTES.items()
         ]
         heads = rng.integers(0, 256, (count, 3)).astype(np.uint8).tobytes() + bytes(4 * count)
         size += len(tile_script("recent/10_10", {}, heads + np.concatenate(planes).tobytes()))
-    places = rng.normal(size=(19, 25)).astype("<f4").tobytes()
+    places = rng.normal(size=(20, 25)).astype("<f4").tobytes()
     size += len(tile_script("places/10_10", {}, places))
     assert 10_000 < size <= 30_000

@@ -62,7 +62,7 @@ def read_tile(path):
         return whole.reshape(shape)
 
     if "step" in head:
-        return raster(steps * head["step"])
+        return raster(steps * head["step"]), raster(0.0005 * np.exp((other.astype(float) - 1) * 0.08))
     code = other[:n].astype(float)
     sigma_m = 0.0005 * np.exp((code - 1) * 0.08)
     change_m = steps * 2.0 ** np.floor(np.log2(sigma_m / 4))
@@ -149,7 +149,8 @@ def test_values_and_heights_of_a_small_store(series, small, tmp_path):
     np.testing.assert_array_equal(np.isfinite(tile_m), seen)
     assert np.all(np.abs(tile_m - change_m)[seen] < 0.3 * sigma_m[seen])  # the store rounds, too
     height_m = small.make_reference().elevation_m[base.rows, base.columns]
-    read_m = assemble(tmp_path / "heights" / "1" / "0", base.grid.shape)
+    read_m, sigma_m = (assemble(tmp_path / "ground" / "1" / "0", base.grid.shape, k) for k in (0, 1))
+    assert sigma_m[np.isfinite(height_m)] == pytest.approx(0.005, rel=0.041)
     assert np.nanmax(np.abs(read_m - height_m)) <= 10 / 32 / 2 + 1e-3
     np.testing.assert_array_equal(np.isfinite(read_m), np.isfinite(height_m))
 

@@ -3,43 +3,96 @@
 import importlib.util
 import re
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from station.archive.areas import update_areas
+from station.archive.derived import level_files
+from station.archive.netcdf_layout import Series
+from station.archive.reference_files import write_reference
 from station.archive.series.index import SeriesIndex
+from station.config import read_site
 from station.products import page
 from station.queries.aggregates import Aggregates
 from station.readers.polygons import cells_inside, read_polygons
 
 pytestmark = pytest.mark.integration
 PLACE = 30, 20  # column and row
+LEVEL_SIGMA_M = 0.006, 0.008  # random and systematic
+REFERENCE_M = 0.014  # random sigma of its cells
 
 
-@pytest.fixture
-def tab(tmp_path):
+@pytest.fixture(scope="module")
+def tab(tmp_path_factory):
     chromium = shutil.which("chromium") or shutil.which("chromium-browser")
     if chromium is None:
         pytest.skip("chromium is not installed: map not tested in a browser (apt-get install chromium)")
     spec = importlib.util.spec_from_file_location("browser", Path(__file__).parents[1] / "browser.py")
     browser = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(browser)
-    tab = browser.Page(chromium, tmp_path / "profile")
+    tab = browser.Page(chromium, tmp_path_factory.mktemp("browser"))
     yield tab
     tab.close()
 
 
-@pytest.fixture
-def address(series, site):
-    """The page of the small archive, with the outlines of its areas."""
+@pytest.fixture(scope="module")
+def series(stored, small, tmp_path_factory):
+    """The small archive, with the outlines of its areas and the levels of a day."""
+    folder = tmp_path_factory.mktemp("viewer")
+    shutil.copytree(stored, folder, dirs_exist_ok=True)
+    site = read_site(folder / "site.toml")
+    series = Series(site.station.data, "hef", site.grid_cells, "EPSG:32632", name="hef")
+    reference = small.make_reference()
+    variance_m2 = np.where(
+        np.isfinite(reference.random_variance_m2), np.float32(REFERENCE_M**2), np.float32(np.nan)
+    )
+    write_reference(series, replace(reference, random_variance_m2=variance_m2))
     polygons = read_polygons(site.areas.file, site.map.crs)
     areas = {name: cells_inside(polygon, series.grid) for name, polygon in polygons.items()}
     update_areas(series, areas, Aggregates(series), lambda: None, polygons=polygons)
-    context = page.PageContext("x", "", 1.0, 3600.0, [], [], [], {})
-    page.write_page(series, site.station.data / "page", context, 600, None, lambda: None)
-    return (site.station.data / "page" / "index.html").as_uri()
+    start_s = float(SeriesIndex(series).start_s[0])
+    day = level_files.LevelPeriod("20251121", "0" * 16, "1", start_s, start_s + 1e4, start_s + 5000, 6)
+    level_files.write_levels(series, day, level_rows)
+    return series
+
+
+def level_rows(rows):
+    """Levels that rise to the east, and the rate of a tenth of them a day."""
+    ones = np.ones((rows.stop - rows.start, 60))
+    random_m, systematic_m = LEVEL_SIGMA_M
+    level_m = ones * level_at(np.arange(60))
+    rasters = {"level": level_m, "rate": level_m / 10, "coverage": ones}
+    for name, share in (("level", 1.0), ("rate", 0.1)):
+        rasters[f"{name}_random_uncertainty"] = ones * random_m * share
+        rasters[f"{name}_systematic_uncertainty"] = ones * systematic_m * share
+    return level_files.encoded(rasters)
+
+
+def level_at(column):
+    return 0.02 * column
+
+
+@pytest.fixture(scope="module")
+def addresses(series, tmp_path_factory):
+    """The page, in English and in German."""
+    folder = tmp_path_factory.mktemp("pages")
+    for language in ("en", "de"):
+        context = page.PageContext("x", "", 1.0, 3600.0, [], [], [], {}, language=language)
+        page.write_page(series, folder / language, context, 600, None, lambda: None)
+        if language == "en":
+            shutil.copytree(folder / "en", folder / "de")  # the same maps
+    return {language: (folder / language / "index.html").as_uri() for language in ("en", "de")}
+
+
+@pytest.fixture
+def address(addresses, tab):
+    tab.events.clear()
+    tab.set_size(1200, 900)
+    tab.open("about:blank")  # a new part after # alone would not load the page again
+    return addresses["en"]
 
 
 def value_under_the_pointer(tab, east_m, north_m):
@@ -73,16 +126,78 @@ def test_values_under_the_pointer_are_those_of_the_store(tab, address, series, s
     assert change == pytest.approx(change_m[-1], abs=sigma_m[-1] / 8 + 0.0006)
     assert half == pytest.approx(1.96 * sigma_m[-1], rel=0.06)
 
-    # since an earlier scan: the difference, and at most the sum of the variances
+    # since an earlier scan: the difference, without the error of the reference
     slider = "document.getElementById('since')"
     tab.run(f"{slider}.value = 1; {slider}.dispatchEvent(new Event('input'))")
-    assert "upper bound" in tab.run("document.getElementById('map-key').textContent")
+    assert "left out of σ" in tab.run("document.getElementById('map-key').textContent")
     tab.run("document.getElementById('map-hover').textContent = ''")
     change, half = value_under_the_pointer(tab, east_m + 0.1, north_m)
     expected_m, bound_m = change_m[-1] - change_m[1], np.hypot(sigma_m[-1], sigma_m[1])
-    assert change == pytest.approx(expected_m, abs=bound_m / 4 + 0.0006)
-    assert half == pytest.approx(1.96 * bound_m, rel=0.06)
+    pair_m = (bound_m**2 - 2 * REFERENCE_M**2) ** 0.5
+    assert pair_m < 0.9 * bound_m
+    assert change == pytest.approx(expected_m, abs=pair_m / 4 + 0.0006)
+    assert half == pytest.approx(1.96 * pair_m, rel=0.07)
+
+    # the curve of the place says the same
+    panel = tab.await_("document.querySelector('#asked-values dd')?.textContent")
+    change, half = (float(n) for n in re.findall(r"[-\d.]+", panel.replace("−", "-"))[:2])
+    assert change == pytest.approx(expected_m, abs=0.0021)
+    stored_m = Aggregates(series).variance(mask, index[-1], index[1]) ** 0.5  # has no systematic part here
+    assert half == pytest.approx(1.96 * stored_m, rel=0.03, abs=0.0006)
     assert "since=2025-11-21T01:00Z" in tab.run("location.hash")
+
+    # swiped: the earlier scan on the left, the later one on the right, each since the reference
+    set_control(tab, "show-swipe", "checked", "true")
+    for border, scan in ((75, 1), (25, -1)):
+        set_control(tab, "swipe", "value", border)
+        tab.run("document.getElementById('map-hover').textContent = ''")
+        change, half = value_under_the_pointer(tab, east_m, north_m)
+        assert change == pytest.approx(change_m[scan], abs=sigma_m[scan] / 8 + 0.0006)
+        assert half == pytest.approx(1.96 * sigma_m[scan], rel=0.06)
+    assert tab.errors() == []
+
+
+def set_control(tab, name, attribute, value):
+    control = f"document.getElementById('{name}')"
+    tab.run(f"{control}.{attribute} = {value}; {control}.dispatchEvent(new Event('input'))")
+
+
+def test_level_and_rate_are_those_of_the_stored_day(tab, address, series):
+    column, row = PLACE
+    east_m, north_m = series.grid.x_m[column], series.grid.y_m[row]
+    sigma_m = np.hypot(*LEVEL_SIGMA_M)
+    for layer, unit in (("level", 1.0), ("rate", 0.1)):
+        tab.open("about:blank")
+        tab.open(f"{address}#layer={layer}")
+        value, half = value_under_the_pointer(tab, east_m, north_m)
+        assert value == pytest.approx(unit * level_at(column), abs=unit * sigma_m / 8 + 0.0006)
+        assert half == pytest.approx(1.96 * unit * sigma_m, rel=0.06, abs=0.0006)
+        assert "2025-11-21 01:23 UTC" in tab.run("document.getElementById('map-key').textContent")
+        assert ("m/d" in tab.run("document.getElementById('map-hover').textContent")) == (layer == "rate")
+    assert tab.errors() == []
+
+
+@pytest.mark.usefixtures("address")
+def test_the_map_is_named_for_screen_readers_and_speaks_german(tab, addresses):
+    tab.open(f"{addresses['de']}#layer=significance&since=2025-11-21T01:00Z")
+    set_control(tab, "show-swipe", "checked", "true")
+    tab.call("Accessibility.enable")
+    tree = tab.call("Accessibility.getFullAXTree")["nodes"]
+    named = {}
+    for node in tree:
+        if not node.get("ignored") and "name" in node:
+            named.setdefault(node["role"]["value"], []).append(node["name"]["value"])
+    assert any(name.startswith("Karte der Höhenänderung") for name in named["application"])
+    assert {"Zeit", "Seit"} <= set(named["slider"])
+    assert any(name.startswith("Grenze zwischen den beiden Scans") for name in named["slider"])
+    assert {"Ort", "Zweiter Ort", "Polygon"} <= set(named["button"])
+    assert "Ebene" in named["combobox"]
+    assert {"Höhenlinien", "Wischen"} <= set(named["checkbox"])
+    assert all(name.strip() for role in ("button", "slider", "checkbox", "combobox") for name in named[role])
+    assert tab.run("document.documentElement.lang") == "de"
+    assert "nicht beobachtet" in tab.run("document.getElementById('map-key').textContent")
+    spoken = tab.run("document.getElementById('since').getAttribute('aria-valuetext')")
+    assert spoken == "2025-11-21 01:00 UTC"  # not the number of the scan
     assert tab.errors() == []
 
 
