@@ -83,6 +83,11 @@ _VARIABLES = (
         "reference_visibility", ("y", "x"), "f4", "share of the scans that observed the cell", "1", None, 3
     ),
     Variable(
+        "shared_parameter", ("parameter",), "f8",
+        "mean state of the scanner in the scans of the reference, relative to the SOP",
+        comment="units are those in parameter_unit; change is not corrected for it",
+    ),
+    Variable(
         "shared_parameter_line_tilt_variance", ("parameter",), "f8",
         "variance of the tilt of each group of scan lines in excess of the parameter",
         comment="units are squares of parameter_unit",
@@ -199,6 +204,7 @@ def _write(
         if all(dim in file.dimensions for dim in spec.dims):
             create_variable(file, spec, series, 1)
     if shared is not None:
+        file["shared_parameter"][:] = shared.estimate
         file["shared_parameter_covariance"][:] = shared.covariance
         file["shared_parameter_line_tilt_variance"][:] = shared.line_tilt_variance
 
@@ -323,9 +329,12 @@ def _reference_from_file(file: h5py.File, path: Path, series: Series) -> Referen
             tuple(decode_parameters(read_variable(file, name)))
             for name in ("parameter_name", "parameter_unit")
         )
+        estimate = np.zeros(len(names))
+        if "shared_parameter" in file:  # absent from references of early versions
+            estimate = np.asarray(file["shared_parameter"][:], dtype=np.float64)
         covariance = np.asarray(file["shared_parameter_covariance"][:], dtype=np.float64)
         line_tilt_variance = np.asarray(file["shared_parameter_line_tilt_variance"][:], dtype=np.float64)
-        shared = SharedParameters(names, units, np.zeros(len(names)), covariance, line_tilt_variance)
+        shared = SharedParameters(names, units, estimate, covariance, line_tilt_variance)
     rasters: dict[str, Any] = {
         field: LazyRaster(path, name, transform) for field, name, transform in _RASTER_FIELDS if name in file
     }

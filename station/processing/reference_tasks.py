@@ -47,6 +47,7 @@ from station.science.gridding.reference_surface import build_surface, centre_ref
 from station.science.gridding.scan_stack import ScanStack
 from station.science.gridding.viewing_geometry import ViewingGeometry
 from station.science.gridding.viewpoints import seen_from_viewpoints
+from station.science.uncertainty.propagation import condense_rows
 
 UPDATE_FACTOR = 4  # each version needs four times the scans of the previous one
 MAX_UPDATE_SCANS = 32  # scans read for one update
@@ -103,6 +104,7 @@ def _build_and_store(site: Site, scans: list[ScanFile], version: str, progress: 
     geometry = stacked[-1].inputs.geometry
     components = _estimate_components(surface.components, stacked)
     reference = centre_reference(surface, stack, geometry.position_m, components)
+    reference = _with_mean_state(reference, stacked)
     scan_provenance = tuple(scan.provenance.to_attrs() for scan in stacked)
     write_reference(
         series_for(site),
@@ -165,7 +167,8 @@ def _update_and_store(
         replaces=replaces,
         scan_provenance=tuple(scan.provenance.to_attrs() for scan in stacked),
     )
-    write_reference(series, update_reference(base, stack, position_m, version, components), provenance)
+    updated = update_reference(base, stack, position_m, version, components)
+    write_reference(series, _with_mean_state(updated, stacked), provenance)
     return stacked[-1].inputs.geometry
 
 
@@ -203,6 +206,19 @@ def _warm_cache(site: Site, version: str, geometry: ScanGeometry) -> None:
     reference = open_reference(series_for(site), version)
     if reference is not None:
         load_viewing_geometry(site, geometry, reference)
+
+
+def _with_mean_state(reference: Reference, stacked: list[_StackedScan]) -> Reference:
+    """Return a reference with the mean state of the scanner in its scans, from where beams are said to move.
+
+    The same reference without adjustments, and if the scanner was relocated between the scans.
+    """
+    shared, adjustments = reference.shared, [scan.adjusted[1] for scan in stacked if scan.adjusted]
+    if shared is None or not adjustments or any(a.params.names != shared.names for a in adjustments):
+        return reference
+    estimate = np.mean([adjustment.estimate for adjustment in adjustments], axis=0)
+    estimate = condense_rows(adjustments[0].params, estimate[:, None])[:, 0]
+    return replace(reference, shared=replace(shared, estimate=estimate))
 
 
 def _estimate_components(components: VarianceComponents, stacked: list[_StackedScan]) -> VarianceComponents:

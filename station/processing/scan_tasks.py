@@ -233,7 +233,7 @@ def _compute_epoch(
     components = usual_motion(reference, start.timestamp()) if reference else VarianceComponents()
     shared, factors = inputs.log_only_shared(components), UNIT_FACTORS
     if adjustment is not None and viewing is not None:
-        shared = adjustment[1].to_shared_parameters(stable_sampling_ratio(viewing))
+        shared = adjustment[1].to_shared_parameters(stable_sampling_ratio(viewing), viewing.reference.shared)
         shared = inputs.with_errors_of_positions(shared, components)
         if not inputs.geometry.published_budget:
             factors = variance_factors(gridder, inputs.geometry, viewing, adjustment, shared)

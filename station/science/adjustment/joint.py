@@ -8,6 +8,7 @@ Source: equations.md, 6.3; adjustment.md, 5.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -40,7 +41,8 @@ MAX_MOVING_EXCESS_M = 1.0  # upper bound for moving patches
 # Of the response of ground to a motion of the beams, over its sampling ratio: on fractal relief the median
 # response of cells is 5 % too small where their ratio is a third, the mean 2 % too large. Larger ratios do
 # not make the response of many cells together more uncertain than the bound.
-RESPONSE_ERROR, MAX_RESPONSE_ERROR = 0.15, 0.03
+RESPONSE_ERROR, MAX_RESPONSE_ERROR = 0.15, 0.04
+MAX_RESPONSE_TILT_RAD = math.radians(0.01)  # beyond, shots jump to the next face as often as they slide
 MAX_GROUP_SIZE = 40.0  # patches that share one error
 HEADING_CLOCKWISE = np.array([1.0, 1.0, -1.0])  # against a rotation about up
 
@@ -94,17 +96,21 @@ class Adjustment:
         """Posterior covariance (u, u) of the estimate."""
         return self.posterior.line_covariance()
 
-    def to_shared_parameters(self, sampling_ratio: float = 0.0) -> SharedParameters:
+    def to_shared_parameters(
+        self, sampling_ratio: float = 0.0, reference: SharedParameters | None = None
+    ) -> SharedParameters:
         """Return the estimate and its covariance on knots, for the store.
 
         `sampling_ratio` is the mean of that of stable cells (`reference_cells.sampling_ratio`): rough ground
-        responds to a motion of the beams that the points lack by a little more or less than modelled.
-        Source: equations.md, 6.8.
+        responds to a motion of the beams against those of the `reference` by a little more or less than
+        modelled. Source: equations.md, 6.8.
         """
         shared = self.posterior.to_shared_parameters(self.estimate)
         response_error = min(RESPONSE_ERROR * sampling_ratio, MAX_RESPONSE_ERROR)
         motion = shared.estimate.copy()
-        motion[:3] = self.unapplied_rad * HEADING_CLOCKWISE
+        if reference is not None and reference.names == shared.names:
+            motion -= reference.estimate
+        motion[:2] *= min(1.0, MAX_RESPONSE_TILT_RAD / max(float(np.hypot(*motion[:2])), 1e-12))
         beam = np.where(self.params.moves_beam, response_error * motion, 0.0)
         return replace(shared, covariance=shared.covariance + np.outer(beam, beam))
 

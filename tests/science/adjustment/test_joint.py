@@ -356,6 +356,38 @@ def test_log_without_ground_gives_its_tilt_with_the_uncertainty_of_the_sensor():
     assert adjustment_warnings(adjustment, COMPONENTS) == ["no stable ground observed"]
 
 
+@pytest.mark.parametrize(
+    ("tilt_deg", "reference_deg", "ratio", "expected_m"),
+    [
+        (0.004, 0.0, 0.5, 0.04 * 1500 * 0.004 / 57.29578),
+        (0.004, 0.004, 0.5, 0.0),  # the beams are where those of the reference were
+        (0.004, -0.004, 0.1, 0.15 * 0.1 * 1500 * 0.008 / 57.29578),
+        (
+            0.060,
+            0.0,
+            0.5,
+            0.04 * 1500 * 0.010 / 57.29578,
+        ),  # beyond 0.01 degree shots jump as often as they slide
+    ],
+)
+def test_rough_ground_adds_its_response_to_a_tilt_against_the_reference(
+    tilt_deg, reference_deg, ratio, expected_m
+):
+    ahead = tuple(np.array([value]) for value in (0.0, 1500.0, -200.0))
+    cells = Sites(np.zeros(1, int), np.zeros(1, int), ahead, np.zeros(1), np.zeros(1))
+    adjustment = adjust_scan(no_patches(), NO_TILT, knot_prior(PARAMS), None)
+    state = np.zeros_like(adjustment.estimate)
+    state[0] = math.radians(tilt_deg)
+    adjustment = replace(adjustment, estimate=state)
+    plain = adjustment.to_shared_parameters()
+    reference = replace(
+        plain, estimate=np.where(np.arange(len(PARAMS.names)) == 0, np.radians(reference_deg), 0)
+    )
+    rough = adjustment.to_shared_parameters(ratio, reference)
+    added_m2 = cells.jacobian().variance(rough) - cells.jacobian().variance(plain)
+    assert np.sqrt(added_m2) == pytest.approx(expected_m, rel=0.02, abs=1e-6)
+
+
 def reference_of(sigma_rad):
     """Shared parameters of a reference with errors in tilt only, global and from knot to knot."""
     names, tilt_slice = PARAMS.names, slice(GLOBAL_COUNT, GLOBAL_COUNT + PARAMS.sight_tilt_knots)
