@@ -103,10 +103,8 @@ def read_found(series: Series) -> Found:
 
 def write_found(series: Series, found: Found) -> None:
     """Keep what was found; skipped without an error if the disk is full."""
-    path, keys = (
-        series.folder / FOUND_NAME,
-        "".join(found.keys),
-    )  # one text: reading a list takes ten times as long
+    path = series.folder / FOUND_NAME
+    keys = "".join(found.keys)  # one text: reading a list takes ten times as long
     content = {"format": FORMAT, "scans": found.scans, "keys": keys, "values": found.values}
     with suppress(StoreError), atomic_write(path) as tmp_path:
         tmp_path.write_text(to_checked_json(content), encoding="ascii")

@@ -42,7 +42,7 @@ MAX_MOVING_EXCESS_M = 1.0  # upper bound for moving patches
 # response of cells is 5 % too small where their ratio is a third, the mean 2 % too large. Larger ratios do
 # not make the response of many cells together more uncertain than the bound.
 RESPONSE_ERROR, MAX_RESPONSE_ERROR = 0.15, 0.04
-MAX_RESPONSE_TILT_RAD = math.radians(0.01)  # beyond, shots jump to the next face as often as they slide
+MAX_RESPONSE_TILT_RAD = math.radians(0.01)  # beyond, shots are taken to jump as often as they slide
 MAX_GROUP_SIZE = 40.0  # patches that share one error
 HEADING_CLOCKWISE = np.array([1.0, 1.0, -1.0])  # against a rotation about up
 
