@@ -1,5 +1,6 @@
 """Processing of scans with missing or faulty inputs: verdict, reasons, sigma, or an error."""
 
+import math
 import re
 import shutil
 from contextlib import nullcontext
@@ -127,6 +128,36 @@ def test_missing_log_increases_the_tilt_sigma(folder):
     assert result.verdict == "degraded"
     assert "inclination log missing" in result.reason
     assert sigma[0] > 3 * sigma_with_log[0]
+
+
+@pytest.mark.integration
+def test_response_of_rough_ground_counts_from_the_state_in_the_scans_of_the_reference(folder):
+    """Its variance is a parabola of that state with the estimate as its vertex (equations.md, 6.8)."""
+    site = edited_site(folder)
+    scans = [scan_file(site, path) for path in sorted(site.scans.inbox.glob("*.laz"))]
+    reference_tasks.build_reference_version(site, scans, "1", lambda: None)
+    path = site.station.data / "reference_1.nc"
+    with netCDF4.Dataset(path) as file:
+        stored = file["shared_parameter"][:].data
+    assert np.hypot(*stored[:2]) > 0
+
+    def tilt_variance(state_rad):
+        with netCDF4.Dataset(path, "a") as file:
+            file["shared_parameter"][0] = state_rad
+        result, sigma = process(folder)
+        epoch = site.station.data / result.epoch
+        with netCDF4.Dataset(epoch) as file:
+            estimate_rad = float(file["shared_parameter"][0, 0])
+        epoch.unlink()  # else it is that of an identical scan, which is not stored again
+        return sigma[0] ** 2, estimate_rad
+
+    step_rad = math.radians(0.004)
+    offsets_rad = (-step_rad, 0.0, step_rad)
+    (below, _), (here, estimate_rad), (above, _) = (tilt_variance(stored[0] + each) for each in offsets_rad)
+    curvature = (above - 2 * here + below) / step_rad**2
+    vertex_rad = stored[0] - (above - below) / (2 * step_rad) / curvature
+    assert 1e-5 < curvature / 2 <= 0.04**2
+    assert vertex_rad == pytest.approx(estimate_rad, abs=0.02 * step_rad)
 
 
 def change_log(folder, change):
