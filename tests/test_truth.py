@@ -1,5 +1,6 @@
 """Simulated stations with a known truth: errors of the pipeline and calibration of its uncertainty."""
 
+import shutil
 from collections import defaultdict
 from dataclasses import replace
 
@@ -36,14 +37,15 @@ class ProcessedStation:
     """A simulated station, processed, optionally with changes of its site file."""
 
     def __init__(self, folder, *changes, first=REFERENCE):
+        self.folder, name = folder, "site"
         if changes:
+            name = f"other-{len(list(folder.glob('*.toml')))}"
             text = (folder / "site.toml").read_text()
-            for old, new in (*changes, ('data = "data"', 'data = "other"')):
+            for old, new in (*changes, ('data = "data"', f'data = "{name}"')):
                 assert old in text
                 text = text.replace(old, new)
-            (folder / "other.toml").write_text(text)
-        self.folder = folder
-        self.site = read_site(folder / ("other.toml" if changes else "site.toml"))
+            (folder / f"{name}.toml").write_text(text)
+        self.site = read_site(folder / f"{name}.toml")
         scans = []
         for path in sorted(self.site.scans.inbox.glob("*.laz")):
             log = path.with_name(f"{path.stem}-incl.txt")
@@ -129,16 +131,14 @@ def test_filtered_inclination_removes_two_thirds_of_the_drift(tmp_path):
 
 
 @pytest.mark.slow
-def test_sigma_covers_errors_that_the_log_does_not_measure(tmp_path):
+def test_sigma_covers_errors_that_the_log_does_not_measure(unadjusted):
     """Filtered log without adjustment, all errors on: within two sigma in 90 % of boxes."""
-    simulate(tmp_path / "station", CALM)
-    processed = ProcessedStation(tmp_path / "station", FILTERED)
-    error, sigma, distance_m = processed.boxes()
+    error, sigma, distance_m = unadjusted.boxes()
     for near, far in ((0, 1500), (1500, 2500), (2500, 5000)):
         inside = (distance_m >= near) & (distance_m < far)
         assert np.mean(np.abs(error[inside]) < 2 * sigma[inside]) > 0.9
         assert sigma[inside].mean() < 0.6
-    assert {result.verdict for result in processed.results} == {"good"}
+    assert {result.verdict for result in unadjusted.results} == {"good"}
 
 
 @pytest.fixture(scope="module")
@@ -146,6 +146,20 @@ def calm(tmp_path_factory):
     folder = tmp_path_factory.mktemp("calm") / "station"
     simulate(folder, CALM)
     return ProcessedStation(folder)
+
+
+@pytest.fixture(scope="module")
+def unadjusted(calm):
+    return ProcessedStation(calm.folder, FILTERED)
+
+
+def copy_of_inputs(folder, copy):
+    return shutil.copytree(folder, copy, ignore=shutil.ignore_patterns("data", "other-*"))
+
+
+@pytest.fixture
+def calm_folder(calm, tmp_path):
+    return copy_of_inputs(calm.folder, tmp_path / "station")
 
 
 def test_adjustment_is_as_accurate_as_manual_registration(calm):
@@ -232,24 +246,29 @@ def test_area_changes_are_stored_with_every_epoch(calm):
         assert (areas.mean_change_uncertainty < 0.02).all()
 
 
+@pytest.fixture(scope="module")
+def snowfall(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("snowfall") / "station"
+    simulate(folder, replace(CALM, snowfall_m=0.4, snow_hours=(2.5, 4.0)))
+    return folder
+
+
 @pytest.mark.slow
-def test_snow_on_stable_ground_is_not_adjusted_as_tilt(tmp_path):
+def test_snow_on_stable_ground_is_not_adjusted_as_tilt(snowfall):
     """0.4 m of patchy snow on everything below 40-50°, on rock too."""
-    scenario = replace(CALM, snowfall_m=0.4, snow_hours=(2.5, 4.0))
-    simulate(tmp_path / "station", scenario)
-    processed = ProcessedStation(tmp_path / "station")
+    processed = ProcessedStation(snowfall)
     error, _, _ = processed.boxes()
     assert np.sqrt(np.mean(error**2)) < 0.05
     assert processed.series.change_step.values[-1] > 0.05
-    fixed, _, _ = ProcessedStation(tmp_path / "station", FILTERED).boxes()
+    fixed, _, _ = ProcessedStation(snowfall, FILTERED).boxes()
     assert np.sqrt(np.mean(error**2)) < 0.7 * np.sqrt(np.mean(fixed**2))
 
 
 @pytest.mark.slow
 @pytest.mark.xfail(strict=True, reason="sigma is too large: z is 0.56")
-def test_snow_on_stable_ground_without_brightness_is_within_sigma(tmp_path):
+def test_snow_on_stable_ground_without_brightness_is_within_sigma(snowfall, tmp_path):
     """The same snowfall in scans whose intensity is zero: only steep rock is stable."""
-    simulate(tmp_path / "station", replace(CALM, snowfall_m=0.4, snow_hours=(2.5, 4.0)))
+    copy_of_inputs(snowfall, tmp_path / "station")
     for path in (tmp_path / "station" / "inbox").glob("*.laz"):
         las = laspy.read(path)
         las.intensity[:] = 0
@@ -311,9 +330,8 @@ def test_avalanche_deposit_keeps_its_height(tmp_path):
         ),
     ],
 )
-def test_missing_input_is_reported_and_included_in_sigma(tmp_path, damage, reason):
-    folder = tmp_path / "station"
-    simulate(folder, CALM)
+def test_missing_input_is_reported_and_included_in_sigma(calm_folder, damage, reason):
+    folder = calm_folder
     if damage == "log":
         for path in sorted((folder / "inbox").glob("*-incl.txt"))[REFERENCE:]:
             path.unlink()
@@ -332,14 +350,16 @@ def test_missing_input_is_reported_and_included_in_sigma(tmp_path, damage, reaso
 
 
 @pytest.fixture(scope="module")
-def z_of_others(tmp_path_factory):
+def z_of_stations(calm, unadjusted, tmp_path_factory):
     """Standardised errors of stations with other weather, motion and sensor errors, by method and scale."""
     z = defaultdict(list)
     for seed in SEEDS:
-        folder = tmp_path_factory.mktemp("other") / "station"
-        simulate(folder, replace(CALM, seed=seed))
-        for method, changes in (("joint", []), ("none", [FILTERED])):
-            processed = ProcessedStation(folder, *changes)
+        stations = {"joint": calm, "none": unadjusted}
+        if seed != CALM.seed:
+            folder = tmp_path_factory.mktemp("other") / "station"
+            simulate(folder, replace(CALM, seed=seed))
+            stations = {"joint": ProcessedStation(folder), "none": ProcessedStation(folder, FILTERED)}
+        for method, processed in stations.items():
             error, sigma, _ = processed.boxes()
             assert rms(error) < (0.03 if method == "joint" else 0.5)
             cells = processed.error() / processed.series.elevation_change_uncertainty.values
@@ -369,9 +389,9 @@ def sigma_too_large(value):
         pytest.param("none", "area", marks=pytest.mark.xfail(strict=False, reason="near 0.6")),
     ],
 )
-def test_sigma_is_calibrated_over_five_stations(z_of_others, method, scale):
+def test_sigma_is_calibrated_over_five_stations(z_of_stations, method, scale):
     """At most a quarter off; 15 scans have 15 errors and rates of areas, for which bounds are wider."""
-    z = z_of_others[method, scale]
+    z = z_of_stations[method, scale]
     spread = 1.4826 * np.median(np.abs(z)) if scale == "cell" else rms(z)
     low, high = (0.6, 1.5) if scale in {"area", "rate"} else (0.8, 1.25)
     assert low < spread < high
@@ -420,11 +440,12 @@ def test_log_clock_offset_is_estimated_and_stored(calm):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("method", ["joint", "none"])
-def test_log_five_seconds_late_is_within_sigma_and_reported_in_wind(tmp_path, method):
+def test_log_five_seconds_late_is_within_sigma_and_reported_in_wind(tmp_path, calm_folder, method):
     """In calm air the offset is too small to detect or to matter; with gusts the ground shows it."""
-    folder = tmp_path / "station"
-    scenario = replace(CALM, hours=REFERENCE + 6, wind_sway_deg=0.004) if method == "joint" else CALM
-    simulate(folder, scenario)
+    folder, scenario = calm_folder, CALM
+    if method == "joint":
+        folder, scenario = tmp_path / "windy", replace(CALM, hours=REFERENCE + 6, wind_sway_deg=0.004)
+        simulate(folder, scenario)
     for path in sorted((folder / "inbox").glob("*-incl.txt"))[REFERENCE:]:
         head, *rows = path.read_text().splitlines()
         late = (f"{float(row.split(',')[0]) + 5:.4f},{row.split(',', 1)[1]}" for row in rows)
