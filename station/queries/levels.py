@@ -12,9 +12,9 @@ from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from itertools import groupby
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
-import xarray as xr
 
 from station.archive.derived.level_files import (
     LEVEL_NAMES,
@@ -40,6 +40,9 @@ from station.quantities import Bools, Floats32
 from station.queries.blocks import BlockQueries
 from station.queries.epoch_cells import EpochReader, bounding_box
 from station.queries.level_filter import DAY_S, LevelFilter
+
+if TYPE_CHECKING:
+    import xarray as xr
 
 FORMAT = 2  # of the filter: another one computes all files again
 RECENT_DAYS = 3  # whose states are kept, besides those of the last days of months
@@ -277,6 +280,8 @@ def _read_window(path: Path, window: tuple[slice, slice]) -> dict[str, Floats32]
 def _to_dataset(
     series: Series, cells: Bools, periods: list[LevelPeriod], rasters: Iterator[dict[str, Floats32]]
 ) -> xr.Dataset:
+    import xarray as xr  # noqa: PLC0415 - the service does not need it
+
     rows, columns = bounds = bounding_box(cells, 0)
     inside = cells[bounds]
     time = np.array([round(period.time_s * 1000) for period in periods], "M8[ms]").astype("M8[ns]")
