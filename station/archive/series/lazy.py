@@ -20,7 +20,7 @@ from xarray.core.indexing import (
 
 from station.archive.chunk_codec import ChunkReader
 from station.archive.derived.computed_rasters import CHANGE, OUTSIDE, is_value
-from station.archive.netcdf_layout import CHUNK, decode_text
+from station.archive.netcdf_layout import CHUNK, EXTENTS, decode_text
 from station.archive.raster_io import Array
 from station.archive.read_errors import read_errors
 from station.archive.schema import BY_NAME
@@ -65,6 +65,7 @@ def open_virtual(path: Path, chunks: Chunks = None) -> xr.Dataset:
             chunks = PREFERRED_CHUNKS | dict(chunks)
         rasters = xr.open_dataset(store, decode_timedelta=False, chunks=chunks, drop_variables=small)
         ds = ds.assign(rasters.data_vars)
+    ds = ds.drop_vars(EXTENTS, errors="ignore")  # of the whole grid: wrong for a part of it
     ds = ds.set_coords([name for name in COORDINATES if name in ds])
     ds.encoding["source"] = str(path.resolve())
     comment = ds.attrs.pop("comment", "")  # what is written is not virtual
