@@ -6,6 +6,7 @@ Source: Attribute Convention for Data Discovery 1.3 (ESIP).
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from datetime import UTC, datetime, timedelta
 from functools import lru_cache
@@ -17,6 +18,7 @@ from pyproj import CRS, Transformer
 from station._version import __version__
 from station.quantities import Grid
 
+NO_HEIGHTS = (math.nan, math.nan)
 DENSIFY_POINTS = 21  # of each edge of the grid, which is curved in degrees
 _STAMP = "%Y-%m-%dT%H:%M:%SZ"
 
@@ -67,13 +69,13 @@ def extent(grid: Grid, crs: str | None) -> dict[str, str | float]:
     }
 
 
-def read_heights(reference: Path) -> tuple[float, float] | None:
-    """Return the smallest and the largest height [m] that the file of a reference states; None without."""
+def read_heights(reference: Path) -> tuple[float, float]:
+    """Return the smallest and the largest height [m] that the file of a reference states; NaN without."""
     try:
         with h5py.File(reference, "r") as file:
             low_m, high_m = (file.attrs[f"geospatial_vertical_{end}"].item() for end in ("min", "max"))
     except (OSError, RuntimeError, KeyError):
-        return None
+        return NO_HEIGHTS
     return float(low_m), float(high_m)
 
 

@@ -107,7 +107,7 @@ def create_file(
     """Write dimensions, coordinates and metadata; no time dimension if `times` is None.
 
     `parameters` are the names and units of the shared parameters, `heights_m` the smallest and the largest
-    height, by default those of the newest reference.
+    height, by default those of the newest reference; NaN if there are none.
     """
     write_global_attrs(file, series, title, heights_m)
     if times is not None:
@@ -130,7 +130,7 @@ def write_global_attrs(
     name = series.name or series.station_id
     extent = dict(discovery.extent(series.grid, series.crs))
     heights_m = heights_m or discovery.read_heights(series.folder / "reference.nc")
-    if heights_m is not None:
+    if np.isfinite(heights_m).all():
         extent |= {"geospatial_vertical_min": heights_m[0], "geospatial_vertical_max": heights_m[1]}
     file.setncatts(
         {

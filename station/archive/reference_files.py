@@ -15,7 +15,7 @@ import netCDF4
 import numpy as np
 
 from station.archive.atomic_files import atomic_write
-from station.archive.discovery import time_coverage
+from station.archive.discovery import NO_HEIGHTS, time_coverage
 from station.archive.netcdf_layout import (
     RENAMED_PARAMETERS,
     Series,
@@ -210,11 +210,11 @@ def _write(
         file["shared_parameter_line_tilt_variance"][:] = shared.line_tilt_variance
 
 
-def _heights_m(reference: Reference) -> tuple[float, float] | None:
-    """Return the smallest and the largest height of the surface as stored [m]; None if none is known."""
+def _heights_m(reference: Reference) -> tuple[float, float]:
+    """Return the smallest and the largest height of the surface as stored [m]; NaN if none is known."""
     known_m = reference.elevation_m[np.isfinite(reference.elevation_m)]
     if not known_m.size:
-        return None
+        return NO_HEIGHTS
     low_m, high_m = rounded(_VARIABLES[0], np.array([known_m.min(), known_m.max()]))
     return float(low_m), float(high_m)
 
