@@ -6,15 +6,19 @@ Source: Attribute Convention for Data Discovery 1.3 (ESIP).
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from datetime import UTC, datetime, timedelta
 from functools import lru_cache
+from pathlib import Path
 
+import h5py
 from pyproj import CRS, Transformer
 
 from station._version import __version__
 from station.quantities import Grid
 
+NO_HEIGHTS = (math.nan, math.nan)
 DENSIFY_POINTS = 21  # of each edge of the grid, which is curved in degrees
 _STAMP = "%Y-%m-%dT%H:%M:%SZ"
 
@@ -63,6 +67,16 @@ def extent(grid: Grid, crs: str | None) -> dict[str, str | float]:
         "geospatial_vertical_positive": "up",
         "geospatial_vertical_units": "m",
     }
+
+
+def read_heights(reference: Path) -> tuple[float, float]:
+    """Return the smallest and the largest height [m] that the file of a reference states; NaN without."""
+    try:
+        with h5py.File(reference, "r") as file:
+            low_m, high_m = (file.attrs[f"geospatial_vertical_{end}"].item() for end in ("min", "max"))
+    except (OSError, RuntimeError, KeyError):
+        return NO_HEIGHTS
+    return float(low_m), float(high_m)
 
 
 def time_coverage(start_s: float, end_s: float) -> dict[str, str]:

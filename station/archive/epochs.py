@@ -23,9 +23,10 @@ from station.archive.derived.computed_rasters import (
     is_value,
     other_part,
 )
-from station.archive.discovery import time_coverage
+from station.archive.discovery import read_heights, time_coverage
 from station.archive.netcdf_layout import Series, create_file, create_variable, decode_text, encode_text
 from station.archive.raster_io import Array, rounded, write_rasters
+from station.archive.reference_files import version_path
 from station.archive.schema import BY_NAME, FILL, TERMS, VARIABLES, VERDICTS
 from station.archive.small_variables import write_epochs
 from station.errors import StoreError
@@ -237,7 +238,8 @@ def _create(file: netCDF4.Dataset, series: Series, epoch: Epoch, values: Mapping
     shared = epoch.shared
     parameters = (shared.names, shared.units) if shared is not None else ((), ())
     title = f"Elevation change at {series.name or series.station_id}, one scan"
-    create_file(file, series, title, 1, parameters)
+    measured_from = version_path(series, epoch.provenance.get("reference_version", ""))
+    create_file(file, series, title, 1, parameters, read_heights(measured_from))
     file.setncatts(time_coverage(epoch.start_s, epoch.end_s))
     names = values.keys() | _measurement_variables(epoch.measurement)
     for spec in VARIABLES:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -23,6 +23,34 @@ CONVENTIONS = "CF-1.11, ACDD-1.3"
 ENCODING = "utf-8"  # of texts; older files declare ascii, a subset
 SCANNER_ATTRIBUTE = "scanner"  # specifications as JSON
 UNCERTAINTY_ATTRIBUTE = "uncertainty_variables"
+ELLIPSOIDAL = "EPSG:4979"  # heights above the ellipsoid of WGS84
+EXTENTS = {  # variables: axis in the names of ACDD's attributes, attributes of the variable
+    "longitude_extent": (
+        "lon",
+        {
+            "standard_name": "longitude",
+            "long_name": "western and eastern end of the grid",
+            "units": "degrees_east",
+        },
+    ),
+    "latitude_extent": (
+        "lat",
+        {
+            "standard_name": "latitude",
+            "long_name": "southern and northern end of the grid",
+            "units": "degrees_north",
+        },
+    ),
+    "height_extent": (
+        "vertical",
+        {
+            "long_name": "lowest and highest point of the reference",
+            "units": "m",
+            "positive": "up",
+            "axis": "Z",
+        },
+    ),
+}
 RENAMED_PARAMETERS = {"refraction_moving": "refraction_ice"}  # older names of shared parameters
 
 
@@ -42,11 +70,20 @@ class Series:
     cf_uncertainty: bool = False  # write the attributes of CF's draft on uncertainty
 
     @property
+    def vertical_crs(self) -> str | None:
+        """What heights are above: a named geoid or vertical CRS, else the ellipsoid; None on a local map."""
+        if self.crs is None:
+            return None
+        crs = CRS.from_user_input(self.crs)
+        if self.vertical_datum or not crs.is_compound:
+            return self.vertical_datum or ELLIPSOIDAL
+        vertical = crs.sub_crs_list[1]
+        return ":".join(vertical.to_authority() or (vertical.name,))
+
+    @property
     def has_ellipsoidal_heights(self) -> bool:
-        """True if heights are above the ellipsoid of the CRS: no geoid and no vertical CRS is named."""
-        if self.crs is None or self.vertical_datum:
-            return False
-        return not CRS.from_user_input(self.crs).is_compound
+        """True if heights are above the ellipsoid of the CRS."""
+        return self.vertical_crs == ELLIPSOIDAL
 
     @property
     def path(self) -> Path:
@@ -65,12 +102,14 @@ def create_file(
     title: str,
     times: int | None,
     parameters: tuple[tuple[str, ...], tuple[str, ...]] = ((), ()),
+    heights_m: tuple[float, float] | None = None,
 ) -> None:
     """Write dimensions, coordinates and metadata; no time dimension if `times` is None.
 
-    `parameters` are the names and units of the shared parameters.
+    `parameters` are the names and units of the shared parameters, `heights_m` the smallest and the largest
+    height, by default those of the newest reference; NaN if there are none.
     """
-    write_global_attrs(file, series, title)
+    write_global_attrs(file, series, title, heights_m)
     if times is not None:
         file.createDimension("time", None)
     for axis, coordinate in (("y", series.grid.y_m), ("x", series.grid.x_m)):
@@ -84,9 +123,15 @@ def create_file(
     _create_parameter_names(file, *parameters)
 
 
-def write_global_attrs(file: netCDF4.Dataset, series: Series, title: str) -> None:
-    """Write the global attributes: conventions, title, station, origin and extent."""
+def write_global_attrs(
+    file: netCDF4.Dataset, series: Series, title: str, heights_m: tuple[float, float] | None = None
+) -> None:
+    """Write conventions, title, station, origin and extent; the extent also as variables."""
     name = series.name or series.station_id
+    extent = dict(discovery.extent(series.grid, series.crs))
+    heights_m = heights_m or discovery.read_heights(series.folder / "reference.nc")
+    if np.isfinite(heights_m).all():
+        extent |= {"geospatial_vertical_min": heights_m[0], "geospatial_vertical_max": heights_m[1]}
     file.setncatts(
         {
             "Conventions": CONVENTIONS,
@@ -95,11 +140,24 @@ def write_global_attrs(file: netCDF4.Dataset, series: Series, title: str) -> Non
             "station_id": series.station_id,
             "station_name": name,
             **discovery.descriptive_attributes(name, series.institution, dict(series.metadata)),
-            **discovery.extent(series.grid, series.crs),
-            **({"geospatial_bounds_vertical_crs": "EPSG:4979"} if series.has_ellipsoidal_heights else {}),
+            **extent,
+            **({"geospatial_bounds_vertical_crs": series.vertical_crs} if series.vertical_crs else {}),
             **_scanner_attributes(series.scanner),
         }
     )
+    _write_extent(file, extent)
+
+
+def _write_extent(file: netCDF4.Dataset, extent: Mapping[str, str | float]) -> None:
+    """Write the extent as variables: ACDD's checker finds no degrees and no heights in projected rasters."""
+    if "extent" not in file.dimensions:  # not bnds: CDO would take it for a vertical axis
+        file.createDimension("extent", 2)
+    for name, (axis, attrs) in EXTENTS.items():
+        if f"geospatial_{axis}_min" not in extent:
+            continue
+        if name not in file.variables:
+            file.createVariable(name, "f8", ("extent",)).setncatts(attrs)
+        file[name][:] = [extent[f"geospatial_{axis}_{end}"] for end in ("min", "max")]
 
 
 def _scanner_attributes(scanner: Scanner | None) -> dict[str, str]:

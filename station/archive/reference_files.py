@@ -15,7 +15,7 @@ import netCDF4
 import numpy as np
 
 from station.archive.atomic_files import atomic_write
-from station.archive.discovery import time_coverage
+from station.archive.discovery import NO_HEIGHTS, time_coverage
 from station.archive.netcdf_layout import (
     RENAMED_PARAMETERS,
     Series,
@@ -186,7 +186,8 @@ def _write(
     """Write everything but the values of the rasters, whose variables are created."""
     shared = reference.shared
     parameters = (shared.names, shared.units) if shared is not None else ((), ())
-    create_file(file, series, f"Reference surface of {series.name or series.station_id}", None, parameters)
+    title = f"Reference surface of {series.name or series.station_id}"
+    create_file(file, series, title, None, parameters, _heights_m(reference))
     file.setncatts({"reference_version": reference.version, "scan_ids": " ".join(reference.scan_ids)})
     file.setncattr("mean_time", reference.time_s)
     file.setncatts({"base": provenance.base, "science_hash": provenance.science_hash})
@@ -207,6 +208,15 @@ def _write(
         file["shared_parameter"][:] = shared.estimate
         file["shared_parameter_covariance"][:] = shared.covariance
         file["shared_parameter_line_tilt_variance"][:] = shared.line_tilt_variance
+
+
+def _heights_m(reference: Reference) -> tuple[float, float]:
+    """Return the smallest and the largest height of the surface as stored [m]; NaN if none is known."""
+    known_m = reference.elevation_m[np.isfinite(reference.elevation_m)]
+    if not known_m.size:
+        return NO_HEIGHTS
+    low_m, high_m = rounded(_VARIABLES[0], np.array([known_m.min(), known_m.max()]))
+    return float(low_m), float(high_m)
 
 
 def _raster_rows(reference: Reference, rows: slice) -> list[np.ndarray[Any, Any]]:

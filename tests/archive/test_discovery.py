@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 from pyproj import Transformer
+from support.epochs import write_surface
 
 import station
 from station.archive import epochs
@@ -93,3 +94,29 @@ def test_heights_are_above_the_ellipsoid_unless_a_geoid_is_named(series, epoch, 
         assert set(file["elevation_change"].ancillary_variables.split()) <= file.variables.keys()
     with station.open(other.folder) as ds:
         assert ds.elevation.standard_name == name
+
+
+@pytest.mark.parametrize(
+    ("crs", "datum", "expected"),
+    [
+        ("EPSG:32632", "", "EPSG:4979"),
+        ("EPSG:32632", "EGM2008 geoid", "EGM2008 geoid"),
+        ("EPSG:25832+5783", "", "EPSG:5783"),  # DHHN92 height
+        (None, "", None),
+    ],
+)
+def test_vertical_crs_is_the_ellipsoid_unless_another_is_named(series, crs, datum, expected):
+    described = replace(series, crs=crs, vertical_datum=datum)
+    assert described.vertical_crs == expected
+    assert described.has_ellipsoidal_heights == (expected == "EPSG:4979")
+
+
+def test_a_file_before_the_first_reference_has_no_height_extent(series, epoch):
+    paths = [epochs.write_epoch(series, epoch(0)).path]
+    write_surface(series)
+    paths.append(epochs.write_epoch(series, epoch(1)).path)
+    found = []
+    for path in paths:
+        with netCDF4.Dataset(path) as file:
+            found.append("height_extent" in file.variables)
+    assert found == [False, True]

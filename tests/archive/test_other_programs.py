@@ -12,11 +12,11 @@ import pytest
 import shapely
 import xarray as xr
 from support.programs import (
-    assert_acdd_misses_only_what_is_not_computed,
     assert_gdal_knows_the_place,
     filled_metadata,
     findings,
     gdal_value,
+    recommendations,
     run,
     tool,
 )
@@ -47,12 +47,6 @@ def test_compliance_checker_accepts_epoch_series_and_reference(built, tmp_path):
     epoch = built.parent / "epochs/2025/11/21/hef_20251121T010000Z.nc"
     beside = (built.parent / name for name in ("processing.nc", "reference.nc"))
     assert findings(tmp_path / "report.json", built, *beside, epoch) == []
-
-
-def test_data_discovery_checker_misses_only_what_is_not_computed(series, epoch, tmp_path):
-    described = dataclasses.replace(series, metadata=filled_metadata(), vertical_datum="")
-    epochs.write_epoch(described, epoch(0))
-    assert_acdd_misses_only_what_is_not_computed(tmp_path / "report.json", build_series(described))
 
 
 def test_compliance_checker_accepts_compacted_files(built, series, tmp_path):
@@ -237,6 +231,7 @@ def test_rioxarray_reads_the_projection(built):
 @pytest.fixture
 def box_files(series, epoch):
     """`boxes.nc` and `daily.nc` of two epochs of a day, and one of the next."""
+    series = dataclasses.replace(series, metadata=filled_metadata())
     surface = np.full(series.grid.shape, 2800.0)
     reference_files.write_reference(series, Reference.from_elevation(series.grid, "1", surface))
     for hour in (1, 2, 30):
@@ -248,6 +243,19 @@ def box_files(series, epoch):
 
 def test_compliance_checker_accepts_boxes(box_files, tmp_path):
     assert findings(tmp_path / "report.json", *box_files) == []
+
+
+def test_data_discovery_checker_recommends_nothing(box_files, series, tmp_path):
+    """For all kinds of files; it compares the middle of a day in `daily.nc` with the ends of the coverage."""
+    described = dataclasses.replace(series, metadata=filled_metadata())
+    areas = update_areas(
+        described, {"all": np.ones(series.grid.shape, bool)}, ConstantAggregator(), lambda: None
+    )
+    epoch_path = next((series.folder / "epochs").rglob("*.nc"))
+    paths = *box_files, areas, series.path, series.processing_path, epoch_path
+    ((name, check, messages),) = recommendations(tmp_path / "report.json", *paths)
+    assert (name, check) == ("daily.nc", "time_coverage_extents_match")
+    assert all("T12:00:00+00:00 (time" in message for message in messages)
 
 
 def test_other_programs_read_boxes(box_files, tmp_path):

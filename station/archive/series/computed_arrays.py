@@ -25,6 +25,7 @@ from station.archive.derived.computed_rasters import (
     RANDOM,
     SYSTEMATIC,
     ReferenceSurfaces,
+    is_value,
     read_raster,
 )
 from station.archive.raster_io import Array
@@ -66,12 +67,13 @@ class ComputedArrays:
         return variables
 
     def read(self, name: str, key: Key) -> Array:
-        """Return a part of a raster, fill values included."""
+        """Return a part of a raster, with NaN for missing values."""
 
         def read(stored: str) -> Array | None:
             return self._read_stored(stored, key) if stored in self._stored else None
 
-        return read_raster(name, read, lambda: self._surface_m(key))
+        values = read_raster(name, read, lambda: self._surface_m(key))
+        return np.where(is_value(values), values, np.float32(np.nan))
 
     def _surface_m(self, key: Key) -> Array:
         """Return the surface that each epoch's change is counted from [m]; NaN without a reference."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from bisect import bisect_right
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, overload
@@ -124,11 +124,9 @@ class SeriesIndex(Sequence[EpochRef]):
             bounds_s = np.asarray(file["time_bnds"][:], dtype=np.float64)
             self.time_s, self.start_s = middle(bounds_s), bounds_s[:, 0]
             self.epoch_file = read_column(file["epoch_file"]).view(self.epoch_file.dtype)[:, 0]
-            for source in file[CHANGE].virtual_sources():
-                is_whole_file = source.src_space.get_select_type() == h5py.h5s.SEL_ALL
-                file_start = 0 if is_whole_file else source.src_space.get_select_bounds()[0][0]
-                self._file_starts.append(source.vspace.get_select_bounds()[0][0])
-                self._locations.append((series.folder / source.file_name, file_start))
+            for linked in linked_epochs(file, series.folder):
+                self._file_starts.append(linked.series_start)
+                self._locations.append((linked.path, linked.file_start))
 
     @property
     def files(self) -> set[Path]:
@@ -167,13 +165,32 @@ def processing_file(series: Series) -> Path:
     return series.processing_path if series.processing_path.is_file() else series.path
 
 
+@dataclass(frozen=True)
+class LinkedEpochs:
+    """Epochs of a virtual file in one of its sources."""
+
+    path: Path
+    file_start: int  # index of the first epoch in the source
+    series_start: int  # and in the virtual file
+
+
 def source_files(series_path: Path) -> set[Path]:
     """Return the files that a `series.nc` or `processing.nc` refers to; empty if there is no such file."""
     if not series_path.is_file():
         return set()
     with read_errors(series_path), h5py.File(series_path, "r") as file:
-        linked = file[CHANGE if CHANGE in file else "time"]
-        return {series_path.parent / source.file_name for source in linked.virtual_sources()}
+        return {linked.path for linked in linked_epochs(file, series_path.parent)}
+
+
+def linked_epochs(file: h5py.File, folder: Path) -> list[LinkedEpochs]:
+    """Return the sources of an open virtual file in the order of its epochs."""
+    found = []
+    for source in file[CHANGE if CHANGE in file else "time"].virtual_sources():
+        is_whole_file = source.src_space.get_select_type() == h5py.h5s.SEL_ALL
+        file_start = 0 if is_whole_file else source.src_space.get_select_bounds()[0][0]
+        series_start = source.vspace.get_select_bounds()[0][0]
+        found.append(LinkedEpochs(folder / source.file_name, file_start, series_start))
+    return found
 
 
 def data_folder(site_or_folder: str | Path) -> Path:

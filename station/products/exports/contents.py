@@ -15,6 +15,7 @@ import netCDF4
 import numpy as np
 
 from station._version import __version__
+from station.archive.chunk_codec import ChunkReader
 from station.archive.derived.computed_rasters import COMPUTED, ReferenceSurfaces, read_raster
 from station.archive.discovery import time_coverage
 from station.archive.netcdf_layout import UNCERTAINTY_ATTRIBUTE, create_file, create_variable, decode_text
@@ -176,7 +177,9 @@ class PartContents:
                 for index, target in zip(_indices(stored_times), _indices(target_times), strict=True):
                     values[target] = self._compute(source, spec.name, index, window)
             elif spec.name in source.raster_shapes:
-                values[target_times] = self.dataset(source, spec.name)[(stored_times, *window)]
+                reader = self._reader(source, spec.name)
+                for index, target in zip(_indices(stored_times), _indices(target_times), strict=True):
+                    values[target] = reader.read(index, *window)
         return values
 
     def _compute(self, source: EpochSource, name: str, index: int, window: tuple[slice, slice]) -> Array:
@@ -185,11 +188,14 @@ class PartContents:
         def read(stored: str) -> Array | None:
             if stored not in source.raster_shapes:
                 return None
-            return np.asarray(self.dataset(source, stored)[(index, *window)])
+            return self._reader(source, stored).read(index, *window)
 
         versions = source.scalars["reference_version"][index - source.file_start]
         version = decode_text(versions[None])[0]
         return read_raster(name, read, lambda: self._surfaces.height_m(version, *window))
+
+    def _reader(self, source: EpochSource, name: str) -> ChunkReader:
+        return ChunkReader(self.dataset(source, name))
 
     def dataset(self, source: EpochSource, name: str) -> Any:  # noqa: ANN401 - h5py has no types
         """Return a variable of a source as an HDF5 dataset; raise StoreError if it cannot be read."""

@@ -26,6 +26,10 @@ if TYPE_CHECKING:
 
 EPOCHS_PER_SHARD = 24  # a shard is a file of the store: about a day
 SHARD_BYTES = 2**25  # at most, before compression
+WRITING = {
+    "codec_pipeline.path": "zarrs.ZarrsCodecPipeline",  # in Rust: that of zarr needs 1 ms for a chunk
+    "threading.max_workers": 1,  # more compress more chunks of a shard at once, up to 0.2 GB
+}
 PROGRESS_FILE = "export.progress"  # in an unfinished store: the raster being written, and its finished blocks
 
 
@@ -70,8 +74,11 @@ def write_zarr(
 def _zarr() -> Any:  # noqa: ANN401 - a module
     try:
         import zarr  # noqa: PLC0415 - an extra
+        import zarrs  # noqa: F401, PLC0415 - used by zarr
     except ImportError as error:
-        raise StationError("Zarr needs the package zarr: pip install 'tls-station[zarr]'") from error
+        raise StationError(
+            "Zarr needs the packages zarr and zarrs: pip install 'tls-station[zarr]'"
+        ) from error
     return zarr
 
 
@@ -144,7 +151,7 @@ def _create_raster(group: zarr.Group, variable: netCDF4.Variable[Any], contents:
         dtype=variable.dtype,
         chunks=chunks,
         shards=(times, chunks[1] * scale, chunks[2] * scale),
-        compressors=BloscCodec(cname="zstd", clevel=3, shuffle="shuffle"),
+        compressors=BloscCodec(cname="zstd", clevel=1, shuffle="shuffle"),
         fill_value=fill_value(variable.dtype),
         dimension_names=variable.dimensions,
         attributes=_attributes(variable),
@@ -153,11 +160,13 @@ def _create_raster(group: zarr.Group, variable: netCDF4.Variable[Any], contents:
 
 def _write_rasters(contents: PartContents, path: Path, advance: Advance) -> None:
     """Write the rasters shard by shard, without the shards that an earlier run finished."""
-    group, progress = _zarr().open_group(path, mode="r+"), path / PROGRESS_FILE
+    zarr, progress = _zarr(), path / PROGRESS_FILE
+    with zarr.config.set(WRITING):
+        arrays = dict(zarr.open_group(path, mode="r+").arrays())
     finished = int(progress.read_text()) if progress.is_file() else 0
     number = 0
     for spec in contents.rasters:
-        array = group[spec.name]
+        array = arrays[spec.name]
         cells = int(np.prod(contents.shape[1:])) * len(contents.rasters)
         for block in contents.blocks(array.shards):
             number += 1

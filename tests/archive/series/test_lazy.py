@@ -165,7 +165,7 @@ def test_a_damaged_chunk_raises_an_error(copied):
         file.write(b"\xff" * (chunk.size - 40))
     with station.open(copied.folder) as ds:
         assert np.isfinite(ds.elevation_change[2]).any()
-        with pytest.raises((OSError, RuntimeError)):
+        with pytest.raises(StoreError, match=damaged.path.name):
             ds.elevation_change[:, 5, 5].load()
 
 

@@ -119,7 +119,7 @@ def test_a_box_and_some_variables(stored, tmp_path):
     (expected, _), (actual, attrs) = raw(stored.path), raw(path)
     assert set(actual) == {
         "time", "time_bnds", "x", "x_bnds", "y", "y_bnds", "crs", "elevation_change", "air_temperature",
-        "scan_id", "verdict", "verdict_reason",
+        "scan_id", "verdict", "verdict_reason", "longitude_extent", "latitude_extent", "height_extent",
     }  # fmt: skip
     assert actual["x"].tolist() == [632115 + 10 * column for column in range(24)]
     assert actual["y"].tolist() == [5185595 - 10 * row for row in range(10)]

@@ -5,14 +5,14 @@ import dataclasses
 import numpy as np
 import pytest
 import xarray as xr
-from support.epochs import make_epoch
+from support.epochs import SURFACE_M, make_epoch, write_surface
 from support.programs import (
-    assert_acdd_misses_only_what_is_not_computed,
     assert_gdal_knows_the_place,
     filled_metadata,
     findings,
     gdal_value,
     readers_python,
+    recommendations,
     run,
     tool,
 )
@@ -161,12 +161,17 @@ def test_compliance_checker_finds_nothing(exported, tmp_path):
     assert findings(tmp_path / "report.json", exported) == []
 
 
-def test_data_discovery_checker_misses_only_what_is_not_computed(series, epoch, tmp_path):
+def test_data_discovery_checker_recommends_nothing(series, epoch, tmp_path):
     epochs.write_epoch(series, epoch(0))
     build_series(series)
+    write_surface(series)
     described = dataclasses.replace(series, metadata=filled_metadata())  # filled in afterwards
     path = write(described, tmp_path / "all.nc")
-    assert_acdd_misses_only_what_is_not_computed(tmp_path / "report.json", path)
+    assert recommendations(tmp_path / "report.json", path) == []
     with xr.open_dataset(path) as ds:
         assert ds.attrs["license"] == "CC-BY-4.0"
+        assert ds.attrs["geospatial_bounds_vertical_crs"] == "EPSG:4979"
+        lowest_m, highest_m = ds.height_extent.values  # the surface rises by a millionth of the northing
+        assert highest_m == pytest.approx(SURFACE_M + series.grid.north_m / 1e6, abs=1e-2)
+        assert lowest_m <= highest_m == ds.attrs["geospatial_vertical_max"]
         assert np.isnan(ds.elevation_change[0, 0, -1])
