@@ -8,7 +8,7 @@ const stationCurves = (() => {
     const sigma = (code) => code ? about.sigma_min_m * Math.exp((code - 1) * about.sigma_step) : 0;
     let model;  // of the systematic errors, once needed
 
-    function parseCurve({ head, bytes }) {
+    function parseCurve({ head, bytes }, isLevel) {
       const { times, blocks } = head, cells = times * blocks;
       let start = 0;
       const take = (count, size) => {
@@ -22,9 +22,10 @@ const stationCurves = (() => {
       const time_s = Array.from(steps_s, ((sum) => (step) => sum += step >>> 0)(0));
       const usable = bytes.subarray(start, start += times);
       const box = take(times, 2);
-      const [change, random, systematic, coverage] = [3, 2, 2, 1].map(
+      const sizes = [3, 2, 2, 1, ...(isLevel ? [3, 2, 2] : [])];
+      const [change, random, systematic, coverage, ...rate] = sizes.map(
         (size) => stationTiles.accumulate(take(cells, size), blocks));
-      return { blocks, local, time_s, usable, box, change, random, systematic, coverage };
+      return { blocks, local, time_s, usable, box, change, random, systematic, coverage, rate };
     }
 
     function parsePlace({ head, bytes }) {
@@ -46,7 +47,7 @@ const stationCurves = (() => {
 
     async function load(tier, name) {
       const tile = await stationTiles.load(`${tier}/${name}`, about.versions[tier]);
-      return tile && (tier === "places" ? parsePlace(tile) : parseCurve(tile));
+      return tile && (tier === "places" ? parsePlace(tile) : parseCurve(tile, tier === "levels"));
     }
 
     // The blocks (row, column, weight) of tiles, with their values over time; those never observed are left out.
@@ -143,6 +144,23 @@ const stationCurves = (() => {
       return sums(blocks, true, true);
     }
 
+    // Level and rate of a place at the end of each day; null where the station keeps no levels.
+    async function levels(position) {
+      const [row, column] = blockOf(position);
+      if (!about.versions.levels || !isKnown(row, column)) return null;
+      const tile = await load("levels", tileOf("levels", row, column).join("_"));
+      const at = tile ? tile.local.indexOf(localOf("levels", row, column)) : -1;
+      if (at < 0) return null;
+      const curve = (unit, [value, random, systematic]) => tile.time_s.map((time_s, t) => {
+        const i = t * tile.blocks + at, coverage = tile.coverage[i] / about.full;
+        if (!coverage) return { time_s, change: null };
+        return { time_s, change: value[i] * unit, sigma: Math.hypot(sigma(random[i]) / Math.sqrt(coverage), sigma(systematic[i])) };
+      });
+      return {
+        level: curve(about.quantum_m, [tile.change, tile.random, tile.systematic]), rate: curve(about.rate_quantum_m, tile.rate),
+      };
+    }
+
     // Blocks whose share of their area inside the polygon is at least that of one of 16 points.
     function blocksInside(polygon) {
       const [rows, columns] = [0, 1].map((k) => polygon.map((point) => blockOf(point)[k]));
@@ -176,7 +194,7 @@ const stationCurves = (() => {
       return { curve, size_m2, blocks: blocks.length };
     }
 
-    return { place, difference, area, maxArea_m2: MAX_BLOCKS * about.block_m ** 2 };
+    return { place, levels, difference, area, maxArea_m2: MAX_BLOCKS * about.block_m ** 2 };
   }
 
   // The change between two times of a curve. The error of the reference is in both, and cancels.

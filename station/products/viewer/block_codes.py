@@ -48,6 +48,11 @@ def sigma_code(sigma_m: Floats) -> Ints:
     return np.clip(np.round(np.nan_to_num(code, neginf=0)), 0, 65535).astype(np.int64)
 
 
+def max_coverage(cells: int) -> int:
+    """Return the code of a block of `cells` × `cells` that was observed completely."""
+    return min(cells**2, MAX_COVERAGE)
+
+
 class BlockCodes:
     """The codes of epochs of one reference, those of its known blocks (n,) row by row."""
 
@@ -57,8 +62,8 @@ class BlockCodes:
         self.version = self.newest_blocks.cells.reference.version
         self.surface: SurfaceBlocks = queries.surface(newest, self.newest_blocks.rock > 0.5)
         self.count = int(np.count_nonzero(self.surface.known))
-        self.max_coverage = min(queries.cells**2, MAX_COVERAGE)
-        self._folder, self._cache = folder, folder / f"{self.version}_{FORMAT}"
+        self.max_coverage = max_coverage(queries.cells)
+        self._folder, self.cache = folder, folder / f"{self.version}_{FORMAT}"
 
     def keep(self, epochs: Sequence[CurveEpoch], progress: Callable[[], None]) -> set[str]:
         """Keep the codes of epochs, and no others; return the file names of those that are there now.
@@ -67,7 +72,7 @@ class BlockCodes:
         """
         names = {epoch.ref.epoch_file for epoch in epochs}
         self._delete_others(names)
-        known = {path.name.removesuffix(".npz") for path in self._cache.glob("*.npz")}
+        known = {path.name.removesuffix(".npz") for path in self.cache.glob("*.npz")}
         missing = [epoch for epoch in reversed(epochs) if epoch.ref.epoch_file not in known]
         for epoch in missing[:MAX_READ]:
             self._compute(epoch)
@@ -78,19 +83,19 @@ class BlockCodes:
     def _delete_others(self, names: set[str]) -> None:
         """Delete what was kept of other epochs and other references."""
         for path in self._folder.glob("*/"):
-            if path != self._cache:
+            if path != self.cache:
                 shutil.rmtree(path, ignore_errors=True)
-        for path in self._cache.glob("*.npz"):
+        for path in self.cache.glob("*.npz"):
             if path.name.removesuffix(".npz") not in names:
                 path.unlink(missing_ok=True)
 
     def read(self, epoch: CurveEpoch) -> Sums:
         """Return the codes of an epoch; those that are damaged are computed again."""
-        codes = _load(self._path(epoch), self.count)
+        codes = load_codes(self._path(epoch), self.count)
         return self._compute(epoch) if codes is None else codes
 
     def _path(self, epoch: CurveEpoch) -> Path:
-        return self._cache / f"{epoch.ref.epoch_file}.npz"
+        return self.cache / f"{epoch.ref.epoch_file}.npz"
 
     def _compute(self, epoch: CurveEpoch) -> Sums:
         is_newest = epoch.ref == self._newest
@@ -115,13 +120,13 @@ class BlockCodes:
             systematic_m2 = boxes[f"{CHANGE}_uncertainty"] ** 2 - boxes[RANDOM] ** 2
             sigma_m = np.sqrt(np.maximum(np.nan_to_num(systematic_m2), 0))
             codes["boxes"] = sigma_code(sigma_m).astype(np.uint16)
-        _save(self._path(epoch), codes)
+        save_codes(self._path(epoch), codes)
         return codes
 
     @cached_property
     def near_ratio(self) -> Floats:
         """Return the systematic sigma (n,) of each block in sigmas of its middle, once for a reference."""
-        path, jacobian = self._cache / "near.bin", self.surface.jacobian
+        path, jacobian = self.cache / "near.bin", self.surface.jacobian
         with suppress(OSError, ValueError):
             ratio = np.fromfile(path)
             if len(ratio) == self.count:
@@ -138,7 +143,7 @@ class BlockCodes:
         return ratio
 
 
-def _load(path: Path, count: int) -> Sums | None:
+def load_codes(path: Path, count: int) -> Sums | None:
     """Return kept codes; None if there are none, or if they are damaged."""
     try:
         with path.open("rb") as opened, np.load(opened) as file:
@@ -148,7 +153,7 @@ def _load(path: Path, count: int) -> Sums | None:
     return codes if all(len(codes.get(name, ())) == count for name in DTYPES) else None
 
 
-def _save(path: Path, codes: Sums) -> None:
+def save_codes(path: Path, codes: Sums) -> None:
     """Keep codes; skipped without an error if that fails."""
     tmp_path = path.with_name(f".{path.name}.part")
     with suppress(OSError):

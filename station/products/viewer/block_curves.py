@@ -1,7 +1,8 @@
 """Curves of the page: change of each block of about 10 m over time with its sigma, in tiles.
 
 Three tiers of tiles have the values: `latest` is rewritten with each scan, `recent` with every eighth,
-`older` once a day. `places` has what no scan changes, renewed each month. Times are thinned as the maps are.
+`older` once a day, as `levels`, where the station keeps them. `places` has what no scan changes, renewed each
+month. Times are thinned as the maps are.
 The systematic errors of an area are propagated in the browser: from the Jacobian of its blocks, the mean
 covariance of the retained epochs in `systematic`, and how the sigma of an epoch differs from it. Source:
 equations.md, 6.2.
@@ -32,6 +33,7 @@ from station.products.viewer.block_codes import (
     BlockCodes,
     CurveEpoch,
 )
+from station.products.viewer.level_curves import RATE_QUANTUM_M, LevelCodes
 from station.products.viewer.tiles import (
     Array,
     TileFolder,
@@ -46,12 +48,13 @@ from station.queries.blocks import BlockQueries
 from station.science.analysis.calibration import SparseJacobian
 from station.science.uncertainty.jacobian import HeightJacobian
 
-TILE_BLOCKS = {"latest": 12, "recent": 5, "older": 5, "places": 5}  # along each side of a tile
+TILE_BLOCKS = {"latest": 12, "recent": 5, "older": 5, "levels": 5, "places": 5}  # along each side of a tile
 LATEST = 8  # epochs before they go to the recent tier
 RECENT_DAYS = 2  # before the last one, of which all epochs are in the recent tier
 MAX_RECENT, MAX_OLDER = 132, 110  # epochs of a curve
 MAX_BASE = 24  # epochs whose covariance is averaged
 CODE_BYTES = {"change": 3, "random": 2, "systematic": 2, "coverage": 1}  # of a value, by name
+LEVEL_BYTES = CODE_BYTES | {"rate": 3, "rate_random": 2, "rate_systematic": 2}  # of a level
 
 
 def curve_tiers(start_s: Floats, retained: Sequence[int]) -> dict[str, list[int]]:
@@ -105,14 +108,23 @@ def update_curves(
     for name, tier in wanted.items():
         keys[name] = tiles.key([epoch.ref.epoch_file for epoch in tier])
         if on_disk.get(name) != keys[name]:
-            tiles.write_curves(name, tier)
+            tiles.write_curves(name, [(epoch.start_s, epoch.is_usable, codes.read(epoch)) for epoch in tier])
             progress()
+    levels = LevelCodes(series, codes.cache / "levels", codes.version, codes.surface.known, queries.cells)
+    days = levels.keep(progress)
+    keys["levels"] = tiles.key(days)
+    if on_disk.get("levels") != keys["levels"]:
+        readable = {name: day for name in days if (day := levels.read(name)) is not None}
+        tiles.write_curves("levels", [(time_s, True, day) for time_s, day in readable.values()])
+        keys["levels"] = tiles.key(list(readable))
+        progress()
     if on_disk.get("places") != keys["places"]:
         os.sync()  # before the keys that say that the tiles are there
     if on_disk != keys:
         tiles.write_keys(keys)
+    filled = {"places", *(name for name, tier in wanted.items() if tier), *(["levels"] if days else [])}
     return tiles.description() | {
-        "versions": {name: key[:8] for name, key in keys.items() if name == "places" or wanted[name]}
+        "versions": {name: key[:8] for name, key in keys.items() if name in filled}
     }
 
 
@@ -187,27 +199,27 @@ class _Tiles:
         """Write the keys of the tiers on disk."""
         replace_file(self._folder / ".curves" / "keys.json", json.dumps(keys).encode())
 
-    def write_curves(self, tier: str, epochs: Sequence[CurveEpoch]) -> None:
-        """Write the tiles of a tier."""
+    def write_curves(self, tier: str, times: Sequence[tuple[float, bool, Sums]]) -> None:
+        """Write the tiles of a tier: of each time [s], whether it is usable and its codes."""
         folder, grouping = TileFolder(self._folder / tier), self._groupings[TILE_BLOCKS[tier]]
-        if epochs:
-            codes = [self._codes.read(epoch) for epoch in epochs]
+        if times:
+            codes = [codes for _, _, codes in times]
             planes = np.concatenate(
                 [
                     byte_planes(encoded(codes, name)[:, grouping.order], size)
-                    for name, size in CODE_BYTES.items()
+                    for name, size in (LEVEL_BYTES if tier == "levels" else CODE_BYTES).items()
                 ]
             )
-            start_s = np.array([round(epoch.start_s) for epoch in epochs], np.int64)
+            time_s = np.array([round(second) for second, _, _ in times], np.int64)
             heads = [
-                byte_planes(np.diff(start_s, prepend=0), 4).tobytes(),
-                np.array([epoch.is_usable for epoch in epochs], np.uint8).tobytes(),
+                byte_planes(np.diff(time_s, prepend=0), 4).tobytes(),
+                np.array([is_usable for _, is_usable, _ in times], np.uint8).tobytes(),
             ]
             boxes = byte_planes(self._box_of_tiles(codes, grouping), 2)
             for position, (number, first, end) in enumerate(grouping.tiles):
                 box, values = boxes[:, :, position].tobytes(), planes[:, :, first:end].tobytes()
                 data = b"".join([grouping.local[first:end].tobytes(), *heads, box, values])
-                folder.write(grouping.name(number), {"times": len(epochs), "blocks": end - first}, data)
+                folder.write(grouping.name(number), {"times": len(times), "blocks": end - first}, data)
         folder.delete_others()
 
     def _box_of_tiles(self, codes: list[Sums], grouping: _Grouping) -> Ints:
@@ -267,6 +279,7 @@ class _Tiles:
             "tiles": base64.b64encode(np.packbits(has_tile).tobytes()).decode(),
             "columns": grouping.columns,
             "quantum_m": QUANTUM_M,
+            "rate_quantum_m": RATE_QUANTUM_M,
             "sigma_min_m": SIGMA_MIN_M,
             "sigma_step": SIGMA_STEP,
             "full": self._codes.max_coverage,

@@ -178,6 +178,16 @@ def test_level_and_rate_are_those_of_the_stored_day(tab, address, series):
         assert half == pytest.approx(1.96 * unit * sigma_m, rel=0.06, abs=0.0006)
         assert "2025-11-21 01:23 UTC" in tab.run("document.getElementById('map-key').textContent")
         assert ("m/d" in tab.run("document.getElementById('map-hover').textContent")) == (layer == "rate")
+    # the curves of the place say the same
+    half_m = 1.96 * np.hypot(*LEVEL_SIGMA_M)
+    asked = tab.await_(
+        "document.getElementById('asked-values')?.textContent.includes('m/d') &&"
+        " document.getElementById('asked-values').textContent"
+    )
+    assert f"Level (2025-11-21 01:23){level_at(column):.3f} ± {half_m:.3f} m" in asked
+    assert f"Rate (2025-11-21 01:23){level_at(column) / 10:.3f} ± {half_m / 10:.3f} m/d" in asked
+    titles = tab.run("[...document.querySelectorAll('#asked-curves h3')].map((h) => h.textContent)")
+    assert [title.partition(",")[0] for title in titles[1:]] == ["Level", "Rate of the level"]
     # the place stays in the middle when the map gets another size: with a late first frame, late styles
     tab.set_size(1000, 900)
     tab.await_("document.getElementById('map-canvas').width < 1000")
