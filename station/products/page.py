@@ -210,12 +210,18 @@ def _update_curves(
     if not newest:
         return None
     index, start_s = SeriesIndex(series), table.start_s[newest]
+    retained = retention_indices(start_s)
     tiers = {
         name: [
-            CurveEpoch(index[position], float(table.start_s[position]), table.verdict[position] != "unusable")
-            for position in (newest[item] for item in items)
+            CurveEpoch(
+                index[newest[item]],
+                float(start_s[item]),
+                table.verdict[newest[item]] != "unusable",
+                item in retained,
+            )
+            for item in items
         ]
-        for name, items in curve_tiers(start_s, retention_indices(start_s)).items()
+        for name, items in curve_tiers(start_s, retained).items()
     }
     return update_curves(series, folder, tiers, progress)
 

@@ -266,6 +266,7 @@
     return `data:text/csv,${encodeURIComponent([head, ...lines, ""].join("\n"))}`;
   }
 
+  let correlation = null;  // of the change of two scans, once needed
   // The values at the time of the shown map, or at the last one before it that has any.
   function showValues() {
     const list = byId("asked-values");
@@ -276,7 +277,8 @@
     if (!at) { list.append(make("p", { textContent: text.not_observed })); return; }
     const from = layers.before() && known.filter((p) => p.time_s <= layers.before().time_s + 1).at(-1);
     if (from) {
-      const { change, sigma } = stationCurves.between(at, from);
+      if (!correlation) reader.correlations().then((found) => { correlation = found; showValues(); });
+      const { change, sigma } = stationCurves.between(at, from, correlation ? correlation(at.time_s, from.time_s) : 0);
       list.append(make("div", {}, make("dt", { textContent: fill(text.since_scan, { time: page.utc(from.time_s) }) }), make("dd", { textContent: withHalf(change, sigma, 3, "m"), title: text.pair_sigma })));
     }
     const levels = Object.entries(current.levels || {}).flatMap(([name, curve]) => {

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import shutil
 import zipfile
 from collections.abc import Callable, Sequence
@@ -12,22 +13,22 @@ from pathlib import Path
 
 import numpy as np
 
-from station.archive.derived.boxes import BOXES, read_entry
-from station.archive.derived.computed_rasters import CHANGE, RANDOM
 from station.archive.epochs import EpochRef
 from station.archive.netcdf_layout import Series
 from station.errors import StoreError
 from station.products.viewer.near_blocks import sigma_ratio
-from station.products.viewer.tiles import replace_file
+from station.products.viewer.tiles import Array, replace_file
 from station.quantities import Floats, Ints
 from station.queries.block_sums import Sums
 from station.queries.blocks import BlockQueries, SurfaceBlocks
+from station.science.analysis.calibration import group_means
 
 QUANTUM_M = 0.001  # of the change
 SIGMA_MIN_M, SIGMA_STEP = 1e-5, 0.02  # code of a sigma: 1 + ln(sigma / minimum) / step
 MAX_COVERAGE = 255  # code of a block that was observed completely, unless it has fewer cells
 MAX_CHANGE = 2**21  # code of a change of 1 km; a difference of two has 3 bytes
-FORMAT = 4  # of the codes: others are computed again
+FORMAT = 5  # of the codes: others are computed again
+COMMON_BLOCKS = (5, 12)  # along the sides of tiles, of which codes have the errors that scans have in common
 MAX_READ = 24  # epochs read at once; a store older than the page is read over several calls
 DTYPES = {"change": np.int32, "random": np.uint16, "systematic": np.uint16, "coverage": np.uint8}
 
@@ -39,6 +40,7 @@ class CurveEpoch:
     ref: EpochRef
     start_s: float
     is_usable: bool
+    has_map: bool = True
 
 
 def sigma_code(sigma_m: Floats) -> Ints:
@@ -115,13 +117,38 @@ class BlockCodes:
             name: np.clip(raster, -MAX_CHANGE, MAX_CHANGE)[self.surface.known].astype(DTYPES[name])
             for name, raster in values.items()
         }
-        boxes = read_entry(self._series, BOXES, epoch.start_s)
-        if boxes is not None:
-            systematic_m2 = boxes[f"{CHANGE}_uncertainty"] ** 2 - boxes[RANDOM] ** 2
-            sigma_m = np.sqrt(np.maximum(np.nan_to_num(systematic_m2), 0))
-            codes["boxes"] = sigma_code(sigma_m).astype(np.uint16)
+        errors = blocks.cells.shared and blocks.cells.shared.change_errors
+        if errors and blocks.cells.adjusted:
+            codes["pattern"] = errors.polar_change
+            for size in COMMON_BLOCKS:
+                gradient = self._gradient(size)
+                if gradient.shape[1] == len(errors.modes):
+                    common_m = np.linalg.norm(gradient @ errors.modes, axis=1)
+                    codes[f"common_{size}"] = sigma_code(common_m).astype(np.uint16)
         save_codes(self._path(epoch), codes)
         return codes
+
+    def pattern(self, epoch: CurveEpoch) -> Floats | None:
+        """Return the pattern of the change of an epoch, which common errors depend on; None if unknown."""
+        return self.read(epoch).get("pattern")
+
+    def _gradient(self, size: int) -> Array:
+        """Return the derivatives (tiles, p) of the mean of each tile of blocks, once for a reference."""
+        path = self.cache / f"tiles_{size}.npy"
+        with suppress(OSError, ValueError, EOFError):
+            return np.asarray(np.load(path))
+        if self.surface.jacobian is None:
+            return np.zeros((0, 0), np.float32)
+        row, column = np.nonzero(self.surface.known)
+        _, tile = np.unique(row // size * self.surface.known.shape[1] + column // size, return_inverse=True)
+        means = group_means(tile) @ self.surface.jacobian.to_sparse()
+        gradient = np.asarray(means.toarray(), np.float32)
+        buffer = io.BytesIO()
+        np.save(buffer, gradient)
+        with suppress(StoreError, OSError):
+            path.parent.mkdir(parents=True, exist_ok=True)
+            replace_file(path, buffer.getvalue())
+        return gradient
 
     @cached_property
     def near_ratio(self) -> Floats:
