@@ -41,7 +41,7 @@ from station.quantities import Floats, Grid
 KEEP_ALL_FOR = timedelta(days=2)  # before the newest epoch; then the last map of each day …
 KEEP_DAILY_FOR = timedelta(days=60)  # … and before that the last of each month
 DAY_S = 86_400.0
-MAX_CELL_MAPS = 60  # newest maps with tiles of cells; before them, of means only
+MAX_CELL_MAPS = 50  # newest maps with tiles of cells, two days of hourly scans; before them, of means only
 MAX_MADE = 8  # per call: the maps of an archive older than the page are made over several calls
 DELETE_GRACE_S = 3600.0  # an open page may still refer to a map that is no longer kept
 LIMIT_SIGMAS = 10.0
