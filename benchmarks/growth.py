@@ -211,7 +211,7 @@ def fill(
         )
     build_series(series)
     update_areas(series, load_areas(site), _InstantAggregator(), lambda: None)
-    update_boxes(series, _RepeatedBlocks(series), lambda: None)
+    update_boxes(series, RepeatedBlocks(series), lambda: None)
     with mock.patch.object(EventQueries, "_search", return_value=[]):  # of a year it would take half an hour
         update_series(site, lambda: None)
     for _ in range(PAGE_UPDATES):
@@ -219,15 +219,16 @@ def fill(
     return end
 
 
-def copy_epoch(series: Series, template: Path, start: datetime) -> None:
-    """Store a copy of an epoch file under another time."""
+def copy_epoch(series: Series, template: Path, start: datetime) -> Path:
+    """Store a copy of an epoch file under another time; return its path."""
     path = epochs.epoch_folder(series, start) / f"{series.station_id}_{start:{epochs.TIME_FORMAT}}.nc"
     path.parent.mkdir(parents=True, exist_ok=True)
     shutil.copyfile(template, path)
     with netCDF4.Dataset(path, "a") as file:
-        file["time"][:] = start.timestamp() + 450
-        file["time_bnds"][:] = (start.timestamp(), start.timestamp() + 900)
+        file["time"][0] = start.timestamp() + 450
+        file["time_bnds"][0] = (start.timestamp(), start.timestamp() + 900)
         file["epoch_file"][0] = encode_text([path.name], "text")[0]
+    return path
 
 
 class _InstantAggregator:
@@ -239,7 +240,7 @@ class _InstantAggregator:
         return AreaChange(value_m, 0.01, value_m, 0.01, 1.0)
 
 
-class _RepeatedBlocks(BlockQueries):
+class RepeatedBlocks(BlockQueries):
     """Blocks of the newest epoch, for all epochs and days."""
 
     def __init__(self, series: Series) -> None:

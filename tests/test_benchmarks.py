@@ -94,6 +94,7 @@ def test_quick_benchmark_prints_all_rows_with_correct_ratios(quick):
     base_s = float(rows["laspy + lazrs, one thread"][0])
     cpu_s, ratio = map(float, rows["station, running service"][:2])
     assert (cpu_s - 0.005) / (base_s + 0.005) - 0.005 <= ratio <= (cpu_s + 0.005) / (base_s - 0.005) + 0.005
+    assert float(rows["station, page alone, mean of a day"][0]) > 0
     for title in ("station, on the grid", "station, epoch written"):  # beside their own decodes, not printed
         assert all(float(cell) > 0 for cell in rows[title][:2])
     for title in ("scipy binned_statistic_2d", "datashader", "PDAL", "CloudCompare", "py4dgeo M3C2"):

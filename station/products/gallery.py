@@ -26,7 +26,7 @@ from station.errors import StoreError
 from station.products.colours import round_up
 from station.products.maps import Caption, change_map, encode_webp
 from station.products.overview import BaseMap, Overview, base_map, read_overview
-from station.products.viewer.level_tiles import LevelMap, update_levels
+from station.products.viewer.level_tiles import LevelMaps, update_levels
 from station.products.viewer.value_tiles import (
     delete_cells,
     delete_old_values,
@@ -41,7 +41,7 @@ from station.quantities import Floats, Grid
 KEEP_ALL_FOR = timedelta(days=2)  # before the newest epoch; then the last map of each day …
 KEEP_DAILY_FOR = timedelta(days=60)  # … and before that the last of each month
 DAY_S = 86_400.0
-MAX_CELL_MAPS = 60  # newest maps with tiles of cells; before them, of means only
+MAX_CELL_MAPS = 50  # newest maps with tiles of cells, two days of hourly scans; before them, of means only
 MAX_MADE = 8  # per call: the maps of an archive older than the page are made over several calls
 DELETE_GRACE_S = 3600.0  # an open page may still refer to a map that is no longer kept
 LIMIT_SIGMAS = 10.0
@@ -88,7 +88,7 @@ class Gallery:
     """The maps of the page: change over time, and levels where the station keeps them."""
 
     change: list[MapImage]
-    levels: list[LevelMap]
+    levels: LevelMaps
     limit_m: float | None
     size: tuple[int, int]  # of a map [pixels]
 
@@ -106,7 +106,7 @@ def update_gallery(
     read or written.
     """
     if not measured:
-        return Gallery([], [], style.limit_m, (0, 0))
+        return Gallery([], LevelMaps(), style.limit_m, (0, 0))
     limit_m = style.limit_m or _fixed_limit(series, folder, measured[0])
     style_json = json.dumps([style.station, style.width_px, limit_m, __version__])
     tag = hashlib.sha256(style_json.encode()).hexdigest()[:8]
@@ -148,7 +148,7 @@ def update_gallery(
     images.reverse()
     _delete_old(folder / "maps", {Path(item.file).name for item in images})
     levels = update_levels(series, folder, bases[images[-1].version], progress)
-    level_folders = [name for level in levels for name in level.folders]
+    level_folders = [name for level in levels.maps for name in level.folders]
     delete_old_values(folder, [*(item.epoch_file for item in images), *level_folders], bases)
     return Gallery(images, levels, limit_m, _size(folder / images[-1].file))
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -31,7 +31,7 @@ from station.products.maps import ASSETS, map_box
 from station.products.overview import Overview
 from station.products.viewer.block_codes import CurveEpoch
 from station.products.viewer.block_curves import curve_tiers, update_curves
-from station.products.viewer.level_tiles import level_at
+from station.products.viewer.level_tiles import LevelMaps
 from station.products.viewer.overlays import area_outlines, browser_scales, event_outlines
 from station.products.viewer.value_tiles import describe_levels, value_codes
 from station.products.web.page_areas import newest_value, usable_area_series
@@ -105,12 +105,13 @@ def write_page(
     table = read_epoch_table(series) if series.path.is_file() else None
     all_areas = usable_area_series(series, table) if table is not None else []
     areas = all_areas[:MAX_AREAS]
-    gallery, curves = Gallery([], [], None, (0, 0)), None
+    gallery, curves = Gallery([], LevelMaps(), None, (0, 0)), None
     if table is not None:
         style = Style(context.name or series.station_id, width_px, limit_m)
         measured = _measured_epochs(series, table, context.overviews)
         gallery = update_gallery(series, folder, measured, style, progress)
         curves = _update_curves(series, folder, table, progress)
+        context = replace(context, faults=[*context.faults, *gallery.levels.faults])
     for name, parts in STATIC.items():
         replace_if_changed(folder / name, b"".join((ASSETS / part).read_bytes() for part in parts))
     data = {
@@ -125,11 +126,11 @@ def write_page(
                 "version": image.version,
                 "values": Path(image.epoch_file).stem,
                 "finest": image.finest,
-                "level": level_at(gallery.levels, image.start.timestamp(), image.version),
+                "level": gallery.levels.at(image.start.timestamp(), image.version),
             }
             for image in gallery.change
         ],
-        "level_times": {level.name: level.time_s for level in gallery.levels},
+        "level_times": {level.name: level.time_s for level in gallery.levels.maps},
         "frames": _frames(series, folder, gallery, width_px),
         "values": value_codes(),
         "scales": browser_scales(gallery.limit_m) if gallery.limit_m else {},
@@ -209,12 +210,18 @@ def _update_curves(
     if not newest:
         return None
     index, start_s = SeriesIndex(series), table.start_s[newest]
+    retained = retention_indices(start_s)
     tiers = {
         name: [
-            CurveEpoch(index[position], float(table.start_s[position]), table.verdict[position] != "unusable")
-            for position in (newest[item] for item in items)
+            CurveEpoch(
+                index[newest[item]],
+                float(start_s[item]),
+                table.verdict[newest[item]] != "unusable",
+                item in retained,
+            )
+            for item in items
         ]
-        for name, items in curve_tiers(start_s, retention_indices(start_s)).items()
+        for name, items in curve_tiers(start_s, retained).items()
     }
     return update_curves(series, folder, tiers, progress)
 

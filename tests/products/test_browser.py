@@ -253,7 +253,7 @@ def test_areas_have_the_mean_and_sigma_of_the_store(tab, folder):
     tab.open(folder.as_uri() + "/index.html")
     cells = round(tab.run("STATION.curves.block_m") / grid.cell_m)
     rng, ratios = np.random.default_rng(3), []
-    for size in (1, 1, 3, 8, 1, 1, 1, 3, 3):  # blocks
+    for size in (1, 1, 3, 8, 8, 8, 1, 3, 8):  # blocks
         place = rng.integers(len(rows))
         top, left = (int(k[place]) // cells * cells for k in (rows, columns))
         side = size * cells
@@ -279,7 +279,7 @@ def test_areas_have_the_mean_and_sigma_of_the_store(tab, folder):
 
 
 def test_the_change_between_two_scans_has_the_sigma_of_the_store(tab, folder):
-    """Blocks of 10 m that both of the last two scans observed completely."""
+    """Of places of 10 m and areas of 80 m that the last two scans observed, after a similar change."""
     series = series_in(folder.parent)
     grid, aggregates, index = series.grid, Aggregates(series), SeriesIndex(series)
     before, after = index[-2], index[-1]
@@ -289,20 +289,36 @@ def test_the_change_between_two_scans_has_the_sigma_of_the_store(tab, folder):
         seen[known] &= np.isfinite(aggregates.read_cells(epoch, known).change_m)
     tab.open(folder.as_uri() + "/index.html")
     cells = round(tab.run("STATION.curves.block_m") / grid.cell_m)
-    edges = [np.arange(0, size, cells) for size in grid.shape]
-    count = np.add.reduceat(np.add.reduceat(seen.astype(int), edges[0], axis=0), edges[1], axis=1)
-    whole = np.argwhere(count == cells**2)
-    for row, column in np.random.default_rng(5).choice(whole, 5, replace=False):
-        mask = np.zeros(grid.shape, bool)
-        mask[row * cells : (row + 1) * cells, column * cells : (column + 1) * cells] = True
-        middle = [float(grid.x_m[mask.any(axis=0)].mean()), float(grid.y_m[mask.any(axis=1)].mean())]
-        shown = tab.run(
-            f"stationCurves.reader(STATION.curves).place({middle})"
-            ".then(({ curve }) => stationCurves.between(curve.at(-1), curve.at(-2)))"
-        )
-        assert 0.9 < shown["sigma"] / aggregates.variance(mask, after, before) ** 0.5 < 1.1
-        change_m = [aggregates.read_cells(epoch, mask).change_m.mean() for epoch in (after, before)]
-        assert shown["change"] == pytest.approx(change_m[0] - change_m[1], abs=0.0011)
+    ratios, without = [], []
+    for size, count in ((cells, 5), (8 * cells, 6)):
+        edges = [np.arange(0, length, size) for length in grid.shape]
+        total = np.add.reduceat(np.add.reduceat(seen.astype(int), edges[0], axis=0), edges[1], axis=1)
+        whole = np.argwhere(total >= (1.0 if size == cells else 0.97) * size**2)
+        assert len(whole) >= count
+        for row, column in np.random.default_rng(5).choice(whole, count, replace=False):
+            mask = np.zeros(grid.shape, bool)
+            mask[row * size : (row + 1) * size, column * size : (column + 1) * size] = True
+            east_m, north_m = (
+                [float(k[mask.any(axis)].min() - half), float(k[mask.any(axis)].max() + half)]
+                for k, axis, half in ((grid.x_m, 0, 0.49 * grid.cell_m), (grid.y_m, 1, 0.49 * grid.cell_m))
+            )
+            corners = [
+                [e, n] for e, n in zip(east_m + east_m[::-1], np.repeat(north_m, 2).tolist(), strict=True)
+            ]
+            shown, ignored = tab.run(
+                "(async () => { const reader = stationCurves.reader(STATION.curves),"
+                f" {{ curve }} = await reader.area({json.dumps(corners)}), [from, to] = curve.slice(-2),"
+                " correlation = (await reader.correlations())(to.time_s, from.time_s);"
+                " return [correlation, 0].map((c) => stationCurves.between(to, from, c)); })()"
+            )
+            stored_m = aggregates.variance(mask & seen, after, before) ** 0.5
+            ratios.append(shown["sigma"] / stored_m)
+            without.append(ignored["sigma"] / stored_m)
+            if size == cells:
+                change_m = [aggregates.read_cells(epoch, mask).change_m.mean() for epoch in (after, before)]
+                assert shown["change"] == pytest.approx(change_m[0] - change_m[1], abs=0.0011)
+    assert 0.9 < min(ratios) <= max(ratios) < 1.1
+    assert max(without) > 1.1
     assert tab.errors() == []
 
 

@@ -1,6 +1,5 @@
 // Curves of places and areas from the tiles of blocks, with their sigma.
 const stationCurves = (() => {
-  const SMALL = 3;  // blocks along a side, up to which the sigma of each block sets the scale; else that of its box
   const MAX_BLOCKS = 1600;
   const HEIGHT = 0, RANGE = 1, INCIDENCE = 2, REFERENCE = 3, NEAR = 4, JACOBIAN = 5, JACOBIAN_ROWS = 14;
 
@@ -8,7 +7,7 @@ const stationCurves = (() => {
     const sigma = (code) => code ? about.sigma_min_m * Math.exp((code - 1) * about.sigma_step) : 0;
     let model;  // of the systematic errors, once needed
 
-    function parseCurve({ head, bytes }) {
+    function parseCurve({ head, bytes }, isLevel) {
       const { times, blocks } = head, cells = times * blocks;
       let start = 0;
       const take = (count, size) => {
@@ -21,10 +20,11 @@ const stationCurves = (() => {
       const steps_s = take(times, 4);
       const time_s = Array.from(steps_s, ((sum) => (step) => sum += step >>> 0)(0));
       const usable = bytes.subarray(start, start += times);
-      const box = take(times, 2);
-      const [change, random, systematic, coverage] = [3, 2, 2, 1].map(
+      const common = take(times, 2);
+      const sizes = [3, 2, 2, 1, ...(isLevel ? [3, 2, 2] : [])];
+      const [change, random, systematic, coverage, ...rate] = sizes.map(
         (size) => stationTiles.accumulate(take(cells, size), blocks));
-      return { blocks, local, time_s, usable, box, change, random, systematic, coverage };
+      return { blocks, local, time_s, usable, common, change, random, systematic, coverage, rate };
     }
 
     function parsePlace({ head, bytes }) {
@@ -46,7 +46,7 @@ const stationCurves = (() => {
 
     async function load(tier, name) {
       const tile = await stationTiles.load(`${tier}/${name}`, about.versions[tier]);
-      return tile && (tier === "places" ? parsePlace(tile) : parseCurve(tile));
+      return tile && (tier === "places" ? parsePlace(tile) : parseCurve(tile, tier === "levels"));
     }
 
     // The blocks (row, column, weight) of tiles, with their values over time; those never observed are left out.
@@ -75,15 +75,15 @@ const stationCurves = (() => {
             values.set(time_s, coverage ? {
               change: tier.change[i] * about.quantum_m,
               random: sigma(tier.random[i]) / Math.sqrt(coverage), systematic: sigma(tier.systematic[i]),
-              coverage, box: sigma(tier.box[t]),
+              coverage, common: sigma(tier.common[t]),
             } : null);
           });
         }
-        const jacobian = place.values > JACOBIAN + 1
+        const jacobian = place.values > JACOBIAN
           ? Array.from({ length: JACOBIAN_ROWS }, (_, k) => place.column(JACOBIAN + k, index)) : null;
         found.push({
           row, column, weight, values, jacobian, reference_m: place.column(REFERENCE, index), near: place.column(NEAR, index), height_m: place.column(HEIGHT, index), range_m: place.column(RANGE, index),
-          incidence_deg: place.column(INCIDENCE, index), box_m: place.column(place.values - 1, index),
+          incidence_deg: place.column(INCIDENCE, index),
         });
       }
       return found;
@@ -100,7 +100,7 @@ const stationCurves = (() => {
     }
 
     // The weighted sum of blocks at each time: weights add up to 1, or to 0 for a difference of two places.
-    function sums(blocks, small, isDifference) {
+    function sums(blocks, isDifference) {
       const times = [...new Set(blocks.flatMap((block) => [...block.values.keys()]))].sort((a, b) => a - b);
       return times.map((time_s) => {
         const seen = blocks.filter((block) => block.values.get(time_s)), at = seen.map((block) => block.values.get(time_s));
@@ -114,8 +114,7 @@ const stationCurves = (() => {
         if (seen.length === 1) {
           systematic2 = (weights[0] * at[0].systematic * seen[0].near) ** 2;
         } else if (model && seen.every((block) => block.own_m)) {
-          const scaled = seen.map((block, i) => weights[i] * (isDifference ? block.near : 1) *
-            (small || !at[i].box || !block.box_m ? at[i].systematic / block.own_m : at[i].box / block.box_m));
+          const scaled = seen.map((block, i) => weights[i] * (isDifference ? block.near : 1) * at[i].systematic / block.own_m);
           systematic2 = stationCovariance.variance(model, seen.map((block) => block.jacobian), scaled);
         } else {
           systematic2 = dot((w, v) => Math.abs(w) * v.systematic) ** 2;
@@ -123,6 +122,7 @@ const stationCurves = (() => {
         const inside = blocks.reduce((sum, block) => sum + Math.abs(block.weight), 0);
         return {
           time_s, change: dot((w, v) => w * v.change), random: Math.sqrt(random2), systematic: Math.sqrt(systematic2), reference2,
+          common: isDifference ? 0 : Math.min(dot((w, v) => w * v.common), Math.sqrt(systematic2)),  // changes little within an area
           sigma: Math.sqrt(random2 + systematic2), observed: isDifference ? 1 : total / inside,
         };
       });
@@ -133,14 +133,31 @@ const stationCurves = (() => {
 
     async function place(position) {
       const [block] = await read([[...blockOf(position), 1]]);
-      return block ? { ...block, curve: sums([block], true, false) } : null;
+      return block ? { ...block, curve: sums([block], false) } : null;
     }
 
     async function difference(position, other) {
       const blocks = await read([[...blockOf(position), -1], [...blockOf(other), 1]]);
       if (blocks.length < 2) return null;
       await prepare(blocks);
-      return sums(blocks, true, true);
+      return sums(blocks, true);
+    }
+
+    // Level and rate of a place at the end of each day; null where the station keeps no levels.
+    async function levels(position) {
+      const [row, column] = blockOf(position);
+      if (!about.versions.levels || !isKnown(row, column)) return null;
+      const tile = await load("levels", tileOf("levels", row, column).join("_"));
+      const at = tile ? tile.local.indexOf(localOf("levels", row, column)) : -1;
+      if (at < 0) return null;
+      const curve = (unit, [value, random, systematic]) => tile.time_s.map((time_s, t) => {
+        const i = t * tile.blocks + at, coverage = tile.coverage[i] / about.full;
+        if (!coverage) return { time_s, change: null };
+        return { time_s, change: value[i] * unit, sigma: Math.hypot(sigma(random[i]) / Math.sqrt(coverage), sigma(systematic[i])) };
+      });
+      return {
+        level: curve(about.quantum_m, [tile.change, tile.random, tile.systematic]), rate: curve(about.rate_quantum_m, tile.rate),
+      };
     }
 
     // Blocks whose share of their area inside the polygon is at least that of one of 16 points.
@@ -171,18 +188,32 @@ const stationCurves = (() => {
       await prepare(blocks);
       const weight = chosen.reduce((sum, block) => sum + block[2], 0);
       const known = blocks.reduce((sum, block) => sum + block.weight, 0);
-      const curve = sums(blocks, span <= SMALL, false);
+      const curve = sums(blocks, false);
       for (const point of curve) if (point.observed) point.observed *= known / weight;
       return { curve, size_m2, blocks: blocks.length };
     }
 
-    return { place, difference, area, maxArea_m2: MAX_BLOCKS * about.block_m ** 2 };
+    // A function that gives the correlation of the change of two times; 0 where it is unknown.
+    async function correlations() {
+      const tile = await stationTiles.load("pairs", about.versions.pairs);
+      if (!tile) return () => 0;
+      const { times, full } = tile.head, steps_s = stationTiles.fromPlanes(tile.bytes, 0, times, 4);
+      const index = new Map(Array.from(steps_s, ((sum) => (step, i) => [sum += step >>> 0, i])(0)));
+      return (...times_s) => {
+        const [low, high] = times_s.map((time_s) => index.get(time_s)).sort((a, b) => a - b);
+        return high > low ? tile.bytes[4 * times + high * (high - 1) / 2 + low] / full - 1 : 0;
+      };
+    }
+
+    return { place, levels, difference, area, correlations, maxArea_m2: MAX_BLOCKS * about.block_m ** 2 };
   }
 
-  // The change between two times of a curve. The error of the reference is in both, and cancels.
-  function between(after, before) {
-    const variance = after.sigma ** 2 + before.sigma ** 2 - after.reference2 - before.reference2;
-    return { change: after.change - before.change, sigma: Math.sqrt(Math.max(variance, 0)) };
+  // The change between two times of a curve, of which the change has a correlation. The error of the reference
+  // is in both, and cancels; so do the errors that similar change causes in both.
+  function between(after, before, correlation) {
+    const random2 = after.random ** 2 + before.random ** 2 - after.reference2 - before.reference2;
+    const systematic2 = after.systematic ** 2 + before.systematic ** 2 - 2 * correlation * after.common * before.common;
+    return { change: after.change - before.change, sigma: Math.sqrt(Math.max(random2, 0) + Math.max(systematic2, 0)) };
   }
 
   function contains(polygon, east, north) {

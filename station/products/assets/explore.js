@@ -195,7 +195,18 @@
         [text.height, `${number(answer.height_m, 1)} m`], [text.range, `${grouped(answer.range_m)} m`],
         [text.incidence, `${number(answer.incidence_deg, 0)}°`],
       ]);
+      showLevels(position);
     });
+  }
+
+  // Level and rate below the curve of a place, when they are there: the curve does not wait for them.
+  async function showLevels(position) {
+    const mine = question, levels = await reader.levels(position);
+    if (!levels || mine !== question) return;
+    current.levels = levels;
+    for (const [title, curve] of [[text.curve_level, levels.level], [text.curve_rate, levels.rate]]) drawCurve(title, curve);
+    page.flush();
+    showValues();
   }
 
   function askDifference(first, second) {
@@ -229,13 +240,13 @@
   const withHalf = (value, sigma, digits, unit) => `${grouped(value, digits)} ± ${grouped(HALF_95 * sigma, digits)} ${unit}`;
   const tell = (words) => panel.replaceChildren(make("p", { textContent: words }));
 
+  const endOfDay = (time_s) => (Math.floor(time_s / 86400) + 1) * 86400;  // a map shows the level of its day
   let current = null;
   function show(heading, title, curve, rows) {
     current = { curve, rows };
     const list = make("dl", { id: "asked-values" });
-    panel.replaceChildren(make("h3", { textContent: heading }), list);
-    const time_s = curve.map((point) => point.time_s);
-    page.curve(panel, title, time_s, [{ values: curve.map((p) => p.change), half: curve.map((p) => p.change == null ? null : HALF_95 * p.sigma), digits: 3 }]);
+    panel.replaceChildren(make("h3", { textContent: heading }), list, make("div", { id: "asked-curves" }));
+    drawCurve(title, curve);
     page.flush();
     const close = make("button", { type: "button", textContent: text.close });
     close.addEventListener("click", () => map.on.finish(null));
@@ -245,6 +256,9 @@
     showValues();
   }
 
+  const drawCurve = (title, curve) => page.curve(byId("asked-curves"), title, curve.map((point) => point.time_s),
+    [{ values: curve.map((p) => p.change), half: curve.map((p) => p.change == null ? null : HALF_95 * p.sigma), digits: 3 }]);
+
   function csvOf(curve) {
     const lines = curve.filter((p) => p.change != null).map((p) =>
       [new Date(p.time_s * 1000).toISOString(), ...[p.change, p.sigma, p.random, p.systematic].map((v) => v.toFixed(5))].join(","));
@@ -252,6 +266,7 @@
     return `data:text/csv,${encodeURIComponent([head, ...lines, ""].join("\n"))}`;
   }
 
+  let correlation = null;  // of the change of two scans, once needed
   // The values at the time of the shown map, or at the last one before it that has any.
   function showValues() {
     const list = byId("asked-values");
@@ -262,10 +277,15 @@
     if (!at) { list.append(make("p", { textContent: text.not_observed })); return; }
     const from = layers.before() && known.filter((p) => p.time_s <= layers.before().time_s + 1).at(-1);
     if (from) {
-      const { change, sigma } = stationCurves.between(at, from);
+      if (!correlation) reader.correlations().then((found) => { correlation = found; showValues(); });
+      const { change, sigma } = stationCurves.between(at, from, correlation ? correlation(at.time_s, from.time_s) : 0);
       list.append(make("div", {}, make("dt", { textContent: fill(text.since_scan, { time: page.utc(from.time_s) }) }), make("dd", { textContent: withHalf(change, sigma, 3, "m"), title: text.pair_sigma })));
     }
-    for (const [name, value] of current.rows(at)) list.append(make("div", {}, make("dt", { textContent: name }), make("dd", { textContent: value })));
+    const levels = Object.entries(current.levels || {}).flatMap(([name, curve]) => {
+      const last = curve.filter((p) => p.change != null && p.time_s <= endOfDay(data.maps[shown].time_s)).at(-1);
+      return last ? [[`${text[`layer_${name}`]} (${page.utc(last.time_s)})`, withHalf(last.change, last.sigma, 3, name === "rate" ? "m/d" : "m")]] : [];
+    });
+    for (const [name, value] of [...current.rows(at), ...levels]) list.append(make("div", {}, make("dt", { textContent: name }), make("dd", { textContent: value })));
     list.append(make("div", {}, make("dt", { textContent: "UTC" }), make("dd", { textContent: page.utc(at.time_s) })));
   }
 

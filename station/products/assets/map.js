@@ -3,7 +3,7 @@ function stationMap(canvas, extent, redraw) {
   const context = canvas.getContext("2d");
   const view = { east: 0, north: 0, scale: 1 };  // map coordinates of the middle; metres per pixel of the page
   const MAX_ZOOM = 200, HOLD_MS = 500, CLICK_PX = 6;
-  let width = 0, height = 0, frame = 0, fitted = 1;
+  let width = 0, height = 0, frame = 0, fitted = 1, isHome = true;
 
   const toPixel = ([east, north]) => [width / 2 + (east - view.east) / view.scale, height / 2 - (north - view.north) / view.scale];
   const toMap = (x, y) => [view.east + (x - width / 2) * view.scale, view.north - (y - height / 2) * view.scale];
@@ -20,17 +20,20 @@ function stationMap(canvas, extent, redraw) {
     });
   }
 
+  // The size may change late, with styles or the window: a place that is shown stays in the middle.
   function resize() {
-    const ratio = devicePixelRatio || 1, isWhole = !width || view.scale === fitted;  // stays so: styles may come late
+    const ratio = devicePixelRatio || 1, isFitted = view.scale === fitted;
     width = canvas.clientWidth;
     height = canvas.clientHeight;
     canvas.width = Math.round(width * ratio);
     canvas.height = Math.round(height * ratio);
     fitted = Math.max((extent.east - extent.west) / width, (extent.north - extent.south) / height);
-    if (isWhole) home(); else draw();
+    if (isFitted) view.scale = fitted;
+    if (isHome) home(); else draw();
   }
 
   function home() {
+    isHome = true;
     view.east = (extent.west + extent.east) / 2;
     view.north = (extent.south + extent.north) / 2;
     view.scale = fitted;
@@ -40,6 +43,7 @@ function stationMap(canvas, extent, redraw) {
   const clamp = (value, low, high) => Math.min(Math.max(value, low), high);
 
   function move(x_px, y_px) {
+    isHome = false;
     view.east = clamp(view.east - x_px * view.scale, extent.west, extent.east);
     view.north = clamp(view.north + y_px * view.scale, extent.south, extent.north);
     draw();
@@ -48,6 +52,7 @@ function stationMap(canvas, extent, redraw) {
   // Zoom so that the point of the map at a pixel stays where it is.
   function zoom(factor, x = width / 2, y = height / 2) {
     const [east, north] = toMap(x, y);
+    isHome = false;
     view.scale = clamp(view.scale / factor, fitted / MAX_ZOOM, fitted * 1.5);
     view.east = clamp(east - (x - width / 2) * view.scale, extent.west, extent.east);
     view.north = clamp(north + (y - height / 2) * view.scale, extent.south, extent.north);
@@ -55,6 +60,7 @@ function stationMap(canvas, extent, redraw) {
   }
 
   function centre([east, north], scale) {
+    isHome = false;
     view.east = east;
     view.north = north;
     if (scale) view.scale = clamp(scale, fitted / MAX_ZOOM, fitted * 1.5);
@@ -135,6 +141,7 @@ function stationMap(canvas, extent, redraw) {
     event.preventDefault();
     KEYS[event.key](event);
   });
+  resize();
   new ResizeObserver(resize).observe(canvas);
 
   return { draw, home, zoom, centre, on, view, now, isMoving: () => pointers.size > 0, box: () => box && box.map((p) => toMap(...p)) };

@@ -1,10 +1,12 @@
 """Curves of the page: change of each block of about 10 m over time with its sigma, in tiles.
 
 Three tiers of tiles have the values: `latest` is rewritten with each scan, `recent` with every eighth,
-`older` once a day. `places` has what no scan changes, renewed each month. Times are thinned as the maps are.
+`older` once a day, as `levels`, where the station keeps them. `places` has what no scan changes, renewed each
+month. Times are thinned as the maps are.
 The systematic errors of an area are propagated in the browser: from the Jacobian of its blocks, the mean
-covariance of the retained epochs in `systematic`, and how the sigma of an epoch differs from it. Source:
-equations.md, 6.2.
+covariance of the retained epochs in `systematic`, and how the sigma of an epoch differs from it. Errors that
+two epochs with a map have in common follow from their size in the mean of a tile and the correlation in
+`pairs`. Source: equations.md, 6.2.
 """
 
 from __future__ import annotations
@@ -16,11 +18,9 @@ import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from datetime import UTC, datetime
-from functools import cached_property
 from pathlib import Path
 
 import numpy as np
-from scipy import sparse
 
 from station.archive.derived.boxes import DAY_S
 from station.archive.netcdf_layout import Series
@@ -32,6 +32,8 @@ from station.products.viewer.block_codes import (
     BlockCodes,
     CurveEpoch,
 )
+from station.products.viewer.level_curves import RATE_QUANTUM_M, LevelCodes
+from station.products.viewer.pair_correlations import write_pairs
 from station.products.viewer.tiles import (
     Array,
     TileFolder,
@@ -40,18 +42,18 @@ from station.products.viewer.tiles import (
     tile_script,
     zigzag_differences,
 )
-from station.quantities import Bools, Floats, Ints, SharedParameters
+from station.quantities import Bools, Floats, SharedParameters
 from station.queries.block_sums import Sums
 from station.queries.blocks import BlockQueries
-from station.science.analysis.calibration import SparseJacobian
 from station.science.uncertainty.jacobian import HeightJacobian
 
-TILE_BLOCKS = {"latest": 12, "recent": 5, "older": 5, "places": 5}  # along each side of a tile
+TILE_BLOCKS = {"latest": 12, "recent": 5, "older": 5, "levels": 5, "places": 5}  # along each side of a tile
 LATEST = 8  # epochs before they go to the recent tier
 RECENT_DAYS = 2  # before the last one, of which all epochs are in the recent tier
 MAX_RECENT, MAX_OLDER = 132, 110  # epochs of a curve
 MAX_BASE = 24  # epochs whose covariance is averaged
 CODE_BYTES = {"change": 3, "random": 2, "systematic": 2, "coverage": 1}  # of a value, by name
+LEVEL_BYTES = CODE_BYTES | {"rate": 3, "rate_random": 2, "rate_systematic": 2}  # of a level
 
 
 def curve_tiers(start_s: Floats, retained: Sequence[int]) -> dict[str, list[int]]:
@@ -105,15 +107,31 @@ def update_curves(
     for name, tier in wanted.items():
         keys[name] = tiles.key([epoch.ref.epoch_file for epoch in tier])
         if on_disk.get(name) != keys[name]:
-            tiles.write_curves(name, tier)
+            tiles.write_curves(name, [(epoch.start_s, epoch.is_usable, codes.read(epoch)) for epoch in tier])
             progress()
+    levels = LevelCodes(series, codes.cache / "levels", codes.version, codes.surface.known, queries.cells)
+    days = levels.keep(progress)
+    keys["levels"] = tiles.key(days)
+    if on_disk.get("levels") != keys["levels"]:
+        readable = {name: day for name in days if (day := levels.read(name)) is not None}
+        tiles.write_curves("levels", [(time_s, True, day) for time_s, day in readable.values()])
+        keys["levels"] = tiles.key(list(readable))
+        progress()
+    with_map = [epoch for tier in wanted.values() for epoch in tier if epoch.has_map]
+    keys["pairs"] = tiles.key([epoch.ref.epoch_file for epoch in with_map])
+    if on_disk.get("pairs") != keys["pairs"]:
+        write_pairs(folder, codes, with_map)
     if on_disk.get("places") != keys["places"]:
         os.sync()  # before the keys that say that the tiles are there
     if on_disk != keys:
         tiles.write_keys(keys)
-    return tiles.description() | {
-        "versions": {name: key[:8] for name, key in keys.items() if name == "places" or wanted[name]}
+    filled = {
+        "places",
+        "pairs",
+        *(name for name, tier in wanted.items() if tier),
+        *(["levels"] if days else []),
     }
+    return tiles.description() | {"versions": {name: key[:8] for name, key in keys.items() if name in filled}}
 
 
 def _mean_shared(queries: BlockQueries, epochs: list[CurveEpoch]) -> SharedParameters | None:
@@ -164,13 +182,6 @@ class _Tiles:
         self.surface = codes.surface
         self._groupings = {size: _Grouping(self.surface.known, size) for size in set(TILE_BLOCKS.values())}
 
-    @cached_property
-    def _box(self) -> Array:
-        """Return the box of 100 m (n,) of each block, as an index into the flattened boxes."""
-        row, column = np.nonzero(self.surface.known)
-        size = self._queries.blocks_per_box
-        return np.asarray(row // size * -(-self.surface.known.shape[1] // size) + column // size)
-
     def key(self, names: list[str]) -> str:
         """Return a text that changes with what a tier is made of."""
         return hashlib.sha256(json.dumps([FORMAT, self._codes.version, *names]).encode()).hexdigest()
@@ -187,35 +198,31 @@ class _Tiles:
         """Write the keys of the tiers on disk."""
         replace_file(self._folder / ".curves" / "keys.json", json.dumps(keys).encode())
 
-    def write_curves(self, tier: str, epochs: Sequence[CurveEpoch]) -> None:
-        """Write the tiles of a tier."""
-        folder, grouping = TileFolder(self._folder / tier), self._groupings[TILE_BLOCKS[tier]]
-        if epochs:
-            codes = [self._codes.read(epoch) for epoch in epochs]
+    def write_curves(self, tier: str, times: Sequence[tuple[float, bool, Sums]]) -> None:
+        """Write the tiles of a tier: of each time [s], whether it is usable and its codes."""
+        size = TILE_BLOCKS[tier]
+        folder, grouping = TileFolder(self._folder / tier), self._groupings[size]
+        if times:
+            unknown = np.zeros(len(grouping.tiles), np.uint16)
+            common = np.array([epoch.get(f"common_{size}", unknown) for _, _, epoch in times])
+            codes = [codes for _, _, codes in times]
             planes = np.concatenate(
                 [
-                    byte_planes(encoded(codes, name)[:, grouping.order], size)
-                    for name, size in CODE_BYTES.items()
+                    byte_planes(encoded(codes, name)[:, grouping.order], count)
+                    for name, count in (LEVEL_BYTES if tier == "levels" else CODE_BYTES).items()
                 ]
             )
-            start_s = np.array([round(epoch.start_s) for epoch in epochs], np.int64)
+            time_s = np.array([round(second) for second, _, _ in times], np.int64)
             heads = [
-                byte_planes(np.diff(start_s, prepend=0), 4).tobytes(),
-                np.array([epoch.is_usable for epoch in epochs], np.uint8).tobytes(),
+                byte_planes(np.diff(time_s, prepend=0), 4).tobytes(),
+                np.array([is_usable for _, is_usable, _ in times], np.uint8).tobytes(),
             ]
-            boxes = byte_planes(self._box_of_tiles(codes, grouping), 2)
+            errors = byte_planes(common, 2)
             for position, (number, first, end) in enumerate(grouping.tiles):
-                box, values = boxes[:, :, position].tobytes(), planes[:, :, first:end].tobytes()
-                data = b"".join([grouping.local[first:end].tobytes(), *heads, box, values])
-                folder.write(grouping.name(number), {"times": len(epochs), "blocks": end - first}, data)
+                shared, values = errors[:, :, position].tobytes(), planes[:, :, first:end].tobytes()
+                data = b"".join([grouping.local[first:end].tobytes(), *heads, shared, values])
+                folder.write(grouping.name(number), {"times": len(times), "blocks": end - first}, data)
         folder.delete_others()
-
-    def _box_of_tiles(self, codes: list[Sums], grouping: _Grouping) -> Ints:
-        """Return the code (t, tiles) of the systematic sigma of the box in the middle of each tile."""
-        middle = np.array([(first + end) // 2 for _, first, end in grouping.tiles])
-        box = self._box[grouping.order][middle]
-        rows = [epoch["boxes"].ravel() if "boxes" in epoch else None for epoch in codes]
-        return np.array([np.zeros(len(box), int) if row is None else row[box] for row in rows], np.int64)
 
     def write_places(self, base: SharedParameters | None) -> None:
         """Write what no scan changes: heights, geometry and Jacobian of blocks, and the mean covariance."""
@@ -229,12 +236,9 @@ class _Tiles:
             np.sqrt(reference_m2),
             self._codes.near_ratio,
         ]
-        box_m = np.zeros(len(grouping.order))
-        if jacobian is not None and base is not None:
+        if jacobian is not None:
             rows += [*jacobian.pose, jacobian.sight_tilt, jacobian.refraction, jacobian.cross_tilt]
             rows += [jacobian.knot_position]
-            box_m = self._box_sigma(jacobian, base)
-        rows.append(box_m)
         values = np.array(rows, np.float64)[:, grouping.order].astype("<f4")
         folder = TileFolder(self._folder / "places")
         for number, first, end in grouping.tiles:
@@ -242,15 +246,6 @@ class _Tiles:
             folder.write(grouping.name(number), {"blocks": end - first, "values": len(values)}, data)
         folder.delete_others()
         _write_systematic(self._folder / "systematic.js", jacobian, base)
-
-    def _box_sigma(self, jacobian: HeightJacobian, base: SharedParameters) -> Floats:
-        """Return the systematic sigma (n,) of the box of each block for the mean covariance [m]."""
-        box, index = np.unique(self._box, return_inverse=True)
-        count = np.bincount(index)
-        entries = 1 / count[index], (index, np.arange(len(index)))
-        weights = sparse.csr_array(entries, shape=(len(box), len(index)))
-        variance_m2 = SparseJacobian(jacobian).sums(weights).variance(np.zeros(len(index)), base)
-        return np.asarray(np.sqrt(variance_m2)[index])
 
     def description(self) -> dict[str, object]:
         """Return what a browser must know to read the tiles."""
@@ -267,6 +262,7 @@ class _Tiles:
             "tiles": base64.b64encode(np.packbits(has_tile).tobytes()).decode(),
             "columns": grouping.columns,
             "quantum_m": QUANTUM_M,
+            "rate_quantum_m": RATE_QUANTUM_M,
             "sigma_min_m": SIGMA_MIN_M,
             "sigma_step": SIGMA_STEP,
             "full": self._codes.max_coverage,

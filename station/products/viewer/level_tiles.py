@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import h5py
@@ -17,6 +17,7 @@ from station.archive.raster_io import Array
 from station.archive.read_errors import read_errors
 from station.archive.schema import FILL
 from station.archive.small_variables import read_number, read_text
+from station.errors import StoreError
 from station.products.overview import BAND_ROWS, BaseMap, Overview, OverviewBuilder
 from station.products.viewer.value_tiles import has_values, write_means
 
@@ -38,37 +39,55 @@ class LevelMap:
         return tuple(f"{quantity}_{self.name}" for quantity in QUANTITIES)
 
 
-def level_at(levels: list[LevelMap], time_s: float, version: str) -> str | None:
-    """Return the name of the level at the end of the day of a time, or of the last one before; or None."""
-    end_s = (time_s // DAY_S + 1) * DAY_S
-    names = [level.name for level in levels if level.time_s < end_s and level.version == version]
-    return names[-1] if names else None
+@dataclass(frozen=True)
+class LevelMaps:
+    """The maps of level and rate, in order of time, and why some are missing."""
+
+    maps: list[LevelMap] = field(default_factory=list)
+    faults: list[str] = field(default_factory=list)
+
+    def at(self, time_s: float, version: str) -> str | None:
+        """Return the name of the level at the end of the day of a time, or of the last before; or None."""
+        end_s = (time_s // DAY_S + 1) * DAY_S
+        names = [level.name for level in self.maps if level.time_s < end_s and level.version == version]
+        return names[-1] if names else None
 
 
-def update_levels(
-    series: Series, folder: Path, base: BaseMap, progress: Callable[[], None]
-) -> list[LevelMap]:
-    """Make the missing maps of the newest days that have the reference of a base map; return all, in order.
+def update_levels(series: Series, folder: Path, base: BaseMap, progress: Callable[[], None]) -> LevelMaps:
+    """Make the missing maps of the newest days that have the reference of a base map; return all.
 
-    Raises StoreError if a file is damaged or cannot be written.
+    A day whose file is damaged has no map until the file is computed again. Raises StoreError if a map cannot
+    be written.
     """
-    maps = []
+    levels = LevelMaps()
     for path in [path for path in level_files(series) if is_day(path)][-MAX_DAYS:]:
-        with read_errors(path), h5py.File(path, "r") as file:
-            version = read_text(file, "reference_version", 0)
-            level_map = LevelMap(path.stem, read_number(file, "time", 0), version)
-        if version != base.version:
+        try:
+            level_map = read_head(path)
+            if level_map.version != base.version:
+                continue
+            overviews = {
+                name: _overview(path, quantity, base)
+                for quantity, name in zip(QUANTITIES, level_map.folders, strict=True)
+                if not has_values(folder, name, base, cells=False)
+            }
+        except StoreError as error:
+            levels.faults.append(f"{error}: the page lacks this day's level (station check --store)")
             continue
-        maps.append(level_map)
-        for quantity, name in zip(QUANTITIES, level_map.folders, strict=True):
-            if not has_values(folder, name, base, cells=False):
-                write_means(folder, name, _overview(path, quantity, base))
-                progress()
-    return maps
+        for name, overview in overviews.items():
+            write_means(folder, name, overview)
+            progress()
+        levels.maps.append(level_map)
+    return levels
+
+
+def read_head(path: Path) -> LevelMap:
+    """Return name, time and reference of a file of levels; raise StoreError if it is damaged."""
+    with read_errors(path), h5py.File(path, "r") as file:
+        return LevelMap(path.stem, read_number(file, "time", 0), read_text(file, "reference_version", 0))
 
 
 def _overview(path: Path, quantity: str, base: BaseMap) -> Overview:
-    """Return level or rate in pixels, with the sigma of their means."""
+    """Return level or rate in pixels, with the sigma of their means; raise StoreError if damaged."""
     builder = OverviewBuilder(base)
     value, random, systematic = (
         level_raster(path, f"{quantity}{part}")
@@ -76,8 +95,9 @@ def _overview(path: Path, quantity: str, base: BaseMap) -> Overview:
     )
     for top in range(0, value.shape[0], BAND_ROWS):
         rows = slice(top, min(top + BAND_ROWS, value.shape[0]))
-        random_m = np.asarray(random[rows])
-        band = {CHANGE: value[rows], TOTAL: np.hypot(random_m, systematic[rows]), RANDOM: random_m}
+        with read_errors(path):
+            random_m = np.asarray(random[rows])
+            band = {CHANGE: value[rows], TOTAL: np.hypot(random_m, systematic[rows]), RANDOM: random_m}
         builder.add(rows, {name: _as_stored(np.asarray(values)) for name, values in band.items()})
     return builder.build()
 

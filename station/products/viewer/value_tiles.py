@@ -255,6 +255,7 @@ def delete_cells(folder: Path, epoch_file: str, base: BaseMap) -> None:
 
 def delete_old_values(folder: Path, keep: Iterable[str], versions: Iterable[str]) -> None:
     """Delete the tiles of epochs and references that are no longer kept, an hour after they were written."""
+    shutil.rmtree(folder / "heights", ignore_errors=True)  # of pages before there were tiles of the ground
     for kind, names in ((VALUES, {Path(name).stem for name in keep}), (HEIGHTS, set(versions))):
         for path in (folder / kind).glob("*"):
             if path.name not in names and time.time() - path.stat().st_mtime > DELETE_GRACE_S:

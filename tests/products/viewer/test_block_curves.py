@@ -78,7 +78,7 @@ def test_a_tile_has_the_changes_and_sigmas_of_the_store(series, curve_epochs, tm
 
 def test_epochs_are_in_their_tiers(series, curve_epochs, tmp_path):
     about = update_curves(series, tmp_path, tiers(curve_epochs, older=1, recent=3), lambda: None)
-    assert set(about["versions"]) == {"places", "older", "recent", "latest"}
+    assert set(about["versions"]) == {"places", "pairs", "older", "recent", "latest"}
     times_s = [round(epoch.start_s) for epoch in curve_epochs]
     for name, expected_s in {
         "older/1_2": times_s[:1], "recent/1_2": times_s[1:4], "latest/0_0": times_s[4:],

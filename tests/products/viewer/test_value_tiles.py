@@ -158,7 +158,9 @@ def test_values_and_heights_of_a_small_store(series, small, tmp_path):
 def test_old_values_go_after_an_hour(series, tmp_path, monkeypatch):
     epoch, base = SeriesIndex(series)[2], base_map(series, "1", 600)
     value_tiles.write_means(tmp_path, epoch.epoch_file, read_overview(epoch, base))
+    (tmp_path / "heights" / "1").mkdir(parents=True)  # of an older page, in another form
     value_tiles.delete_old_values(tmp_path, [], [])
+    assert not (tmp_path / "heights").exists()
     assert value_tiles.has_values(tmp_path, epoch.epoch_file, base, cells=False)
     monkeypatch.setattr(value_tiles, "DELETE_GRACE_S", -1.0)
     value_tiles.delete_old_values(tmp_path, [epoch.epoch_file], [])

@@ -20,7 +20,7 @@ from station.queries.aggregates import Aggregates
 from station.readers.polygons import cells_inside, read_polygons
 
 pytestmark = pytest.mark.integration
-PLACE = 30, 20  # column and row
+PLACE = 34, 20  # column and row, not in the middle of the map
 LEVEL_SIGMA_M = 0.006, 0.008  # random and systematic
 REFERENCE_M = 0.014  # random sigma of its cells
 
@@ -100,8 +100,14 @@ def value_under_the_pointer(tab, east_m, north_m):
     tab.run("document.getElementById('map').scrollIntoView()")
     tab.run(f"document.querySelector('#map-tools input').value = '{east_m} {north_m}'")
     tab.run("document.querySelector('#map-tools form').requestSubmit()")
+    return value_in_the_middle(tab)
+
+
+def value_in_the_middle(tab):
+    """Change and half of its 95 % interval that the map shows in its middle [m]."""
     box = tab.run("JSON.parse(JSON.stringify(document.getElementById('map-canvas').getBoundingClientRect()))")
     x, y = box["left"] + box["width"] / 2, box["top"] + box["height"] / 2
+    tab.run("document.getElementById('map-hover').textContent = ''")
     tab.call("Input.dispatchMouseEvent", type="mouseMoved", x=x, y=y)
     hover = "document.getElementById('map-hover').textContent"
     tab.await_(f"{hover}.includes(':')")
@@ -130,7 +136,6 @@ def test_values_under_the_pointer_are_those_of_the_store(tab, address, series, s
     slider = "document.getElementById('since')"
     tab.run(f"{slider}.value = 1; {slider}.dispatchEvent(new Event('input'))")
     assert "left out of σ" in tab.run("document.getElementById('map-key').textContent")
-    tab.run("document.getElementById('map-hover').textContent = ''")
     change, half = value_under_the_pointer(tab, east_m + 0.1, north_m)
     expected_m, bound_m = change_m[-1] - change_m[1], np.hypot(sigma_m[-1], sigma_m[1])
     pair_m = (bound_m**2 - 2 * REFERENCE_M**2) ** 0.5
@@ -150,7 +155,6 @@ def test_values_under_the_pointer_are_those_of_the_store(tab, address, series, s
     set_control(tab, "show-swipe", "checked", "true")
     for border, scan in ((75, 1), (25, -1)):
         set_control(tab, "swipe", "value", border)
-        tab.run("document.getElementById('map-hover').textContent = ''")
         change, half = value_under_the_pointer(tab, east_m, north_m)
         assert change == pytest.approx(change_m[scan], abs=sigma_m[scan] / 8 + 0.0006)
         assert half == pytest.approx(1.96 * sigma_m[scan], rel=0.06)
@@ -174,6 +178,20 @@ def test_level_and_rate_are_those_of_the_stored_day(tab, address, series):
         assert half == pytest.approx(1.96 * unit * sigma_m, rel=0.06, abs=0.0006)
         assert "2025-11-21 01:23 UTC" in tab.run("document.getElementById('map-key').textContent")
         assert ("m/d" in tab.run("document.getElementById('map-hover').textContent")) == (layer == "rate")
+    # the curves of the place say the same
+    half_m = 1.96 * np.hypot(*LEVEL_SIGMA_M)
+    asked = tab.await_(
+        "document.getElementById('asked-values')?.textContent.includes('m/d') &&"
+        " document.getElementById('asked-values').textContent"
+    )
+    assert f"Level (2025-11-21 01:23){level_at(column):.3f} ± {half_m:.3f} m" in asked
+    assert f"Rate (2025-11-21 01:23){level_at(column) / 10:.3f} ± {half_m / 10:.3f} m/d" in asked
+    titles = tab.run("[...document.querySelectorAll('#asked-curves h3')].map((h) => h.textContent)")
+    assert [title.partition(",")[0] for title in titles[1:]] == ["Level", "Rate of the level"]
+    # the place stays in the middle when the map gets another size: with a late first frame, late styles
+    tab.set_size(1000, 900)
+    tab.await_("document.getElementById('map-canvas').width < 1000")
+    assert value_in_the_middle(tab) == [value, half]
     assert tab.errors() == []
 
 
