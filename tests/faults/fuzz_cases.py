@@ -20,7 +20,9 @@ import struct
 import sys
 import warnings
 from collections import Counter
+from contextlib import suppress
 from datetime import UTC, datetime
+from importlib import import_module
 from pathlib import Path
 
 import numpy as np
@@ -38,6 +40,10 @@ from station.readers.sop import read_matrix
 from station.readers.weather import VALID_RANGES, interpolate_air, read_weather
 from station.science.geometry import inclination, pose
 from station.sections.inputs import ScansSection, WeatherSection
+
+for library in ("pye57", "pyogrio"):  # extras, whose own memory does not count
+    with suppress(ImportError):
+        import_module(library)
 
 TIMEOUT_S = 5  # for one case of a few kilobytes
 MEMORY_BYTES = 1 << 29  # in addition to the imported modules

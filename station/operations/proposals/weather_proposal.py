@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import Any
 
 from station.errors import StationError
+from station.operations.proposals.weather_columns import FoundColumns, find_columns
 from station.readers.weather import read_weather
-from station.readers.weather_columns import FoundColumns, find_columns
 from station.sections.inputs import WeatherSection
 
 NAMELESS = ("toa5", "csv")  # dialects whose columns have no usual names

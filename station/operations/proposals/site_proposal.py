@@ -15,8 +15,8 @@ from pyproj.exceptions import CRSError
 from station.errors import ConfigError, StationError
 from station.inbox.listing import is_scan
 from station.operations.inbox_contents import CONVERTED, MANUAL, epoch_advice, files_below, fitting_pattern
+from station.operations.proposals.weather_proposal import weather_lines
 from station.operations.riscan_import import file_stem, import_riscan, matrix_text, site_text, write_new
-from station.operations.weather_proposal import weather_lines
 from station.processing.workers import isolation
 from station.quantities import Floats
 from station.readers.formats.conversion import open_site_scan

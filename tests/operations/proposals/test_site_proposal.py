@@ -17,11 +17,11 @@ from support import tiny_station
 
 from station.config import read_site
 from station.errors import ConfigError
-from station.operations.site_proposal import _code, propose_site
+from station.operations.proposals.site_proposal import _code, propose_site
 from station.processing.scans.scan_files import inbox_scans
 from station.readers.weather import read_weather
 
-ROOT = Path(__file__).parents[2]
+ROOT = Path(__file__).parents[3]
 
 
 @pytest.fixture(scope="module")

@@ -4,7 +4,7 @@ import tomllib
 
 import pytest
 
-from station.operations.weather_proposal import weather_lines
+from station.operations.proposals.weather_proposal import weather_lines
 from station.readers.weather import read_weather
 from station.readers.weather_dialects import recognise_dialect
 from station.sections.inputs import WeatherSection
