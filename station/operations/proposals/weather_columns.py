@@ -96,7 +96,7 @@ def _possible_names(file: BinaryIO, dialect: str) -> Iterator[list[str]]:
             with suppress(csv.Error):
                 names = split_line(line, delimiter)
                 if len(names) <= MAX_COLUMNS:
-                    yield [name for name in names if len(name) <= MAX_COLUMN_NAME]
+                    yield [name for name in names if len(name) <= MAX_COLUMN_NAME and name.isprintable()]
 
 
 def _columns_in(names: Sequence[str]) -> FoundColumns:

@@ -76,6 +76,13 @@ def test_columns_of_the_real_log_at_the_hintereisferner_are_in_doubt(shared_data
     assert "# humidity_pct: RHact_1m_Avg or RHact_2m_Avg" in lines
 
 
+@pytest.mark.parametrize("name", ["Temp\x7f", "Temp\x07;Temp", 'Temp"', "Temp\\u00"])
+def test_any_name_of_a_column_leaves_the_site_file_valid(name, tmp_path):
+    """TOML allows no control characters, not even in comments."""
+    (tmp_path / "log").write_text(CSV.replace("Temperatur", f"{name};{name}2").format("2025-07-15 00:10;3"))
+    proposed(tmp_path / "log")
+
+
 @pytest.mark.parametrize("columns", [1000, 1001])
 def test_a_line_of_very_many_columns_is_no_header(columns, tmp_path):
     """Each is tried for each dialect in many ways: a hundred such lines took a minute."""
