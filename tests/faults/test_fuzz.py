@@ -207,7 +207,7 @@ def fuzz(corpus, capsys, *, rounds, each):
 
 @pytest.mark.integration
 def test_few_mutated_files_of_every_kind(corpus, capsys):
-    fuzz(corpus, capsys, rounds=1, each=20)
+    fuzz(corpus, capsys, rounds=1, each=15)
 
 
 @pytest.mark.slow
