@@ -5,6 +5,7 @@ Scans may lie in folders below the inbox: their names then have as many `/` as t
 
 from __future__ import annotations
 
+import hashlib
 import re
 import unicodedata
 from datetime import UTC, datetime
@@ -19,6 +20,7 @@ FIELD_DIGITS = {"Y": 4, "m": 2, "d": 2, "H": 2, "I": 2, "M": 2, "S": 2, "y": 2, 
 ANY = "*"
 ZONE_MARK = "@"  # separates the pattern from its time zone
 SEPARATOR = "/"  # of folders
+MAX_ID_BYTES = 64  # of the name of a scan in the store
 HOURS, MINUTES = ("%H", "%I", "%T", "%X", "%c", "%s", "%f"), ("%M", "%T", "%X", "%c", "%s", "%f")
 
 
@@ -42,10 +44,23 @@ def composed(name: str) -> str:
     return name if name.isascii() else unicodedata.normalize("NFC", name)
 
 
-def scan_id(name: str) -> str:
+def path_stem(name: str) -> str:
     """Return the name of a scan with its folders below the inbox, without suffixes."""
     folder, separator, _ = name.rpartition(SEPARATOR)
     return f"{folder}{separator}{scan_stem(name)}"
+
+
+def scan_id(name: str) -> str:
+    """Return the name of a scan in the store: with its folders, without suffixes, at most 64 bytes.
+
+    Of a longer one it is the end, where the time usually is, after a hash of the whole.
+    """
+    stem = path_stem(name)
+    content = stem.encode("utf-8", "replace")
+    if len(content) <= MAX_ID_BYTES:
+        return stem
+    mark = hashlib.sha256(content).hexdigest()[:8] + "~"
+    return mark + content[len(mark) - MAX_ID_BYTES :].decode("utf-8", "ignore")
 
 
 def folder_depth(pattern: str) -> int:
@@ -74,7 +89,7 @@ def start_in_name(name: str, pattern: str) -> datetime | None:
     before a `/`. `@` and the name of a time zone may follow; of an hour that occurs twice, the first counts.
     """
     pattern, _, zone = composed(pattern).partition(ZONE_MARK)
-    stem = composed(scan_id(name_below(PurePath(name), pattern)))
+    stem = composed(path_stem(name_below(PurePath(name), pattern)))
     if ANY in pattern:
         match = _expression(pattern).fullmatch(stem)
         if match is None:

@@ -284,7 +284,7 @@ def test_inclination_in_the_points_is_used_like_a_log_file(tmp_path):
     """A log file tells each reading's own time, points within 0.1 s: change is the same within 0.1 sigma."""
     series = {}
     for name in ("file", "points"):
-        folder = tiny_station.build(tmp_path / name, method="joint", hours=4)
+        folder = tiny_station.build(tmp_path / name, method="joint", hours=3)
         (folder / "inbox").rmdir()
         (folder / tiny_station.PENDING).rename(folder / "inbox")
         for scan in sorted((folder / "inbox").glob("*.laz")) if name == "points" else ():

@@ -104,6 +104,18 @@ def test_names_with_folders_are_unique_without_suffixes():
     assert name_below(Path("/srv/hut/2025-07-15/a.laz"), "%Y-%m-%d/*") == "2025-07-15/a.laz"
 
 
+def test_names_too_long_for_the_store_stay_apart_in_64_bytes():
+    for letter in ("x", "ä", "雪"):
+        folders = [f"{letter * 40}{number}.PROJ/ScanPos001.SCNPOS/scans" for number in range(1000)]
+        names = [f"{folder}/250715_0900{second:02d}.laz" for folder in folders for second in (0, 1)]
+        identifiers = {scan_id(name) for name in names}
+        assert len(identifiers) == len(names)
+        assert max(len(identifier.encode()) for identifier in identifiers) <= 64
+        assert {identifier[-13:] for identifier in identifiers} == {"250715_090000", "250715_090001"}
+    assert scan_id("x" * 64 + ".laz") == "x" * 64  # as it is, to the last byte
+    assert scan_id("x" * 65 + ".laz") != scan_id("x" * 66 + ".laz")
+
+
 def test_epochs_are_those_of_the_zone():
     late = datetime(2025, 7, 14, 22, 30, tzinfo=UTC)
     assert epoch_name(late, "%Y-%m-%d@Europe/Vienna") == "2025-07-15"

@@ -61,9 +61,9 @@ def station(*arguments):
                           capture_output=True, text=True, check=False, timeout=600)  # fmt: skip
 
 
-def tiled(folder, *, method="joint"):
+def tiled(folder, *, method="joint", hours=3):
     """Return a simulated station whose scans wait as tiles, each with a third of the lines, in a folder."""
-    tiny_station.build(folder, method=method, hours=4)
+    tiny_station.build(folder, method=method, hours=hours)
     text = (folder / "site.toml").read_text()
     text = re.sub(r'name = "%y%m%d_%H%M%S".*', 'name = "%Y-%m-%d Hütte Süd/*_%H%M%S_*"', text)
     text += '\n[epoch]\nname = "%y%m%d_%H%M%S"\nfiles = 3\nwait_s = 3600\n'
@@ -97,7 +97,7 @@ def without_log(folder):
 @pytest.mark.parametrize("has_log", [False, True])
 def test_tiles_of_a_scan_are_measured_as_the_whole_scan(tmp_path, has_log):
     """Without a log to the quantum; a log is laid over other samples of the head's azimuth."""
-    whole = tiny_station.build(tmp_path / "whole", method="joint", hours=4)
+    whole = tiny_station.build(tmp_path / "whole", method="joint", hours=3)
     folder = tiled(tmp_path / "tiles")
     for path in (whole / tiny_station.PENDING).iterdir():
         path.rename(whole / "inbox" / path.name)
@@ -126,9 +126,9 @@ def test_tiles_of_a_scan_are_measured_as_the_whole_scan(tmp_path, has_log):
 
 def test_live_epochs_of_a_killed_service_are_those_of_one_run(tmp_path):
     """Tiles arrive in any order while the service is killed; copies and touched files change nothing."""
-    expected = tiled(tmp_path / "expected")
+    expected = tiled(tmp_path / "expected", hours=4)
     assert station("process", expected / "site.toml", *deliver(expected)).returncode == 0
-    live, random = tiled(tmp_path / "live"), np.random.default_rng(5)
+    live, random = tiled(tmp_path / "live", hours=4), np.random.default_rng(5)
     pending = live / tiny_station.PENDING / DAY
     day = live / "inbox" / DAY
     day.mkdir()

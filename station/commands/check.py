@@ -29,7 +29,7 @@ def init(
 ) -> None:
     """Write a commented site file to start from."""
     from station.config import write_site
-    from station.operations.site_proposal import propose_site
+    from station.operations.proposals.site_proposal import propose_site
 
     for path in [write_site(folder, like)] if source is None else propose_site(source, folder):
         print(path)

@@ -23,7 +23,7 @@ from station.inbox.journal import LONGEST_RETRY_S
 from station.inbox.journal_reader import UNFINISHED, State
 from station.inbox.listing import ScanFile, ScanListing, safe_name, start_from_name
 from station.logs import logfmt
-from station.scan_names import scan_id
+from station.scan_names import path_stem
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Mapping
@@ -206,13 +206,13 @@ class Inbox:
         if inclination and inclination.required and len(scan.logs) < len(scan.files):
             remaining_s = inclination.wait_s - stable_s
             if remaining_s > 0 and not (scan.parts and scan.logs):  # one may serve all files of an epoch
-                return f"{WAITING_FOR_LOG} {scan_id(scan.files[0].name)}{inclination.suffix}", remaining_s
+                return f"{WAITING_FOR_LOG} {path_stem(scan.files[0].name)}{inclination.suffix}", remaining_s
         registration = self._site.registration
         if registration and registration.suffix and len(scan.matrices) < len(scan.files):
             remaining_s = registration.wait_s - stable_s
             if remaining_s > 0:
                 missing = next(file for file in scan.files if file.matrix is None)
-                return f"{WAITING_FOR_MATRIX} {scan_id(missing.name)}{registration.suffix}", remaining_s
+                return f"{WAITING_FOR_MATRIX} {path_stem(missing.name)}{registration.suffix}", remaining_s
         retry_s = self._retry_delay_s(scan, summary)
         return "its next attempt" if retry_s else "", retry_s or math.inf
 

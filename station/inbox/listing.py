@@ -15,7 +15,7 @@ from pathlib import Path
 
 from station.config import Site
 from station.errors import NotReadyError
-from station.scan_names import SEPARATOR, composed, epoch_name, folder_depth, scan_id, start_in_name
+from station.scan_names import SEPARATOR, composed, epoch_name, folder_depth, path_stem, start_in_name
 
 # Names of letters of any language, without control characters or wildcards.
 _SAFE_PART = r"[^\W_](?:[\w.,+=@~() -]*[\w.,+=@~()-])?"
@@ -136,7 +136,7 @@ class ScanListing:
 
     def _beside(self, name: str, suffix: str) -> str:
         """Return the name of the file of a suffix beside a scan; '' without a regular one with content."""
-        companion = f"{scan_id(name)}{suffix}" if suffix else ""
+        companion = f"{path_stem(name)}{suffix}" if suffix else ""
         status = self.files.get(companion)
         is_usable = status is not None and stat.S_ISREG(status.st_mode) and status.st_size > 0
         return companion if is_usable else ""

@@ -43,10 +43,9 @@ from station.errors import StoreError
 from station.inbox.file_hash import sha256_file
 from station.inbox.journal_reader import Entry, State
 from station.processing.provenance import StoredEpoch, stored_epochs
-from station.processing.scans.scan_files import find_scan
+from station.processing.scans.scan_files import ScanFinder
 from station.processing.site_files import series_for
 from station.processing.workers.worker_process import Progress
-from station.readers.formats.conversion import scan_suffixes
 
 
 @dataclass(frozen=True)
@@ -192,7 +191,8 @@ def unjournaled_epochs(site: Site, epochs: Mapping[str, str], progress: Progress
         refs = [
             index[position] for position, name in enumerate(names) if name.decode("ascii") not in journaled
         ]
-    return [_journal_entry(site, stored) for stored in stored_epochs(series, refs)]
+    finder = ScanFinder(site)
+    return [_journal_entry(site, finder, stored) for stored in stored_epochs(series, refs)]
 
 
 def check_store(
@@ -326,11 +326,11 @@ def restore_tilt_offsets(site: Site, progress: Progress) -> None:
             write_tilt_offset(site, sop_id, tilt_offset)
 
 
-def _journal_entry(site: Site, stored: StoredEpoch) -> Entry:
+def _journal_entry(site: Site, finder: ScanFinder, stored: StoredEpoch) -> Entry:
     start = stored.ref.start
     epoch = Path("epochs") / start.strftime("%Y/%m/%d") / stored.ref.epoch_file
     return Entry(
-        name=_scan_filename(site, stored),
+        name=_scan_filename(site, finder, stored),
         size=-1,
         mtime_ns=-1,
         state=State.STORED,
@@ -352,12 +352,8 @@ def _journal_entry(site: Site, stored: StoredEpoch) -> Entry:
     )
 
 
-def _scan_filename(site: Site, stored: StoredEpoch) -> str:
+def _scan_filename(site: Site, finder: ScanFinder, stored: StoredEpoch) -> str:
     """Return the name of the scan of an epoch in the journal; the store has it without suffix."""
-    if site.epoch is not None:
-        return stored.provenance.scan_id
-    for suffix in scan_suffixes(site.scans):
-        name = stored.provenance.scan_id + suffix
-        if find_scan(site, name, stored.provenance.start_s):
-            return name
-    return stored.provenance.scan_id + ".laz"
+    scan = stored.provenance
+    suffix = ".laz" if site.epoch is None else ""
+    return finder.name_of(scan.scan_id, scan.start_s) or f"{scan.scan_id}{suffix}"

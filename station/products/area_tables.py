@@ -28,6 +28,7 @@ from station.products.epoch_table import (
 from station.quantities import Bools
 from station.queries.aggregates import Aggregates
 from station.readers.polygons import cells_inside, read_polygons
+from station.scan_names import scan_id
 
 UNITS = {"mean_change": "m", "median_change": "m", "volume_change": "m3"}
 COLUMN_SUFFIXES = {"": "", "_uncertainty": "_sigma", "_low": "_low95", "_high": "_high95"}
@@ -88,7 +89,7 @@ def find_epoch(series: Series, text: str) -> EpochRef:
     if text == "last":
         return epochs[-1]
     table = read_epoch_table(series)
-    name = text.removesuffix(".laz").removesuffix(".las")
+    name = text if text in table.texts["scan_id"] else scan_id(text)
     if name in table.texts["scan_id"]:
         epoch_file = table.texts["epoch_file"][table.texts["scan_id"].index(name)]
         return next(epoch for epoch in epochs if epoch.epoch_file == epoch_file)

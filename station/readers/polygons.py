@@ -203,7 +203,10 @@ def _read_layer(path: Path) -> tuple[list[_Feature], CRS | None]:
     for number, (wkb, values) in enumerate(zip(geometries, zip(*columns, strict=True), strict=True), start=1):
         name = _name(dict(zip(meta["fields"].tolist(), values, strict=True)), None, number)
         location = f"{path}: feature {number} ({name})"
-        geometry = None if wkb is None else shapely.from_wkb(wkb)
+        try:
+            geometry = None if wkb is None else shapely.from_wkb(wkb)
+        except shapely.GEOSException as error:
+            raise ConfigError(f"{location}: is damaged: {error}") from error
         if geometry is None or geometry.geom_type not in KINDS or geometry.is_empty:
             kind = "without geometry" if geometry is None else geometry.geom_type
             raise ConfigError(f"{location}: is {kind}; expected {' or '.join(KINDS)}")

@@ -285,7 +285,7 @@ def scan_start(
         if name_start is None:
             raise ScanError(
                 f"start unknown: the name does not match scans.name = {pattern!r}"
-                " and the points carry no absolute time"
+                " and the points carry no absolute time: its start must be in its name"
             )
         return name_start
     gps_start = gps_to_utc(times_s[0] + STANDARD_OFFSET_S)

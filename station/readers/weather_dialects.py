@@ -22,7 +22,7 @@ from station.sections.inputs import WeatherSection
 
 MAX_LINE_BYTES = 1 << 16
 MAX_COLUMN_NAME = 200  # characters; in a longer one no unit is looked for, which would take long
-MAX_HEADER_LINES = 100
+MAX_HEADER_LINES, MAX_COLUMNS = 100, 1000  # of a log
 DELIMITERS = (";", "\t", ",", "")  # '': any white space
 QUANTITIES = ("temperature_c", "pressure_hpa", "humidity_pct")
 # Units, in lower case without spaces, degree signs, `deg` and `_`: factor and offset to °C, hPa and %.
@@ -280,6 +280,8 @@ def _find_names(file: BinaryIO, section: WeatherSection, wanted: _Wanted, *, is_
         line = decode(file.readline(MAX_LINE_BYTES))
         for delimiter in [mark for mark in DELIMITERS if mark and mark in line] or [""]:
             names = split_line(line, delimiter)
+            if len(names) > MAX_COLUMNS:
+                continue
             if section.format == "davis" and delimiter == "\t":
                 names = _two_lines(split_line(previous, delimiter), names)
             if not wanted.missing(names, is_part=is_part):

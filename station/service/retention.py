@@ -18,7 +18,7 @@ from station.inbox.listing import ScanFile
 from station.processing.scans.scan_files import ScanFinder, archive_folder, find_scan
 from station.processing.site_files import series_for, sha256_log
 from station.processing.workers.worker_process import Progress
-from station.scan_names import scan_id, scan_stem
+from station.scan_names import path_stem, scan_stem
 
 MAX_PER_RUN = 50  # scans per maintenance run; there are four runs a day
 
@@ -42,7 +42,7 @@ def expired_scans(site: Site, entries: Iterable[Entry], reserved: set[str], now_
         if entry.start_utc_s is not None
         and entry.start_utc_s < cutoff_s
         and entry.outcome is not None
-        and not sop_scans & {scan_id(entry.name), scan_stem(entry.name)}
+        and not sop_scans & {path_stem(entry.name), scan_stem(entry.name)}
         and (settings.raw == "move" or entry.name not in reserved)
         and finder.in_inbox(entry.name)
     ]

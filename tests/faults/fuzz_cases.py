@@ -20,27 +20,37 @@ import struct
 import sys
 import warnings
 from collections import Counter
+from contextlib import suppress
 from datetime import UTC, datetime
+from importlib import import_module
 from pathlib import Path
 
 import numpy as np
+from readers.test_weather_dialects import LOGS
 
 from station.config import read_site
 from station.errors import ConfigError, ScanError
 from station.quantities import AzimuthTrack, Grid
+from station.readers.formats.conversion import open_site_scan
+from station.readers.formats.riscan import read_project
 from station.readers.inclination import read_inclination
 from station.readers.polygons import cells_inside, read_polygons
-from station.readers.scan import open_scan, utc_interval
+from station.readers.scan import utc_interval
 from station.readers.sop import read_matrix
 from station.readers.weather import VALID_RANGES, interpolate_air, read_weather
 from station.science.geometry import inclination, pose
-from station.sections.inputs import WeatherSection
+from station.sections.inputs import ScansSection, WeatherSection
+
+for library in ("pye57", "pyogrio"):  # extras, whose own memory does not count
+    with suppress(ImportError):
+        import_module(library)
 
 TIMEOUT_S = 5  # for one case of a few kilobytes
 MEMORY_BYTES = 1 << 29  # in addition to the imported modules
 RANGE_M = 3000.0
 NAME_PATTERN = "%y%m%d_%H%M%S"
 CORPUS = "corpus"
+COLUMNS = ("x", "y", "z", "intensity", "time", "return_number", "number_of_returns")
 VALID_FILES = {  # kind: file of the corpus, in the order of `write_corpus`
     "las": "250715_000000.las",
     "laz": "250715_000000.laz",
@@ -51,14 +61,27 @@ VALID_FILES = {  # kind: file of the corpus, in the order of `write_corpus`
     "ply": "250715_000000.ply",
     "pcd": "250715_000000.pcd",
     "xyz": "250715_000000.xyz",
+    "text": "250715_000000.txt",
+    "gz": "250715_030000.laz.gz",
+    "copc": "250715_040000.copc.laz",
     "inclination": "incl.txt",
     "toa5": "weather.dat",
     "csv": "weather.csv",
     "smet": "weather.smet",
     "dwd": "weather.dwd",
+    "meteoswiss": "weather.meteoswiss",
+    "geosphere": "weather.geosphere",
+    "davis": "weather.davis",
+    "hobo": "weather.hobo",
+    "lufft": "weather.lufft",
     "sop": "sop.dat",
+    "matrix": "sop.xml",
+    "riscan": "project.rsp",
     "site": "site.toml",
+    "site_keys": "all_keys.toml",
     "polygons": "stable.geojson",
+    "gpkg": "areas.gpkg",
+    "shp": "areas.shp",
 }
 ODD_NUMBERS = (0, 1, 2, 127, 128, 255, 256, 32767, 65535, 2**31 - 1, 2**31, 2**32 - 1, 2**63 - 1, 2**64 - 1)
 ODD_DOUBLES = (0.0, -0.0, 1e-300, 1e300, -1e300, 1e18, math.nan, math.inf, -math.inf, -1.0, 604_800.0, 1e9)
@@ -160,7 +183,8 @@ TEXT = (_flip, _byte, _cut, _drop, _double, _zero, _word, _word, _word, _line)
 def check_scan(path, rng):
     range_max_m = rng.choice((RANGE_M, None))
     pattern = "%Y" if rng.random() > 0.95 else NAME_PATTERN
-    with open_scan(path, range_max_m=range_max_m) as scan:
+    scans = ScansSection(inbox=path.parent, columns=COLUMNS if path.suffix == ".txt" else ())
+    with open_site_scan(path, scans, range_max_m=range_max_m, work_folder=path.parent) as scan:
         start, end, _ = utc_interval(scan, pattern)
         blocks = list(scan.blocks(500))
         track, log = scan.azimuth_track(), scan.inclination()
@@ -208,7 +232,9 @@ def check_weather(path, rng):
     moment_s = datetime(2025, 7, 15, 1, tzinfo=UTC).timestamp()
     window = rng.choice((None, (moment_s - 3600, moment_s + 3600)))
     settings = WEATHER[path.name.rpartition(".")[2]]
-    log = read_weather(WeatherSection(file=path, utc_offset_h=offset_h, **settings), window)
+    offset_h = None if "zone" in settings else offset_h
+    settings = settings | ({} if offset_h is None else {"utc_offset_h": offset_h})
+    log = read_weather(WeatherSection(file=path, **settings), window)
     assert np.isfinite(log.time_utc_s).all()
     assert (np.diff(log.time_utc_s) > 0).all()
     air = interpolate_air(log, moment_s, 3600.0)
@@ -225,6 +251,14 @@ def check_sop(path, _dice):
     assert np.abs(matrix[:3, :3] @ matrix[:3, :3].T - np.eye(3)).max() < 1e-5, "no rotation"
     assert np.abs(matrix[:3, 3]).max() < 1e9, "beyond any map"
     pose.scanner_to_map_by_origin(matrix, (46.8, 10.8, 3245.0), "EPSG:32632", RANGE_M)
+
+
+def check_riscan(path, _dice):
+    project = read_project(path)
+    assert project.pop is None or np.isfinite(project.pop).all()
+    for position in project.positions:
+        assert np.isfinite(position.sop).all()
+        assert position.air is None or np.isfinite(list(vars(position.air).values())).all(), "impossible air"
 
 
 def check_site(path, _dice):
@@ -255,6 +289,7 @@ WEATHER = {  # settings by suffix
     },
     "smet": {"format": "smet"},
     "dwd": {"format": "dwd"},
+    **{kind: LOGS[kind][0] for kind in ("meteoswiss", "geosphere", "davis", "hobo", "lufft")},
 }
 TEXT_CHECKS = {
     "inclination": check_inclination,
@@ -262,11 +297,21 @@ TEXT_CHECKS = {
     "csv": check_weather,
     "smet": check_weather,
     "dwd": check_weather,
+    "meteoswiss": check_weather,
+    "geosphere": check_weather,
+    "davis": check_weather,
+    "hobo": check_weather,
+    "lufft": check_weather,
     "xyz": check_scan,
+    "text": check_scan,
     "sop": check_sop,
+    "matrix": check_sop,
+    "riscan": check_riscan,
     "site": check_site,
+    "site_keys": check_site,
     "polygons": check_polygons,
 }
+BINARY_CHECKS = {"gpkg": check_polygons, "shp": check_polygons}
 
 
 # ---- running
@@ -275,7 +320,7 @@ TEXT_CHECKS = {
 def run(kind, first, count, folder, at):
     """Read `count` mutations of one kind; return the numbers of outcomes and the findings."""
     valid = (folder / CORPUS / VALID_FILES[kind]).read_bytes()
-    check = TEXT_CHECKS.get(kind, check_scan)
+    check = (TEXT_CHECKS | BINARY_CHECKS).get(kind, check_scan)
     path = folder / str(first) / VALID_FILES[kind]
     counts, findings = Counter(), []
     check(_written(path, valid), random.Random(0))  # noqa: S311 - no secret

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gzip
 import json
 import os
 import resource
@@ -10,13 +11,19 @@ import shutil
 import subprocess
 import sys
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 
 import fuzz_cases
 import harness
 import laspy
 import numpy as np
 import pytest
+import shapely
 from readers.formats import test_formats as written
+from readers.formats.test_riscan import POSITION, SOP, write_project
+from readers.test_weather_dialects import LOGS
+
+from station.products.exports.copc import write_copc
 
 WEIGHTS = {"las": 3, "laz": 4, "old_laz": 3, "week_las": 2}  # 1 for the others
 
@@ -39,7 +46,12 @@ def corpus(tmp_path_factory):
     ]
     (target / "weather.csv").write_text("time,t,rh,p\n" + "".join(rows))
     write_dialects(target)
-    write_formats(target)
+    write_matrices(target)
+    write_site(target)
+    for write in (write_polygons, write_e57, write_ply, write_pcd):
+        with suppress(pytest.skip.Exception):  # their libraries are extras
+            write(target)
+    write_text(target)
     write_scans(laspy.read(station / harness.PENDING / f"{harness.scan_name(0)}.laz"), target)
     return folder
 
@@ -56,15 +68,65 @@ def write_dialects(target):
     lines = [f"3;202507150{n // 60}{n % 60:02d};3;{p:.1f};{t:.1f};{rh:.1f};eor\n" for n, t, rh, p in rows]
     (target / "weather.dwd").write_text(header + "".join(lines))
 
+    for kind in ("meteoswiss", "geosphere", "davis", "hobo", "lufft"):
+        (target / f"weather.{kind}").write_text(LOGS[kind][1])
 
-def write_formats(target):
-    """Write a few points in the formats of other programs."""
-    points, stem = written.Points(400), target / "250715_000000"
-    written.e57_file(stem.with_suffix(".e57"), points)
-    written.ply_file(stem.with_suffix(".ply"), points)
-    written.pcd_file(stem.with_suffix(".pcd"), points, "BINARY_COMPRESSED")
+
+def write_matrices(target):
+    """Write an SOP and a project as RiSCAN does."""
+    (target / "sop.xml").write_text(f"<sop><matrix rows='4' cols='4'>{SOP}</matrix></sop>")
+    write_project(target, POSITION.format(name="SP1", states="", first="250701_110000", sop=SOP))
+
+
+def write_site(target):
+    """Write a site file with all keys on files of others."""
+    text = (target / "site.toml").read_text()
+    more = {
+        "[scans]": 'zone = "Europe/Vienna"\nsuffix = ".xyz"\ncolumns = ["x", "y", "z", "time"]\n'
+        'convert = ["cp", "{in}", "{out}"]\n',
+        "[[sop]]": 'files = "*_A*"\nscanner = { model = "VZ-6000", range_sigma_m = 0.02 }\n',
+        "[weather]": 'station = "JUN"\nnames = ["time", "t", "rh", "p"]\ntime_format = "unix"\n'
+        'units = { temperature_c = "F", humidity_pct = "fraction", pressure_hpa = "Pa" }\n',
+    }
+    for table, lines in more.items():
+        assert f"{table}\n" in text
+        text = text.replace(f"{table}\n", f"{table}\n{lines}")
+    text += '\n[epoch]\nname = "%Y%m%d_%H%M"\nfiles = 4\nwindow_s = 600\nwait_s = 10\n'
+    text += (
+        '[registration]\nsuffix = ".sop"\nuse = "given"\ninto = "scanner"\nsigma_m = 0.01\nsigma_deg = 0.01\n'
+    )
+    (target / "all_keys.toml").write_text(text)
+
+
+def write_polygons(target):
+    """Write two areas as GeoPackage and Shapefile."""
+    pyogrio = pytest.importorskip("pyogrio")
+    squares = [shapely.box(635_400 + 100 * n, 5_184_600, 635_450 + 100 * n, 5_184_700) for n in (0, 1)]
+    for suffix in ("gpkg", "shp"):
+        pyogrio.raw.write(
+            target / f"areas.{suffix}", shapely.to_wkb(squares), [np.array(["a", "b"], object)], ["name"],
+            geometry_type="Polygon", crs="EPSG:32632",
+        )  # fmt: skip
+
+
+def write_e57(target):
+    written.e57_file(target / fuzz_cases.VALID_FILES["e57"], written.Points(400))
+
+
+def write_ply(target):
+    written.ply_file(target / fuzz_cases.VALID_FILES["ply"], written.Points(400))
+
+
+def write_pcd(target):
+    written.pcd_file(target / fuzz_cases.VALID_FILES["pcd"], written.Points(400), "BINARY_COMPRESSED")
+
+
+def write_text(target):
+    """Write a few points as text, with names and without."""
     header = "//X Y Z Intensity GpsTime return_number number_of_returns"
-    written.text_file(stem.with_suffix(".xyz"), points, header=header, fields="xyzitnc")
+    for kind, names in (("xyz", header), ("text", "")):
+        path = target / fuzz_cases.VALID_FILES[kind]
+        written.text_file(path, written.Points(400), header=names, fields="xyzitnc")
 
 
 def write_scans(scan, target):
@@ -91,6 +153,11 @@ def write_scans(scan, target):
         for axis in tilt:
             las[axis] = 0.003 * (las.gps_time.astype(int) % 7)
         las.write(target / name)
+    packed = gzip.compress((target / "250715_000000.laz").read_bytes())
+    (target / "250715_030000.laz.gz").write_bytes(packed)
+    las = laspy.read(target / "250715_000000.laz")
+    with (target / "250715_040000.copc.laz").open("w+b") as file:
+        write_copc(file, las.header, las.points.array)
 
 
 def run_cases(corpus, first, counts):
@@ -110,7 +177,11 @@ def run_cases(corpus, first, counts):
 def fuzz(corpus, capsys, *, rounds, each):
     """Read `each` mutations of every kind, times its weight, in each round; print the counts."""
     seed = int(os.environ.get("STATION_FAULTS_SEED", secrets.randbits(31)))
-    counts = {kind: each * WEIGHTS.get(kind, 1) for kind in fuzz_cases.VALID_FILES}
+    counts = {
+        kind: each * WEIGHTS.get(kind, 1)
+        for kind, name in fuzz_cases.VALID_FILES.items()
+        if (corpus / fuzz_cases.CORPUS / name).exists()
+    }
     before = resource.getrusage(resource.RUSAGE_CHILDREN)
     with ThreadPoolExecutor(max_workers=min(2, rounds)) as pool:
         firsts = [seed + 100_000 * index for index in range(rounds)]
@@ -136,7 +207,7 @@ def fuzz(corpus, capsys, *, rounds, each):
 
 @pytest.mark.integration
 def test_few_mutated_files_of_every_kind(corpus, capsys):
-    fuzz(corpus, capsys, rounds=1, each=20)
+    fuzz(corpus, capsys, rounds=1, each=15)
 
 
 @pytest.mark.slow

@@ -179,6 +179,26 @@ def test_geopackage_and_shapefile(tmp_path, suffix, crs):
         read_polygons(path, CRS)
 
 
+@pytest.mark.filterwarnings("ignore:Non closed ring")
+def test_an_open_ring_of_a_shapefile_is_refused(tmp_path):
+    """GDAL reads a ring whose last vertex is not its first; GEOS does not."""
+    pyogrio = pytest.importorskip("pyogrio")
+    path = tmp_path / "areas.shp"
+    pyogrio.raw.write(
+        path,
+        shapely.to_wkb([shapely.box(0, 0, 10, 10)]),
+        [np.array(["a"], object)],
+        ["name"],
+        geometry_type="Polygon",
+        crs=CRS,
+    )
+    content = bytearray(path.read_bytes())
+    content[-16:-8] = np.float64(5).tobytes()  # x of the last vertex
+    path.write_bytes(content)
+    with pytest.raises(ConfigError, match=r"feature 1 \(a\): is damaged"):
+        read_polygons(path, CRS)
+
+
 TWO_HALVES = {"type": "MultiPolygon", "coordinates": [[square(0, 0, 10)], [square(10, 0, 10)]]}
 OVERLAPPING = {"type": "MultiPolygon", "coordinates": [[square(0, 0, 10)], [square(5, 0, 10)]]}
 SPIKE = polygon(ring((0, 0), (0, 10), (10, 10), (10, 0), (5, 0), (5, -20), (5, 0)))

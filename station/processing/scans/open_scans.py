@@ -16,7 +16,7 @@ from station.readers.formats.conversion import open_site_scan
 from station.readers.formats.several_files import as_one
 from station.readers.scan import ScanReader, utc_interval
 from station.readers.sop import sops_of_file, valid_sop
-from station.scan_names import scan_id, start_in_name
+from station.scan_names import path_stem, start_in_name
 from station.science.geometry.pose import horizontal_crs, is_same_map
 from station.sections.inputs import SopSection
 
@@ -83,7 +83,7 @@ def open_scan_for(site: Site, scan: ScanFile) -> Iterator[OpenScan]:
                     raise
                 raise type(error)(f"{file.name}: {error}") from error
             groups.setdefault(key, []).append((file, reader))
-        name = scan_id(scan.name)
+        name = path_stem(scan.name)
         positions = tuple(_position(site, name, sop, files) for (sop, *_), files in groups.items())
         yield OpenScan(positions, len(kept))
 

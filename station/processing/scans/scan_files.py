@@ -13,7 +13,7 @@ from station.config import Site
 from station.errors import NotReadyError
 from station.inbox.listing import ScanFile, ScanListing, name_in_journal
 from station.readers.formats.conversion import scan_suffixes
-from station.scan_names import name_below, scan_id, scan_stem
+from station.scan_names import name_below, path_stem, scan_id, scan_stem
 
 
 def is_present(path: Path) -> bool:
@@ -57,7 +57,7 @@ def find_in_inbox(site: Site, stem: str) -> ScanFile | None:
     Raises NotReadyError if it cannot be listed.
     """
     listing = ScanListing(site, site.scans.inbox, scan_suffixes(site.scans))
-    names = (name for name in sorted(listing.scans) if stem in {scan_id(name), scan_stem(name)})
+    names = (name for name in sorted(listing.scans) if stem in {path_stem(name), scan_stem(name)})
     return next((listing.scan(name) for name in names), None)
 
 
@@ -77,12 +77,23 @@ class ScanFinder:
     def __init__(self, site: Site) -> None:
         self._site = site
         self._listing = cache(lambda folder: ScanListing(site, folder, scan_suffixes(site.scans)))
+        self._names_by_id = cache(
+            lambda folder: {scan_id(name): name for name in sorted(self._listing(folder).scans)}
+        )
 
     def in_inbox(self, name: str) -> bool:
         """Return True if a scan, or at least one file of an epoch, lies in the inbox."""
         if self._site.epoch is None:
             return is_present(self._site.scans.inbox / name)
         return name in self._listing(self._site.scans.inbox).scans
+
+    def name_of(self, stored_id: str, start_utc_s: float) -> str | None:
+        """Return the name of a scan in the inbox or the archive by that in the store; None without one."""
+        folders = [self._site.scans.inbox]
+        if self._site.retention.archive is not None:
+            folders.append(archive_folder(self._site.retention.archive, start_utc_s))
+        names = (self._names_by_id(folder).get(stored_id) for folder in folders if folder.is_dir())
+        return next(filter(None, names), None)
 
     def find(self, name: str, start_utc_s: float | None) -> ScanFile | None:
         """Return a scan from the inbox or the archive; None if it no longer exists.

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import re
 from dataclasses import dataclass
-from datetime import UTC, datetime
+from datetime import datetime
 from pathlib import Path
 from xml.etree import ElementTree as ET
 
@@ -13,6 +13,7 @@ from station.errors import ConfigError
 from station.quantities import Air, Floats
 from station.readers.regular_file import read_text
 from station.readers.sop import checked_matrix
+from station.scan_names import start_in_name
 
 PROJECT_FILE = "project.rsp"
 SCAN_NAME = re.compile(r"(\d{6}_\d{6})(?:\D.*)?")  # of scans, by their start
@@ -72,11 +73,7 @@ def _position(node: ET.Element, path: Path) -> ScanPosition:
     scans = [scan for scan in (single.iter("scan") if single is not None else ()) if _is_kept(scan)]
     matches = [match for scan in scans if (match := SCAN_NAME.fullmatch(scan.get("name", "")))]
     first = min((match[1] for match in matches), default="")
-    extents = [
-        float(text.split()[0])
-        for scan in scans
-        if (text := scan.findtext("geometryinfo/maxpolar")) and text.split()
-    ]
+    extents = [_number(scan.findtext("geometryinfo/maxpolar")) for scan in scans]
     instruments = [node.findtext("ppm_instrument"), *(scan.findtext("instrument") for scan in scans)]
     return ScanPosition(
         name=name,
@@ -84,8 +81,8 @@ def _position(node: ET.Element, path: Path) -> ScanPosition:
         instrument=next((text.strip() for text in instruments if text and text.strip()), ""),
         air=_air(node),
         first_scan=first,
-        start_utc=datetime.strptime(first, "%y%m%d_%H%M%S").replace(tzinfo=UTC) if first else None,
-        extent_m=max(extents, default=0.0),
+        start_utc=start_in_name(first, "%y%m%d_%H%M%S"),
+        extent_m=max(filter(math.isfinite, extents), default=0.0),
     )
 
 
@@ -94,16 +91,22 @@ def _matrix(node: ET.Element | None, path: Path) -> Floats | None:
     return None if not text else checked_matrix(" ".join(text.split()), path)
 
 
+def _number(text: str | None) -> float:
+    """Return the first number of a text, NaN without one."""
+    try:
+        return float((text or "").split()[0])
+    except (ValueError, IndexError):
+        return math.nan
+
+
 def _air(node: ET.Element) -> Air | None:
     """Return the atmosphere that was set; the vapour pressure becomes humidity by the Magnus formula.
 
     Source: WMO-No. 8 (2021), annex 4.B.
     """
     keys = "ppm_air_temperature", "ppm_air_pressure", "ppm_moisture_pressure"
-    values = [node.findtext(key) for key in keys]
-    try:
-        temperature_c, pressure_hpa, vapour_hpa = (float(value or "") for value in values)
-    except ValueError:
+    temperature_c, pressure_hpa, vapour_hpa = (_number(node.findtext(key)) for key in keys)
+    if not (-60 <= temperature_c <= 50 and 300 <= pressure_hpa <= 1100 and vapour_hpa >= 0):  # also NaN
         return None
     saturation_hpa = 6.112 * math.exp(17.62 * temperature_c / (243.12 + temperature_c))
     return Air(temperature_c, pressure_hpa, min(100.0 * vapour_hpa / saturation_hpa, 100.0))

@@ -86,3 +86,21 @@ def test_other_files_are_refused(tmp_path, text, reason):
         read_project(path)
     with pytest.raises(ConfigError, match="cannot be read"):
         read_project(tmp_path / "none.rsp")
+
+
+@pytest.mark.parametrize(
+    ("old", "new"),
+    [("12</ppm", "nan</ppm"), ("1000", "1e999"), ("12</ppm", "-243.12</ppm"), ("8.42", "-1")],
+)
+def test_an_impossible_atmosphere_is_none(old, new, tmp_path):
+    text = POSITION.format(name="SP1", states="", first="240101_000000", sop=SOP)
+    (position,) = read_project(write_project(tmp_path, text.replace(old, new, 1))).positions
+    assert position.air is None
+
+
+def test_numbers_and_dates_that_are_none_are_not_used(tmp_path):
+    text = POSITION.format(name="SP1", states="", first="240101_000000", sop=SOP)
+    for name in ("250701_120000", "250702_120000"):
+        text = text.replace(name, name.replace("2507", "2599"))
+    (position,) = read_project(write_project(tmp_path, text.replace("426.6", "x"))).positions
+    assert (position.extent_m, position.start_utc) == (0.0, None)

@@ -15,6 +15,7 @@ from pyproj.exceptions import CRSError
 from station.errors import ConfigError, StationError
 from station.inbox.listing import is_scan
 from station.operations.inbox_contents import CONVERTED, MANUAL, epoch_advice, files_below, fitting_pattern
+from station.operations.proposals.weather_proposal import weather_lines
 from station.operations.riscan_import import file_stem, import_riscan, matrix_text, site_text, write_new
 from station.processing.workers import isolation
 from station.quantities import Floats
@@ -34,7 +35,6 @@ SOP_WORD = re.compile(r"[-_ ]*sop$", re.IGNORECASE)  # at the end of names
 MAX_MATRIX_BYTES = 1 << 14
 GEOCENTRIC_M = 6e6  # a POP leads to the centre of the Earth
 MAX_SCANNER_FRAME_M = 20_000.0  # farther from the origin, points are on a map
-NAMELESS = ("toa5", "csv")  # dialects whose columns have no usual names
 MEMORY_GB, TIMEOUT_S = 4.0, 300.0  # to look at one scan
 
 
@@ -249,17 +249,7 @@ def _more_lines(found: _Found, header: ScanHeader | None, *, mode: str) -> list[
         )
         lines += ["[inclination]", source, f'mode = "{mode}"{note}', ""]
     if found.weather is not None:
-        path, kind = found.weather
-        weather = ["[weather]", f"file = {_quoted(path.resolve())}", f'format = "{kind}"']
-        if kind == "davis":  # day or month first, as the computer was set
-            weather += ['time_format = "%d/%m/%y %H:%M"   # check: as in the file']
-        if kind in ("davis", "lufft"):
-            weather += ['zone = "UTC"   # check: of the logger']
-        if kind in NAMELESS:
-            names = "" if kind == "toa5" else 'time = "…", '
-            names += 'temperature_c = "…", humidity_pct = "…", pressure_hpa = "…"'
-            weather = [f"# {line}" for line in (*weather, f"columns = {{ {names} }}   # check")]
-        lines += [*weather, ""]
+        lines += [*weather_lines(*found.weather), ""]
     if found.polygons is not None:
         lines += ["[areas]", f"file = {_quoted(found.polygons.resolve())}", ""]
     return lines

@@ -17,11 +17,11 @@ from support import tiny_station
 
 from station.config import read_site
 from station.errors import ConfigError
-from station.operations.site_proposal import _code, propose_site
+from station.operations.proposals.site_proposal import _code, propose_site
 from station.processing.scans.scan_files import inbox_scans
 from station.readers.weather import read_weather
 
-ROOT = Path(__file__).parents[2]
+ROOT = Path(__file__).parents[3]
 
 
 @pytest.fixture(scope="module")
@@ -87,11 +87,10 @@ def test_a_proposed_davis_log_can_be_read(source, tmp_path):
     assert len(read_weather(site.weather).time_utc_s) == 1
 
 
-def test_columns_of_an_unknown_log_are_left_to_the_user(source, tmp_path):
+def test_a_log_with_plain_names_can_be_read(source, tmp_path):
     (source / "weather.csv").write_text("Zeit;Temperatur;Feuchte;Luftdruck\n2025-07-15 00:10;-1,5;51;684,5\n")
-    path = propose_site(source, tmp_path / "site")[0]
-    assert read_site(path).weather is None
-    assert '# columns = { time = "…", temperature_c' in path.read_text()
+    log = read_weather(read_site(propose_site(source, tmp_path / "site")[0]).weather)
+    assert log.temperature_c.tolist() == [-1.5]
 
 
 def test_scans_on_the_map_and_other_names(tmp_path):

@@ -1,0 +1,1 @@
+"""Site files that `station init --from` proposes for what lies in a folder."""
