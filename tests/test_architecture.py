@@ -2,8 +2,6 @@
 
 import ast
 import re
-import subprocess
-import sys
 from collections import Counter
 from pathlib import Path
 
@@ -243,11 +241,3 @@ def test_numbers_carry_their_unit():
         if argument.arg in bare
     ]
     assert not found
-
-
-def test_service_starts_without_the_libraries_of_those_who_read_the_store():
-    """Each takes half a second, or more on a small machine, and tens of megabytes."""
-    libraries = {"xarray", "pandas", "dask", "rioxarray", "matplotlib"}
-    program = "import sys, station.service.worker; print(*sys.modules)"
-    imported = subprocess.run([sys.executable, "-c", program], check=True, capture_output=True, text=True)
-    assert libraries & set(imported.stdout.split()) == set()

@@ -5,7 +5,6 @@ What is known is kept beside the tiles, so that a new epoch is only compared wit
 
 from __future__ import annotations
 
-import io
 import zipfile
 from collections.abc import Sequence
 from contextlib import suppress
@@ -13,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
-from station.products.viewer.block_codes import BlockCodes, CurveEpoch
+from station.products.viewer.block_codes import BlockCodes, CurveEpoch, save_codes
 from station.products.viewer.tiles import Array, byte_planes, replace_file, tile_script
 from station.science.uncertainty.common_mode import SECTORS, pattern_correlation
 
@@ -39,9 +38,7 @@ def write_pairs(folder: Path, codes: BlockCodes, epochs: Sequence[CurveEpoch]) -
                 if is_kept
                 else pattern_correlation(patterns[row], patterns[column])
             )
-    buffer = io.BytesIO()
-    np.savez(buffer, names=np.array(names), patterns=patterns, correlation=correlation)
-    replace_file(path, buffer.getvalue())
+    save_codes(path, {"names": np.array(names), "patterns": patterns, "correlation": correlation})
     time_s = np.array([round(epoch.start_s) for epoch in epochs], np.int64)
     steps = byte_planes(np.diff(time_s, prepend=0), 4).tobytes()
     triangle = correlation[np.tril_indices(len(names), -1)]

@@ -13,6 +13,7 @@ from station.errors import ConfigError
 from station.quantities import Air, Floats
 from station.readers.regular_file import read_text
 from station.readers.sop import checked_matrix
+from station.readers.weather import VALID_RANGES
 from station.scan_names import start_in_name
 
 PROJECT_FILE = "project.rsp"
@@ -106,7 +107,8 @@ def _air(node: ET.Element) -> Air | None:
     """
     keys = "ppm_air_temperature", "ppm_air_pressure", "ppm_moisture_pressure"
     temperature_c, pressure_hpa, vapour_hpa = (_number(node.findtext(key)) for key in keys)
-    if not (-60 <= temperature_c <= 50 and 300 <= pressure_hpa <= 1100 and vapour_hpa >= 0):  # also NaN
+    limited = zip((temperature_c, pressure_hpa), VALID_RANGES[:2], strict=True)
+    if not (vapour_hpa >= 0 and all(low <= value <= high for value, (low, high) in limited)):  # also NaN
         return None
     saturation_hpa = 6.112 * math.exp(17.62 * temperature_c / (243.12 + temperature_c))
     return Air(temperature_c, pressure_hpa, min(100.0 * vapour_hpa / saturation_hpa, 100.0))
