@@ -4,7 +4,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from station.papers.figures import HARTZELL, LESLAR, OZENDI, VOORDENDAG
+from station.papers.hartzell import HARTZELL
+from station.papers.leslar import LESLAR
+from station.papers.ozendi import OZENDI
+from station.papers.voordendag import VOORDENDAG
 
 
 @dataclass(frozen=True)

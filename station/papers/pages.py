@@ -15,7 +15,13 @@ import station.science
 from station.errors import StoreError
 from station.papers import mobile_lidar
 from station.papers.errata import ERRATA, NOT_REPRODUCIBLE, PAPERS, Paper
-from station.papers.figures import PAPER_NUMBERS, PaperNumber
+from station.papers.hartzell import HARTZELL_NUMBERS
+from station.papers.leslar import LESLAR_NUMBERS
+from station.papers.ozendi import OZENDI_NUMBERS
+from station.papers.paper_number import PaperNumber
+from station.papers.voordendag import VOORDENDAG_NUMBERS
+
+PAPER_NUMBERS = (*HARTZELL_NUMBERS, *VOORDENDAG_NUMBERS, *OZENDI_NUMBERS, *LESLAR_NUMBERS)
 
 
 @dataclass(frozen=True)

@@ -8,9 +8,11 @@ import pytest
 from typer.testing import CliRunner
 
 from station.cli import app
-from station.papers import figures, pages
+from station.papers import hartzell, pages
 from station.papers.errata import ERRATA, NOT_REPRODUCIBLE, PAPERS
-from station.papers.figures import BOXES, HARTZELL_NUMBERS, PAPER_NUMBERS
+from station.papers.hartzell import HARTZELL_NUMBERS
+from station.papers.pages import PAPER_NUMBERS
+from station.papers.voordendag import BOXES
 
 MAX_UNEXPLAINED = 0.02  # deviation of a printed value that needs no note
 
@@ -58,7 +60,7 @@ def test_major_axes_of_the_boxes_agree_with_the_column_of_table_2():
 
 def test_simulated_registration_has_the_errors_of_the_paper():
     """Hartzell et al. (2015), section 2.2: rotations of 0.003-0.006°, shifts of 1-3 cm."""
-    rotation_rad, shift_m = np.split(np.sqrt(np.diag(figures._registration().covariance)), 2)
+    rotation_rad, shift_m = np.split(np.sqrt(np.diag(hartzell._registration().covariance)), 2)
     assert (np.degrees(rotation_rad) < 0.006).all()
     assert (shift_m > 0.005).all()
     assert (shift_m < 0.03).all()

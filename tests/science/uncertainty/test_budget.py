@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from station.papers.figures import BOX_5
+from station.papers.voordendag import BOX_5
 from station.quantities import Grid, Scanner, SharedParameters
 from station.science.geometry.observation import Observation
 from station.science.uncertainty import budget, parameters
