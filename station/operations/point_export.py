@@ -22,11 +22,11 @@ from station.inbox.journal_reader import JournalReader
 from station.inbox.listing import ScanFile
 from station.processing.pipeline import stacking_inputs, to_map
 from station.processing.provenance import stored_epochs
-from station.processing.scan_inputs import ScanInputs
 from station.processing.scans.adjusted_scan import grid_and_adjust, load_viewing_geometry
 from station.processing.scans.epoch_inputs import load_scan_inputs
 from station.processing.scans.open_scans import OpenScan, open_scan_for
 from station.processing.scans.scan_files import find_scan
+from station.processing.scans.scan_inputs import ScanInputs
 from station.processing.site_files import series_for
 from station.processing.usable_inputs import usable_site
 from station.processing.workers import isolation

@@ -32,10 +32,10 @@ from station.operations.site_plausibility import (
     weather_time_findings,
 )
 from station.processing.integrity import check_store
-from station.processing.scan_air import pressure_fault
 from station.processing.scan_tasks import dry_run
 from station.processing.scanner_pose import map_position, scanner_height_m, scanner_to_map
 from station.processing.scans.open_scans import open_files
+from station.processing.scans.scan_air import pressure_fault
 from station.processing.scans.scan_files import inbox_scans, scan_file
 from station.processing.site_files import load_areas, polygon_cells, series_for
 from station.processing.workers import isolation

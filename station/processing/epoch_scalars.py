@@ -8,7 +8,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from station.archive import epochs
-from station.processing.scan_inputs import ScanInputs
+from station.processing.scans.scan_inputs import ScanInputs
 from station.quantities import Measurement, Quality
 
 MAX_METRIC_CELLS = 100_000  # the metrics of larger scans are computed from a sample

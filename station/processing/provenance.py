@@ -25,8 +25,8 @@ from station.errors import ConfigError, NotReadyError, ScanError
 from station.inbox.file_hash import sha256_files
 from station.inbox.journal_reader import Entry
 from station.inbox.listing import ScanFile
-from station.processing.scan_air import air_from_log
 from station.processing.scanner_pose import scanner_height_m, sop_identity_at
+from station.processing.scans.scan_air import air_from_log
 from station.quantities import Air
 from station.readers.flags import read_flags, reasons_for
 from station.readers.sop import valid_sop

@@ -32,10 +32,10 @@ from station.processing.pipeline import (
     stacking_inputs,
 )
 from station.processing.provenance import ScanProvenance
-from station.processing.scan_inputs import ScanInputs
 from station.processing.scans.adjusted_scan import adjust_scan, load_viewing_geometry, stable_cells
 from station.processing.scans.epoch_inputs import load_scan_inputs
 from station.processing.scans.open_scans import open_scan_for
+from station.processing.scans.scan_inputs import ScanInputs
 from station.processing.site_files import exclusion_reason, series_for, sha256_log
 from station.processing.workers.worker_process import Progress
 from station.quantities import Reference, ScanGeometry, VarianceComponents

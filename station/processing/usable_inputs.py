@@ -16,8 +16,8 @@ from typing import Any, TypeVar
 from station.archive.atomic_files import atomic_write
 from station.config import Site
 from station.errors import NotReadyError, ScanError, StationError, StoreError
-from station.processing.scan_air import air_from_log
 from station.processing.scanner_pose import scanner_height_m
+from station.processing.scans.scan_air import air_from_log
 from station.readers.flags import read_flags
 from station.readers.polygons import LAYER_SUFFIXES, read_polygons, to_geojson
 from station.readers.regular_file import open_regular

@@ -7,7 +7,7 @@ from pyproj import Transformer
 from station.config import read_site
 from station.errors import ConfigError
 from station.operations.riscan_import import import_riscan
-from station.processing.scan_inputs import scanner_to_map
+from station.processing.scanner_pose import scanner_to_map
 
 
 def test_the_site_of_a_real_project(shared_data, tmp_path):

@@ -7,8 +7,8 @@ import pytest
 
 from station.config import read_site
 from station.errors import ConfigError
-from station.processing.scan_inputs import inputs_in_map_frame
 from station.processing.scans.registration import registration_difference
+from station.processing.scans.scan_inputs import inputs_in_map_frame
 from station.quantities import VarianceComponents
 
 ORIGIN = '[map]\ncrs = "EPSG:32632"\norigin = { latitude_deg = 47.0, longitude_deg = 9.0, height_m = 5.0 }\n'

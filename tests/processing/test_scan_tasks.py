@@ -18,10 +18,10 @@ from station.errors import ConfigError, NotReadyError, ScanError
 from station.operations import site_check
 from station.processing import provenance, reference_tasks, scan_tasks
 from station.processing.pipeline import to_map
-from station.processing.scan_air import pressure_fault
 from station.processing.scan_tasks import ScanHistory
 from station.processing.scans import open_scans
 from station.processing.scans.epoch_inputs import load_scan_inputs
+from station.processing.scans.scan_air import pressure_fault
 from station.processing.scans.scan_files import scan_file
 from station.quantities import Air, Quality
 from station.science.uncertainty.parameters import LINE_GROUPS_PER_KNOT

@@ -18,8 +18,8 @@ from station.processing.pipeline import (
     new_gridder,
     reference_viewing_geometry,
 )
-from station.processing.scan_inputs import ScanInputs
 from station.processing.scans.open_scans import OpenScan
+from station.processing.scans.scan_inputs import ScanInputs
 from station.processing.site_files import polygon_cells, series_for
 from station.processing.workers.worker_process import Progress, trim_heap
 from station.quantities import Bools, Reference, ScanGeometry

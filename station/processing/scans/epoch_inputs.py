@@ -12,11 +12,11 @@ import numpy as np
 
 from station.config import Site
 from station.processing.pipeline import AdjustmentInputs, Pose
-from station.processing.scan_air import air_of_scan
-from station.processing.scan_inputs import MEAN_TILT, ScanInputs, inputs_in_map_frame, position_inputs
 from station.processing.scanner_pose import scan_geometry, scanner_to_map, sop_identity_at
 from station.processing.scans.open_scans import OpenScan
 from station.processing.scans.registration import registered_covariance
+from station.processing.scans.scan_air import air_of_scan
+from station.processing.scans.scan_inputs import MEAN_TILT, ScanInputs, inputs_in_map_frame, position_inputs
 from station.quantities import Viewpoint
 from station.readers.sop import valid_sop
 from station.science.adjustment import prior

@@ -12,14 +12,6 @@ import numpy as np
 from station.config import Site
 from station.errors import NotReadyError
 from station.processing.pipeline import AdjustmentInputs, Pose, to_map
-from station.processing.scan_air import air_of_scan
-from station.processing.scan_tilt import (
-    log_of_scan,
-    own_tilt_offset,
-    sop_tilt_offset,
-    static_tilt_faults,
-    tilt_of_scan,
-)
 from station.processing.scanner_pose import (
     map_position,
     scan_geometry,
@@ -32,6 +24,14 @@ from station.processing.scans.registration import (
     is_given,
     registered_covariance,
     registration,
+)
+from station.processing.scans.scan_air import air_of_scan
+from station.processing.scans.scan_tilt import (
+    log_of_scan,
+    own_tilt_offset,
+    sop_tilt_offset,
+    static_tilt_faults,
+    tilt_of_scan,
 )
 from station.quantities import (
     Air,
