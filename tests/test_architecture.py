@@ -3,6 +3,7 @@
 import ast
 import re
 from collections import Counter
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -20,7 +21,7 @@ MAX_MODULES = 14
 TEXTS = {
     path: path.read_text(encoding="utf-8")
     for path in PACKAGE.rglob("*")
-    if path.suffix in {".py", ".js", ".css", ".html", ".toml"}
+    if path.suffix in {".py", ".js", ".css", ".html", ".j2", ".toml"}
 }
 
 
@@ -28,20 +29,27 @@ def name(path):
     return str(path.relative_to(ROOT).with_suffix("")).replace("/", ".")
 
 
+MODULE_NAMES = {name(path).removesuffix(".__init__") for path in MODULES}
+
+
+@cache
+def nodes(path):
+    """Return all nodes of the syntax tree of a file."""
+    return list(ast.walk(ast.parse(path.read_text(encoding="utf-8"))))
+
+
 def functions(path):
-    tree = ast.parse(path.read_text(encoding="utf-8"))
-    return [node for node in ast.walk(tree) if isinstance(node, ast.FunctionDef)]
+    return [node for node in nodes(path) if isinstance(node, ast.FunctionDef)]
 
 
-def imported_modules(tree):
+def imported_modules(path):
     """Return the names under which a module imports other modules of the package."""
-    modules = {name(path).removesuffix(".__init__") for path in MODULES}
     return {
         alias.asname or alias.name
-        for node in ast.walk(tree)
+        for node in nodes(path)
         if isinstance(node, ast.ImportFrom)
         for alias in node.names
-        if f"{node.module}.{alias.name}" in modules
+        if f"{node.module}.{alias.name}" in MODULE_NAMES
     }
 
 
@@ -70,13 +78,10 @@ def test_forbidden_words(word):
     """Private words occur nowhere in the package: not in a name, a message, a comment or a docstring."""
     pattern = re.compile(rf"(?<![A-Za-z]){word}(?![A-Za-z])", re.IGNORECASE)
     camel = re.compile(rf"(?<![A-Z]){word.capitalize()}(?=[A-Z]|\b)")
-    texts = [
-        path for path in PACKAGE.rglob("*") if path.suffix in {".py", ".js", ".css", ".html", ".j2", ".toml"}
-    ]
     found = [
         f"{path.relative_to(ROOT)}:{number}"
-        for path in texts
-        for number, line in enumerate(path.read_text(encoding="utf-8").splitlines(), 1)
+        for path, text in TEXTS.items()
+        for number, line in enumerate(text.splitlines(), 1)
         if pattern.search(line) or camel.search(line)
     ]
     assert not found
@@ -86,7 +91,7 @@ def test_no_class_name_twice():
     classes = Counter(
         node.name
         for path in MODULES
-        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8")))
+        for node in nodes(path)
         if isinstance(node, ast.ClassDef) and not node.name.startswith("_")
     )
     assert not [name for name, count in classes.items() if count > 1]
@@ -96,16 +101,15 @@ def test_no_name_shadows_an_imported_module():
     """No function, parameter or variable bears the name of a module that its file imports."""
     found = []
     for path in MODULES:
-        tree = ast.parse(path.read_text(encoding="utf-8"))
-        modules = imported_modules(tree)
+        modules = imported_modules(path)
         fields = {
             id(field.target)
-            for node in ast.walk(tree)
+            for node in nodes(path)
             if isinstance(node, ast.ClassDef)
             for field in node.body
             if isinstance(field, ast.AnnAssign)
         }
-        for node in ast.walk(tree):
+        for node in nodes(path):
             if id(node) in fields:
                 continue
             bound = (
@@ -191,7 +195,7 @@ def test_every_equation_of_the_papers_has_a_home():
     """Except for two that docs/explanation/equations.md does not use."""
     actual = set()
     for path in SCIENCE:
-        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        for node in nodes(path):
             if not isinstance(node, (ast.FunctionDef, ast.ClassDef)):
                 continue
             text = " ".join((ast.get_docstring(node) or "").split())

@@ -153,6 +153,7 @@ def test_accuracy_figures_are_those_of_the_simulated_errors():
 
 
 @pytest.mark.parametrize("factor", [1.3, 1 / 1.35])
+@pytest.mark.integration
 def test_accuracy_row_misses_its_limits_if_sigma_is_wrong_by_a_third(factor):
     found = missed(ROWS["rough"], figures_of_row(records_of(factor, 0.0), good=0.9))
     assert {"z cell", "z 10 m", "z 100 m", "z cell 1.5-2.5 km", "significant", "good"} <= set(found)
@@ -182,6 +183,7 @@ def test_accuracy_tables_replace_those_of_a_page(tmp_path):
     assert "old" not in text
 
 
+@pytest.mark.integration
 def test_filter_of_levels_is_as_good_as_a_plain_one_and_keeps_steps():
     quiet, avalanche = (
         {
@@ -195,6 +197,7 @@ def test_filter_of_levels_is_as_good_as_a_plain_one_and_keeps_steps():
     assert avalanche["station"] < avalanche["plain Kalman"] / 3
 
 
+@pytest.mark.integration
 def test_events_of_the_table_are_found_by_the_station_and_none_in_a_quiet_series():
     total = events.Score()
     for seed, area_m2 in ((1, 1000), (2, 0)):

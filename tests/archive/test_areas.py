@@ -124,6 +124,7 @@ def test_a_new_revision_replaces_its_epoch_and_a_deleted_epoch_is_removed(series
     assert read(update()).sizes["time"] == 1
 
 
+@pytest.mark.integration
 def test_compaction_recomputes_nothing(series, epoch, update, aggregator):
     write(series, epoch, 1, 2, 26)
     expected = read(update())
@@ -225,6 +226,7 @@ def test_a_damaged_file_is_rebuilt(series, epoch, update, damage):
     assert read(update()).equals(expected)
 
 
+@pytest.mark.integration
 def test_a_failed_update_leaves_the_old_file(series, epoch, update):
     class Failing:
         def area(self, _cells, _epoch):

@@ -1,5 +1,6 @@
 """Elevation and random uncertainty, which are computed: in series of old and new epochs alike."""
 
+import shutil
 from dataclasses import replace
 from datetime import UTC, datetime
 from xml.etree import ElementTree as ET
@@ -79,9 +80,10 @@ def make_older(path, epoch, random_m):
             variable[0] = rounded(BY_NAME[name], values)
 
 
-@pytest.fixture
-def mixed(series):
+@pytest.fixture(scope="module")
+def mixed_store(tmp_path_factory):
     """A compacted day of an old, a new and an old epoch, and one of each in files of their own."""
+    series = Series(tmp_path_factory.mktemp("mixed"), "hef", GRID, "EPSG:32632")
     elevation_m = surface()
     elevation_m[OUTSIDE] = np.nan
     write_reference(series, Reference.from_elevation(GRID, "1", elevation_m, np.isfinite(elevation_m)))
@@ -95,6 +97,13 @@ def mixed(series):
     kinds = [epoch.path.relative_to(series.folder).parts[0] for epoch in list_epochs(series)]
     assert kinds == ["days"] * 3 + ["epochs"] * 2
     return series
+
+
+@pytest.fixture
+def mixed(mixed_store, tmp_path):
+    folder = tmp_path / "mixed"
+    shutil.copytree(mixed_store.folder, folder)
+    return replace(mixed_store, folder=folder)
 
 
 def expected_rasters():

@@ -45,6 +45,7 @@ def test_time_coverage_is_from_the_first_start_to_the_last_end():
     }
 
 
+@pytest.mark.integration
 def test_series_that_grows_covers_the_time_of_all_its_epochs(series, epoch):
     for hour in (1, 2, 5):
         epochs.write_epoch(series, epoch(hour))

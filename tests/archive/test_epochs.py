@@ -196,6 +196,7 @@ def test_an_epoch_that_does_not_fit_the_disk_leaves_no_file(series, epoch):
 
 
 @pytest.mark.parametrize("task", ["series", "compaction", "reference"])
+@pytest.mark.integration
 def test_a_full_disk_leaves_all_files_unchanged(series, epoch, task):
     epochs.write_epoch(series, noisy(epoch, 1))
     build_series(series)

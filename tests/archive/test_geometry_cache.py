@@ -104,6 +104,7 @@ def test_other_settings_and_another_reference_have_their_own_cache_and_few_are_k
     assert len(cache.folders) == MAX_CACHED
 
 
+@pytest.mark.integration
 def test_a_flipped_bit_or_a_truncated_file_is_detected_and_the_cache_rebuilt(series):
     expected = compute(series)
     cache = Cache(series, expected)

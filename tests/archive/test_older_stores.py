@@ -44,6 +44,7 @@ def test_the_refraction_over_ice_keeps_its_column_under_its_older_name(series, e
     assert source.scalars["shared_parameter"].tolist() == [estimate.tolist()] * 2
 
 
+@pytest.mark.integration
 def test_a_series_that_contained_everything_is_read_until_the_next_scan(series, epoch, monkeypatch):
     def only_series(series):
         text = "This file is virtual."

@@ -212,6 +212,7 @@ def test_live_scan_takes_its_turn_while_a_file_of_its_size_changes(make_inbox, d
     assert inbox.poll().ahead
 
 
+@pytest.mark.integration
 def test_polling_costs_the_same_for_each_scan_of_a_backlog(make_inbox, drop, tmp_path, journal):
     """So long the live scan waits, besides the one that is being processed when it arrives.
 

@@ -263,6 +263,7 @@ def test_concurrent_evaluations_send_once(make_site, credentials, webhook):
     assert len(webhook.received) == 1
 
 
+@pytest.mark.integration
 def test_test_message_names_failed_targets(make_site, credentials, webhook):
     site = make_site(more='[alarms]\ntargets = ["good", "odd", "dead"]\ndigest = "good"\n')
     credentials(good=webhook.url, odd="nosuch://", dead="json://127.0.0.1:9/")

@@ -116,6 +116,7 @@ def test_requests_to_other_hosts_are_refused(station, port, host):
         urllib.request.urlopen(request)  # noqa: S310 - an address of this test
 
 
+@pytest.mark.integration
 def test_idle_connections_take_neither_threads_nor_the_service(station, port, monkeypatch):
     monkeypatch.setattr(_RequestHandler, "timeout", 0.1)
     before = threading.active_count()

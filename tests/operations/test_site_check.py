@@ -206,6 +206,7 @@ def folder_warnings(site):
     return [finding["what"] for finding in site_check._folders(site) if finding["level"] == "warning"]
 
 
+@pytest.mark.integration
 def test_scan_without_brightness_is_a_warning_that_says_what_it_costs(folder):
     site = read_site(folder / "site.toml")
     assert [finding["what"] for finding in site_check._newest_scan(site)] == ["scan"]
@@ -220,6 +221,7 @@ def test_scan_without_brightness_is_a_warning_that_says_what_it_costs(folder):
     assert "scans.intensity" in finding["message"]
 
 
+@pytest.mark.integration
 def test_tilt_in_the_points_that_nobody_uses_is_told(folder):
     path = folder / "site.toml"
     path.write_text(re.sub(r"(?ms)^\[inclination\].*?(?=^\[)", "", path.read_text()))

@@ -21,6 +21,7 @@ def site(series, monkeypatch):
     return SimpleNamespace()
 
 
+@pytest.mark.integration
 def test_a_damaged_description_of_any_variable_is_found(series, epoch, site):
     path = epochs.write_epoch(series, epoch(1)).path
     content = path.read_bytes()

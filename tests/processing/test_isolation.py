@@ -110,6 +110,7 @@ def test_killed_worker_is_restarted_twice(tasks, tmp_path):
     assert (tmp_path / "other").stat().st_size == 3
 
 
+@pytest.mark.integration
 def test_worker_killed_during_its_report_is_restarted(tasks, tmp_path):
     """The report exceeds the pipe's buffer, and the parent reads it after the worker was killed."""
     delays_s = [1.0]
@@ -122,6 +123,7 @@ def test_worker_killed_during_its_report_is_restarted(tasks, tmp_path):
     assert not delays_s
 
 
+@pytest.mark.integration
 def test_stop_ends_the_delay_before_a_restart(tasks, tmp_path, monkeypatch):
     monkeypatch.setattr(isolation, "RETRY_DELAYS_S", (60.0,))
     until_s = time.monotonic() + 1.0
@@ -144,6 +146,7 @@ def test_base_exceptions_of_a_task_raise_inconclusive_error(tasks, task):
         run(getattr(tasks, task))
 
 
+@pytest.mark.integration
 def test_hanging_worker_is_killed_at_its_timeout(tasks, tmp_path):
     start_s = time.monotonic()
     with pytest.raises(InconclusiveError, match="longer than 1 s"):
@@ -152,6 +155,7 @@ def test_hanging_worker_is_killed_at_its_timeout(tasks, tmp_path):
     assert not is_alive(int((tmp_path / "pid").read_text()))
 
 
+@pytest.mark.integration
 def test_blocked_worker_reports_no_progress_and_is_killed(tasks, tmp_path, monkeypatch):
     """A pipe without a writer stands for a network folder that hangs; then nothing may feed the watchdog."""
     monkeypatch.setattr(isolation, "STALL_S", 0.8)
@@ -169,6 +173,7 @@ def test_blocked_worker_reports_no_progress_and_is_killed(tasks, tmp_path, monke
     assert not is_alive(int((tmp_path / "pid").read_text()))
 
 
+@pytest.mark.integration
 def test_silent_work_counts_as_progress(tasks, monkeypatch):
     monkeypatch.setattr(isolation, "STALL_S", 0.5)
     reports = []

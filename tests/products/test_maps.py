@@ -198,6 +198,7 @@ def test_maps_of_sigma_and_point_count(series, last, small):
         assert np.ptp(cell_colour(picture, 10, 10)) > 20
 
 
+@pytest.mark.integration
 def test_compression_keeps_greys_neutral_and_colours_close(series, last):
     """With a reduced palette no grey takes a tint that could be read as change."""
     overview = read_overview(last, base_map(series, "1", WIDTH))

@@ -270,6 +270,7 @@ def test_page_size_is_limited_after_a_year_of_hourly_scans(write, context, monke
     assert "4 more in" in (folder / "index.html").read_text()
 
 
+@pytest.mark.integration
 def test_maps_use_the_reference_version_of_their_epoch(write, series, site, small):
     write_reference(series, small.make_reference(version="2"))
     epochs.write_epoch(series, small.make_epoch(8, reference="2"))

@@ -165,6 +165,7 @@ def test_a_daily_mean_has_the_sigma_of_three_epochs(base):
     assert daily.epoch_count[15, 3] == 0
 
 
+@pytest.mark.integration
 def test_only_new_epochs_are_computed_and_the_result_is_that_of_a_new_file(stored, monkeypatch):
     computed = []
     for name in ("boxes", "single"):
@@ -227,6 +228,7 @@ def test_an_interrupted_update_of_many_epochs_continues(stored, base, monkeypatc
     xr.testing.assert_identical(read(stored, "boxes.nc").drop_attrs(), read(base, "boxes.nc").drop_attrs())
 
 
+@pytest.mark.integration
 def test_a_damaged_file_of_a_day_is_not_copied_from(stored):
     """The first day gets a late epoch; the file of the second day stays as it is until it is deleted."""
     paths, _ = days(stored)
@@ -283,6 +285,7 @@ def test_kept_sums_of_another_file_of_that_name_are_not_used(stored):
     assert (BlockQueries(stored).boxes(list_epochs(stored)[-1])["coverage"] != coverage).any()
 
 
+@pytest.mark.integration
 def test_sums_are_kept_until_their_day_is_in_the_daily_means(stored):
     for hour in (32, 33, 50):
         keep(stored, make_epoch(hour))

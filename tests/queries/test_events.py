@@ -115,6 +115,7 @@ def test_scar_and_deposit_are_a_pair_with_the_true_volumes(base):
     assert deposit.confirmed[11:13] == f"{(int(deposit.begin[11:13]) + 1):02}"
 
 
+@pytest.mark.integration
 def test_the_second_scan_tells_an_event_and_no_scan_before(base, tmp_path):
     series = empty_store(tmp_path / "store")
     copy_scans(base, series, range(EVENT_HOUR + 1))
@@ -141,6 +142,7 @@ def test_live_equals_anew_and_a_late_scan(base, tmp_path):
     assert table(live) == table(base)
 
 
+@pytest.mark.integration
 def test_an_interrupted_search_of_a_whole_series_continues(base, tmp_path, monkeypatch):
     monkeypatch.setattr("station.queries.events.SEARCHES_KEPT", 2)
     series = empty_store(tmp_path / "store")

@@ -126,9 +126,14 @@ def test_azimuth_track_of_a_scan_with_noise(write_echoes):
 
 @pytest.mark.parametrize(("name", "point_format"), [("a.las", 1), ("a.laz", 1), ("a.las", 7), ("a.laz", 7)])
 @pytest.mark.parametrize(
-    ("kind", "scale"), [("int16", 0.01), ("int32", 0.001), ("float32", None), ("float64", None)]
+    ("kind", "scale", "title"),
+    [
+        ("int16", 0.01, "Reflectance"),
+        ("int32", 0.001, "reflectance"),
+        ("float32", None, "REFLECTANCE"),
+        ("float64", None, "Reflectance"),
+    ],
 )
-@pytest.mark.parametrize("title", ["Reflectance", "reflectance", "REFLECTANCE"])
 def test_reflectance_in_decibels_becomes_linear(write_echoes, name, point_format, kind, scale, title):
     """A tenth for every 10 dB, a half for 3.01 dB; 6 dB above white is clipped, as a reflector is."""
     relative_db = np.tile([0.0, -10.0, -20.0, -3.01, 3.01, 20.0], 500)

@@ -268,6 +268,7 @@ def is_inside_by_crossings(corners, x_m, y_m):
 
 
 @given(st.lists(st.floats(0.05, 1.6), min_size=3, max_size=25), st.floats(0.001, 0.999))
+@pytest.mark.integration
 def test_random_stars_equal_the_crossing_number(radii, shift):
     angle = np.linspace(0, 2 * np.pi, len(radii), endpoint=False) + shift
     radius_m = 150 * np.array(radii)

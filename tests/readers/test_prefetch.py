@@ -91,6 +91,7 @@ def test_closing_the_iterator_ends_the_child():
     assert result.returncode == 0, result.stderr.decode()
 
 
+@pytest.mark.integration
 def test_error_in_the_child_is_raised_after_the_valid_buffers():
     script = """
         def on_third():

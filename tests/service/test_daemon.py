@@ -211,6 +211,7 @@ def test_inbox_may_be_removed_and_recreated(write_site, start):
     assert service.process.poll() is None
 
 
+@pytest.mark.integration
 def test_service_pauses_while_another_folder_is_in_place_of_its_data(write_site, start):
     """As after `umount -l`: the mount point, an empty folder, comes to light."""
     path = write_site(settle_s=0.0)
@@ -230,6 +231,7 @@ def test_service_pauses_while_another_folder_is_in_place_of_its_data(write_site,
     wait_for(lambda: "service=resumed" in service.log())
 
 
+@pytest.mark.integration
 def test_deleted_lock_is_taken_again(write_site, start):
     path = write_site(settle_s=0.0)
     start(path, period_s=0.1)

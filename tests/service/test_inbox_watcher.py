@@ -49,6 +49,7 @@ def drain(events, for_s=0.2):
 
 
 @pytest.mark.parametrize("polling", [False, True])
+@pytest.mark.integration
 def test_written_moved_and_linked_files_are_events(make, events, folder, tmp_path, monkeypatch, polling):
     monkeypatch.setattr(inbox_watcher, "_POLL_INTERVAL_S", 0.1)
     make(polling=polling)

@@ -40,6 +40,7 @@ def renew(site):
     return update_mirror(site, lambda: None)
 
 
+@pytest.mark.integration
 def test_the_files_of_the_mirror_follow_the_epochs(site):
     assert renew(site) == ""
     folder = site.path.parent / "served"
@@ -60,6 +61,7 @@ def test_the_files_of_the_mirror_follow_the_epochs(site):
     assert not [path for path in folder.iterdir() if path.name.startswith(".")]
 
 
+@pytest.mark.integration
 def test_a_fault_of_one_format_is_told_and_the_others_are_renewed(site):
     (site.path.parent / "served").mkdir()
     (site.path.parent / "served" / "test.ncml").write_text("mine")

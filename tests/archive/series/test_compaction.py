@@ -51,6 +51,7 @@ def filled(base_store, tmp_path):
     return copied(base_store, tmp_path / "store")
 
 
+@pytest.mark.integration
 def test_compaction_changes_no_value_and_reduces_the_number_of_files(filled):
     expected = values(filled)
     assert compact_and_build(filled, datetime(2025, 11, 22, 12, tzinfo=UTC)) == 1
@@ -65,6 +66,7 @@ def test_compaction_changes_no_value_and_reduces_the_number_of_files(filled):
     assert compact_and_build(filled, MONTH_AFTER) == 0
 
 
+@pytest.mark.integration
 def test_a_late_scan_causes_a_new_revision_of_its_day(filled, epoch):
     compact_and_build(filled, DAY_AFTER)
     epochs.write_epoch(filled, epoch(7))
@@ -89,6 +91,7 @@ def test_a_day_with_a_late_scan_is_not_rewritten_each_time_if_its_month_cannot_b
     assert values(filled).identical(expected)
 
 
+@pytest.mark.integration
 def test_replaced_files_are_deleted_only_after_the_grace_period(filled):
     expected = values(filled)
     now = datetime.now(UTC)
@@ -116,6 +119,7 @@ def test_temporary_files_and_folders_of_killed_processes_are_deleted(filled):
     assert not folder.exists()
 
 
+@pytest.mark.integration
 def test_a_file_that_the_series_refers_to_is_never_deleted(filled):
     """If the disk was full after compaction, the old series remains in use."""
     original = filled.path.read_bytes()
@@ -179,6 +183,7 @@ def relocate(epoch):
     return dataclasses.replace(epoch, shared=shared)
 
 
+@pytest.mark.integration
 def test_epochs_before_and_after_a_relocation_keep_their_parameters_in_one_series(filled, epoch):
     epochs.write_epoch(filled, relocate(epoch(33)))
     build_series(filled)

@@ -92,6 +92,7 @@ def test_times_and_texts_are_decoded(stored):
         assert offset_s.dtype == np.float64  # seconds are not decoded as time differences
 
 
+@pytest.mark.integration
 def test_an_open_series_stays_readable_while_the_service_writes(copied):
     with station.open(copied.folder) as ds:
         write_epoch(copied, make_epoch(40))
@@ -131,6 +132,7 @@ def test_a_file_that_is_no_series_is_refused(stored):
         station.open(stored.folder / "reference.nc")
 
 
+@pytest.mark.integration
 def test_threads_of_dask_read_the_reference_one_at_a_time(stored):
     """The library netCDF4 is not safe in threads: two that open a file at once end the process."""
     with station.open(stored.folder) as plain:

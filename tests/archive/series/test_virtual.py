@@ -155,6 +155,7 @@ DAMAGES = {
 
 
 @pytest.mark.parametrize("kind", ["empty", "one bit", "a folder"])
+@pytest.mark.integration
 def test_damaged_derived_files_are_rebuilt(growing, epoch, rng, kind):
     series, update = growing
     epochs.write_epoch(series, epoch(1, grid=SMALL_GRID))
@@ -185,6 +186,7 @@ def test_damaged_derived_files_are_rebuilt_with_the_next_epoch(growing, epoch, r
 
 
 @pytest.mark.parametrize("name", ["series.nc", "processing.nc"])
+@pytest.mark.integration
 def test_file_damaged_while_it_was_written_is_rebuilt_with_the_next_epoch(growing, epoch, rng, name):
     """Its fingerprint is that of the damaged file."""
     series, update = growing
@@ -199,6 +201,7 @@ def test_file_damaged_while_it_was_written_is_rebuilt_with_the_next_epoch(growin
     assert len(SeriesIndex(series)) == 2
 
 
+@pytest.mark.integration
 def test_any_flipped_bit_is_noticed(growing, epoch, rng):
     series, update = growing
     epochs.write_epoch(series, epoch(1, grid=SMALL_GRID))
@@ -240,6 +243,7 @@ def test_only_the_new_epoch_of_a_long_series_is_opened(growing, epoch, monkeypat
     assert not opened
 
 
+@pytest.mark.integration
 def test_a_kill_between_the_two_files_is_repaired(growing, epoch, monkeypatch):
     series, update = growing
     epochs.write_epoch(series, epoch(1, grid=SMALL_GRID))

@@ -175,6 +175,7 @@ def test_scans_in_folders_and_of_several_files_are_found(source, tmp_path):
     assert [scan.name for scan in inbox_scans(site)] == ["2025-07-15"]
 
 
+@pytest.mark.integration
 def test_inclination_in_the_points_is_used(source, tmp_path):
     for log in source.glob("*-incl.txt"):
         log.unlink()

@@ -67,6 +67,7 @@ def test_references_read_like_the_series(stored, tmp_path):
         assert np.isnan(actual.elevation_change[0, 0, -1])
 
 
+@pytest.mark.integration
 def test_references_are_renewed_when_a_chunk_moves(stored, tmp_path):
     out = tmp_path / "days"
     assert len(write("references", referring(stored), out, "1D")) == 2

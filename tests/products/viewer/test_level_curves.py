@@ -76,6 +76,7 @@ def test_days_of_the_newest_reference_are_kept_some_at_a_time(series, tmp_path):
     assert codes.read(names[2]) is not None
 
 
+@pytest.mark.integration
 def test_a_damaged_level_is_named_on_the_page_until_it_is_there_again(series, tmp_path):
     rasters = rasters_of(series.grid.shape, 0.1)
     path = store(series, 20, rasters)

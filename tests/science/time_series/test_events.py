@@ -68,6 +68,7 @@ def disc(row, column, area_m2, depth_m):
 
 
 @pytest.mark.parametrize("heavy", [False, True])
+@pytest.mark.integration
 def test_quiet_hours_have_no_event(heavy):
     for seed in range(4):
         valley = Valley(seed, heavy=heavy)

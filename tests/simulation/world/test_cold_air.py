@@ -49,6 +49,7 @@ def integrate_ray(cold_air, slope, coefficient, ice_m):
     ids=["deep", "thin", "whole path"],
 )
 @pytest.mark.parametrize(("slope", "ice_m"), [(-0.25, -500.0), (-0.04, -100.0)])
+@pytest.mark.integration
 def test_rays_end_where_an_independent_integration_puts_them(cold_air, slope, ice_m):
     axis = np.arange(-3500.0, 3501.0, 50.0)
     ground = NodeField(-3500.0, -3500.0, 50.0, np.full((len(axis), len(axis)), ice_m))
