@@ -56,6 +56,7 @@ def test_ascii_texts_of_older_files_are_decoded():
     assert decode_text(netCDF4.stringtochar(old)) == ["sop-1", "a reason?"]
 
 
+@pytest.mark.integration
 def test_epochs_and_series_return_the_texts_also_after_compaction(built, series):
     with station.open(series.folder) as ds:
         assert ds.verdict_reason.values.tolist() == ["", TEXT]

@@ -133,6 +133,7 @@ def test_page_without_any_scan(tmp_path, context, series):
     assert page_data(tmp_path / "page")["maps"] == []
 
 
+@pytest.mark.integration
 def test_only_changed_files_are_replaced_and_no_temporary_file_remains(write, context):
     folder = write()
     before = {path: path.stat().st_ino for path in folder.rglob("*") if path.is_file()}

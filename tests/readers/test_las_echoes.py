@@ -192,6 +192,7 @@ def test_constant_reflectance_is_replaced_by_intensity_only_if_the_choice_is_fre
     assert read(path, intensity="reflectance")[1] is None
 
 
+@pytest.mark.integration
 def test_intensity_that_begins_after_the_first_chunk_is_brightness(write_echoes):
     values = np.where(np.arange(120_000) < 50_000, 0, 300)
     path = write_echoes("a.laz", 120_000, intensity=values)

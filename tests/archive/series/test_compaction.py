@@ -129,6 +129,7 @@ def test_a_file_that_the_series_refers_to_is_never_deleted(filled):
     assert values(filled).sizes["time"] == 5
 
 
+@pytest.mark.integration
 def test_the_grace_period_starts_when_the_series_no_longer_refers_to_a_file(filled):
     original = filled.path.read_bytes()
     compact_and_build(filled, DAY_AFTER)
@@ -164,6 +165,7 @@ def test_a_compacted_file_never_changes_under_its_name(filled, epoch):
         assert contents.get(path.name, path.read_bytes()) == path.read_bytes()
 
 
+@pytest.mark.integration
 def test_progress_is_called_while_a_file_is_copied(filled):
     calls = []
     compact_and_build(filled, DAY_AFTER, lambda: calls.append(1))

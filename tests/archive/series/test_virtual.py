@@ -322,6 +322,7 @@ def test_changed_metadata_of_the_station_is_written_to_the_series(growing, epoch
         assert file.attrs["station_name"] == b"Kesselwandferner"
 
 
+@pytest.mark.integration
 def test_the_index_is_current_until_a_file_is_added_or_removed(growing, epoch):
     series, update = growing
     assert manifest.index_if_current(series) is None

@@ -152,6 +152,7 @@ def test_matrices_with_the_same_name_stay_apart(source, tmp_path):
     assert len(read_site(site).sop) == 1  # the other one is a comment
 
 
+@pytest.mark.integration
 def test_pipes_links_and_garbage_are_no_finds(source, tmp_path):
     """A pipe would make whoever opens it wait for ever."""
     for name in ("a.txt", "b.dat", "c.rsp", "250716_000000.laz"):

@@ -463,6 +463,7 @@ def test_posterior_without_observations_is_the_prior():
     assert_allclose(adjustment.redundancy, 0.0, atol=1e-6)
 
 
+@pytest.mark.integration
 def test_smooth_snowfall_hardly_biases_the_state_if_stable_ground_is_spread_out():
     stable, z = random_sites(41, 100), []
     for seed in range(8):

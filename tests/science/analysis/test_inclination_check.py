@@ -175,6 +175,7 @@ def test_a_bias_is_reported():
 
 
 @pytest.mark.parametrize("offset_s", [6.0, -6.0])
+@pytest.mark.integration
 def test_a_clock_offset_is_detected_with_strong_jitter(offset_s):
     estimates = []
     for seed in range(4):

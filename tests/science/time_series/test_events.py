@@ -77,6 +77,7 @@ def test_quiet_hours_have_no_event(heavy):
             assert valley.regions(scans[:last]) == []
 
 
+@pytest.mark.integration
 def test_a_small_deposit_is_found_by_the_second_scan_anywhere():
     """0.3 m over 500 m²; where at least 60 % of it is seen."""
     found = seen = 0

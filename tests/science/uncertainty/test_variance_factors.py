@@ -50,6 +50,7 @@ def test_systematic_factor_is_one_where_stable_ground_fits_better_than_expected(
 
 
 @pytest.mark.parametrize("sigma_m", [0.0015, 0.004])
+@pytest.mark.integration
 def test_systematic_factor_is_found_from_blocks_of_stable_ground(sigma_m):
     found = [estimate_variance_factors(residuals(seed, (1.0, 1.0), sigma_m)).systematic for seed in range(4)]
     assert np.mean(np.log(found)) == pytest.approx(np.log((sigma_m / 0.001) ** 2), abs=0.4)

@@ -47,6 +47,7 @@ def test_gusts_do_not_depend_on_the_order_of_evaluation():
     np.testing.assert_allclose(gusts(time_s), singly, atol=1e-18)
 
 
+@pytest.mark.integration
 def test_steps_have_their_rate_and_magnitude_and_decay():
     scenario = single_error(tilt_jerk_deg=0.002)
     time_s = np.arange(0, 60 * 3600, 0.5)

@@ -140,6 +140,7 @@ def test_random_walk_does_not_depend_on_the_length_of_the_series():
     assert walk.tilt(np.array([-6.0]))[0] == pytest.approx(-walk.mean_rad)
 
 
+@pytest.mark.integration
 def test_heavy_tails_of_the_line_jitter():
     """Student's t with 5 degrees of freedom has kurtosis 9; 2.5 % lie beyond 2.571 · √(3/5) σ."""
     scenario = single_error(line_jitter_deg=0.001, lines=2000)

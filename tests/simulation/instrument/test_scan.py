@@ -165,6 +165,7 @@ def test_ridge_casts_a_shadow():
     assert (along < crest).sum() > 1000
 
 
+@pytest.mark.integration
 def test_cast_rays_agree_with_small_steps_along_the_rays():
     station = Station(small())
     ground = station.valley.ground

@@ -99,6 +99,7 @@ def test_creep_lowers_a_plane_by_its_steeper_dip():
     assert 0.2 < (inner == 0).mean() < 0.9
 
 
+@pytest.mark.integration
 def test_truth_tells_the_heave_of_stable_ground():
     scenario = replace(small(hours=3), heave_m=0.003, creep_m=0.02, terrain_step_m=4.0, cell_m=10.0)
     truth = Station(scenario).truth()
