@@ -6,6 +6,7 @@ import gc
 import multiprocessing
 import time
 from datetime import timedelta
+from importlib import import_module
 from multiprocessing.connection import Connection
 from pathlib import Path
 from statistics import mean
@@ -21,6 +22,7 @@ from station.archive.series.virtual import build_series
 from station.config import Site, read_site
 from station.processing.epoch_recorder import page_folder
 from station.processing.site_files import series_for
+from station.processing.workers.fork_server import PRELOAD
 from station.products.gallery import cached_base_map
 from station.products.overview import Overview, OverviewBuilder
 from station.products.page import PageContext, write_page
@@ -61,6 +63,8 @@ def page(site: str, history: int, hours: int) -> dict[str, float]:
 def _cost(site: Site, epoch: Path) -> float:
     """Return the CPU time of the page of a new epoch [s], in a process of its own as in the service."""
     receiver, sender = multiprocessing.Pipe()
+    for module in PRELOAD:  # as the server has, from which the service's workers are forked
+        import_module(module)
     child = multiprocessing.get_context("fork").Process(target=_measure, args=(site, epoch, sender))
     child.start()
     sender.close()  # so that a failed child is an error here

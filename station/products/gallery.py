@@ -91,6 +91,7 @@ class Gallery:
     levels: LevelMaps
     limit_m: float | None
     size: tuple[int, int]  # of a map [pixels]
+    bases: dict[str, BaseMap]  # by version of the reference
 
 
 def update_gallery(
@@ -106,7 +107,7 @@ def update_gallery(
     read or written.
     """
     if not measured:
-        return Gallery([], LevelMaps(), style.limit_m, (0, 0))
+        return Gallery([], LevelMaps(), style.limit_m, (0, 0), {})
     limit_m = style.limit_m or _fixed_limit(series, folder, measured[0])
     style_json = json.dumps([style.station, style.width_px, limit_m, __version__])
     tag = hashlib.sha256(style_json.encode()).hexdigest()[:8]
@@ -150,7 +151,7 @@ def update_gallery(
     levels = update_levels(series, folder, bases[images[-1].version], progress)
     level_folders = [name for level in levels.maps for name in level.folders]
     delete_old_values(folder, [*(item.epoch_file for item in images), *level_folders], bases)
-    return Gallery(images, levels, limit_m, _size(folder / images[-1].file))
+    return Gallery(images, levels, limit_m, _size(folder / images[-1].file), bases)
 
 
 def _make(

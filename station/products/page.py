@@ -22,7 +22,6 @@ from station.products.gallery import (
     Gallery,
     MeasuredEpoch,
     Style,
-    cached_base_map,
     replace_if_changed,
     retention_indices,
     update_gallery,
@@ -105,7 +104,7 @@ def write_page(
     table = read_epoch_table(series) if series.path.is_file() else None
     all_areas = usable_area_series(series, table) if table is not None else []
     areas = all_areas[:MAX_AREAS]
-    gallery, curves = Gallery([], LevelMaps(), None, (0, 0)), None
+    gallery, curves = Gallery([], LevelMaps(), None, (0, 0), {}), None
     if table is not None:
         style = Style(context.name or series.station_id, width_px, limit_m)
         measured = _measured_epochs(series, table, context.overviews)
@@ -131,7 +130,7 @@ def write_page(
             for image in gallery.change
         ],
         "level_times": {level.name: level.time_s for level in gallery.levels.maps},
-        "frames": _frames(series, folder, gallery, width_px),
+        "frames": _frames(gallery, width_px),
         "values": value_codes(),
         "scales": browser_scales(gallery.limit_m) if gallery.limit_m else {},
         "picture_px": gallery.size[0],
@@ -226,11 +225,11 @@ def _update_curves(
     return update_curves(series, folder, tiers, progress)
 
 
-def _frames(series: Series, folder: Path, gallery: Gallery, width_px: int) -> dict[str, Any]:
+def _frames(gallery: Gallery, width_px: int) -> dict[str, Any]:
     """Return where the map is in its images, and its extent [m], by version of the reference."""
     frames = {}
     for version in sorted({image.version for image in gallery.change}):
-        base = cached_base_map(series, folder, version, width_px)
+        base = gallery.bases[version]
         grid = base.grid
         extent = {"west": grid.west_m, "east": grid.west_m + grid.nx * grid.cell_m, "north": grid.north_m}
         extent["south"] = grid.north_m - grid.ny * grid.cell_m

@@ -29,7 +29,7 @@ from station.queries.stable_ground import z_by_range
 
 CALIBRATED_Z_STD = (0.8, 1.25)  # limits of the standard deviation of change / sigma on stable ground
 RECENT_SCANS = 24  # scans used for it
-READ_EVERY_S = 21_600.0  # of their stable ground, as reading costs half of a decoding on a large grid
+READ_EVERY_S = 43_200.0  # of their stable ground, as reading costs half of a decoding on a large grid
 READ_SCANS = 1  # per page: older scans are read over several pages
 MIN_CELLS = 20  # of stable ground, for a distance to be judged
 DAYS, DAY_S, DAY_MIN = 10, 86_400.0, 1440.0
@@ -106,7 +106,7 @@ def sigma_status(z_std: float) -> str:
 def calibration_by_range(
     series: Series, table: EpochTable, folder: Path, text: dict[str, str]
 ) -> list[RangeCalibration]:
-    """Return the calibration of sigma by distance, from four scans a day that are not of the reference.
+    """Return the calibration of sigma by distance, from two scans a day that are not of the reference.
 
     What was read of a scan is kept in `folder`. Raises StoreError if an epoch cannot be read.
     """

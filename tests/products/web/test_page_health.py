@@ -39,7 +39,7 @@ def with_stable_ground(series, small):
     range_m = np.hypot(grid.x_m[None, :] - east_m, grid.y_m[:, None] - north_m)
     sigma_m = np.full(grid.shape, 0.02, np.float32)
     error_m = 0.02 * rng.normal(size=grid.shape) * np.where(range_m < 250, 1.0, 2.0)
-    epoch = small.make_epoch(6)
+    epoch = small.make_epoch(12)
     measurement = Measurement.from_rasters(
         grid,
         np.full(grid.shape, Quality.STABLE_GROUND, np.uint8),
@@ -87,7 +87,7 @@ def test_stable_ground_of_a_scan_is_read_once(with_stable_ground, tmp_path, monk
     )
     for _ in range(6):
         page_health.calibration_by_range(series, table, tmp_path, ENGLISH)
-    assert sorted(calls) == [table.texts["epoch_file"][hour] for hour in (0, 6)]  # one in six hours
+    assert sorted(calls) == [table.texts["epoch_file"][position] for position in (0, 6)]  # one in twelve hours
     (tmp_path / ".calibration.json").write_text("{damaged")
     (row,) = page_health.calibration_by_range(series, table, tmp_path, ENGLISH)
     assert (row.range, row.scans) == ("up to 100 m", page_health.READ_SCANS)
