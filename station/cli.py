@@ -16,11 +16,11 @@ from station.commands import (
     process,
     products,
     reprocess,
-    retry,
     run,
     sensitivity,
     simulate,
     sop,
+    upgrade,
 )
 from station.errors import StationError
 
@@ -34,7 +34,8 @@ app = typer.Typer(
     rich_markup_mode=None,
 )
 COMMANDS = (
-    check.init, check.check, process.process, retry.retry, reprocess.reprocess, run.run, run.status,
+    check.init, check.check, process.process, reprocess.retry, reprocess.reprocess, run.run, run.status,
+    upgrade.upgrade,
     simulate.simulate, simulate.demo, products.areas, products.trend, products.events, products.plot,
     exports.export, run.publish, products.serve, products.index, calibrate.calibrate,
     sensitivity.sensitivity, papers.papers,

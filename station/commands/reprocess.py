@@ -1,4 +1,4 @@
-"""`station reprocess`."""
+"""`station reprocess` and `station retry`."""
 
 from __future__ import annotations
 
@@ -39,3 +39,21 @@ def reprocess(
 
     begin, end = (moment.replace(tzinfo=UTC) if moment else None for moment in (from_, to))
     sys.exit(reprocess_site(read_site(site), (begin, end), print, scheduler=scheduler, dry_run=dry_run))
+
+
+def retry(
+    site: SiteArgument,
+    scans: Annotated[
+        list[str] | None,
+        typer.Argument(metavar="[SCAN...]", help="File names; all if none is given.", show_default=False),
+    ] = None,
+) -> None:
+    """Try scans again that were set aside or failed, also beside the running service.
+
+    Not needed after a change of settings, limits or version: then the service tries them by itself.
+    """
+    from station.config import read_site
+    from station.operations.retry import retry_scans
+
+    for line in retry_scans(read_site(site), [scan.rpartition("/")[2] for scan in scans or ()]):
+        print(line)

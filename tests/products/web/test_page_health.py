@@ -87,7 +87,9 @@ def test_stable_ground_of_a_scan_is_read_once(with_stable_ground, tmp_path, monk
     )
     for _ in range(6):
         page_health.calibration_by_range(series, table, tmp_path, ENGLISH)
-    assert sorted(calls) == [table.texts["epoch_file"][position] for position in (0, 6)]  # one in twelve hours
+    assert sorted(calls) == [
+        table.texts["epoch_file"][position] for position in (0, 6)
+    ]  # one in twelve hours
     (tmp_path / ".calibration.json").write_text("{damaged")
     (row,) = page_health.calibration_by_range(series, table, tmp_path, ENGLISH)
     assert (row.range, row.scans) == ("up to 100 m", page_health.READ_SCANS)
