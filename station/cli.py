@@ -35,7 +35,8 @@ app = typer.Typer(
 )
 COMMANDS = (
     check.init, check.check, process.process, retry.retry, reprocess.reprocess, run.run, run.status,
-    simulate.simulate, simulate.demo, products.areas, products.trend, products.events, products.plot,
+    simulate.simulate, simulate.demo, products.areas, products.product, products.trend, products.events,
+    products.plot,
     exports.export, run.publish, products.serve, products.index, calibrate.calibrate,
     sensitivity.sensitivity, papers.papers,
 )  # fmt: skip

@@ -3,6 +3,7 @@
 import shutil
 from collections import defaultdict
 from dataclasses import replace
+from datetime import UTC, timedelta
 
 import laspy
 import numpy as np
@@ -10,6 +11,7 @@ import pytest
 import xarray as xr
 from support.series import open_with_processing
 
+import station
 from station.config import read_site
 from station.inbox.listing import ScanFile
 from station.monitoring.log_clock import log_clock_offset
@@ -18,7 +20,9 @@ from station.products.area_tables import Span
 from station.products.trend_tables import trend_records
 from station.quantities import Quality
 from station.queries.aggregates import Aggregates
+from station.queries.site_products.product_queries import Product, update_products
 from station.science.analysis.inclination_check import MAX_OFFSET_S
+from station.sections.product import ProductSection
 from station.simulation.instrument.motion import sensor_faults
 from station.simulation.scenario import named
 from station.simulation.station import simulate
@@ -244,6 +248,43 @@ def test_area_changes_are_stored_with_every_epoch(calm):
         assert areas.sizes["time"] == 3
         assert (np.abs(areas.mean_change) < 3.5 * areas.mean_change_uncertainty).all()
         assert (areas.mean_change_uncertainty < 0.02).all()
+
+
+def boxes_of_products(calm):
+    """Return boxes of 100 m off stable ground, three quarters of whose cells every scan observed, by name."""
+    observed, boxes = np.isfinite(calm.error()).all(axis=0), {}
+    for top, left in np.ndindex(*(size // (2 * BOX) for size in observed.shape)):
+        cells = np.zeros(observed.shape, bool)
+        cells[2 * BOX * top :, 2 * BOX * left :][:BOX, :BOX] = True
+        if observed[cells].mean() > 0.75 and not calm.stable[cells].any():
+            boxes[f"box {top} {left}"] = cells
+    return boxes
+
+
+def product_of(calm, places, line=None, **settings):
+    section = ProductSection.model_validate({"name": "product", **settings})
+    series = scan_tasks.series_for(calm.site)
+    update_products(series, [Product(section, places, line)], [section.key], lambda: None)
+    return station.product(series.folder, "product")
+
+
+def test_products_are_calibrated(calm):
+    """Depth above the first scan, melt since the reference, and gain and loss, with voids, in many boxes."""
+    boxes, first = boxes_of_products(calm), calm.series.time.values[0].astype("M8[s]").item()
+    ends = first - timedelta(minutes=10), first + timedelta(minutes=10)
+    span = dict(zip(("from", "to"), (time.replace(tzinfo=UTC) for time in ends), strict=True))
+    true_m = np.array([[change[cells].mean() for cells in boxes.values()] for change in calm.true_change])
+    depth = product_of(calm, boxes, kind="snow_depth", surface=span)
+    z = (depth.snow_depth.values - true_m + true_m[0])[1:] / depth.snow_depth_uncertainty.values[1:]
+    assert len(boxes) > 20
+    assert 0.8 < rms(z) < 1.25
+    melt = product_of(calm, boxes, kind="melt", density_kg_m3=870.0)
+    z = (melt.melt.values + 0.87 * true_m) / melt.melt_uncertainty.values
+    assert 0.8 < rms(z) < 1.25
+    budget = product_of(calm, boxes, kind="volume_budget")
+    true_m3 = true_m * 100.0 * BOX**2
+    z = (budget.net_change.values - true_m3) / budget.net_change_uncertainty.values
+    assert 0.8 < rms(z) < 1.25
 
 
 @pytest.fixture(scope="module")

@@ -1,0 +1,96 @@
+"""`station product`: tables of products, their newest values, and the comparison with observations."""
+
+import csv
+import io
+import json
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from station.cli import app
+from station.config import read_site
+from station.errors import StationError
+
+SITE_MORE = """
+[[product]]
+name = "Snow depth"
+kind = "snow_depth"
+areas = ["rises"]
+surface = { from = 2025-11-21T00:00:00Z, to = 2025-11-21T00:59:00Z }
+observations = "gauge.csv"
+
+[[product]]
+name = "stake 1"
+kind = "point"
+at = [632125, 5185905]
+
+[[product]]
+name = "line"
+kind = "profile"
+line = [[632100, 5185905], [632300, 5185905]]
+"""
+
+
+@pytest.fixture
+def run(site):
+    """Return a function that runs `station product` and returns its output; the site has three products."""
+    with site.path.open("a") as file:
+        file.write(SITE_MORE)
+    (site.path.parent / "gauge.csv").write_text("time_utc,snow_depth_m\n2025-11-21T02:07:30,0.08\n")
+
+    def run(*arguments):
+        result = CliRunner().invoke(app, ["product", str(site.path), *arguments], catch_exceptions=False)
+        assert result.exit_code == 0
+        return result
+
+    return run
+
+
+def test_the_newest_values_are_those_of_the_last_usable_scan(run, small):
+    """The box rises by 5 cm an hour since the first scan."""
+    rows = json.loads(run("--json").stdout)
+    (depth,) = [row for row in rows if row["quantity"] == "snow_depth"]
+    assert (depth["product"], depth["place"], depth["unit"]) == ("Snow depth", "rises", "m")
+    assert depth["value"] == pytest.approx(0.25, abs=0.01)
+    assert depth["sigma"] < 0.01
+    assert depth["start_s"] == small.START_S + 5 * 3600
+    text = run().stdout
+    assert "Snow depth  rises    snow_depth" in text
+    assert "stake 1     stake 1  elevation" in text
+
+
+def test_a_product_over_time_as_csv_and_text(run):
+    rows = list(csv.DictReader(io.StringIO(run("snow depth", "--csv", "-").stdout)))
+    assert len(rows) == 6
+    assert rows[2]["time_utc"] == "2025-11-21T02:07:30.000Z"
+    assert float(rows[2]["snow_depth_m"]) == pytest.approx(0.10, abs=0.01)
+    sigma_m, random_m, systematic_m = (
+        float(rows[2][f"snow_depth{part}_m"]) for part in ("_sigma", "_random_sigma", "_systematic_sigma")
+    )
+    assert sigma_m == pytest.approx(np.hypot(random_m, systematic_m), rel=1e-4)
+    assert rows[2]["new_snow_24h_m"] == ""
+    result = run("snow depth", "--from", "2025-11-21T02:00", "--to", "2025-11-21T03:30")
+    assert [line[:16] for line in result.stdout.splitlines()[1:3]] == ["2025-11-21 02:00", "2025-11-21 03:00"]
+    assert "snow_depth less observations: n = 1, bias +0.0" in result.stdout
+    assert "z " in result.stdout
+
+
+def test_a_profile_is_printed_for_the_newest_scan(run):
+    lines = run("line").stdout.splitlines()
+    assert len(lines) == 22
+    assert lines[1].startswith("2025-11-21 05:00  0.00")
+
+
+@pytest.mark.usefixtures("run")
+def test_a_name_that_is_none_is_answered_with_those_there_are(site):
+    with pytest.raises(StationError, match=r"no product 'depth'.*products: line, snow_depth, stake_1"):
+        CliRunner().invoke(app, ["product", str(site.path), "depth"], catch_exceptions=False)
+
+
+def test_a_product_that_cannot_be_computed_is_named_and_keeps_no_other_back(run, site):
+    site.path.write_text(site.path.read_text().replace('areas = ["rises"]', 'areas = ["nowhere"]'))
+    result = run()
+    assert "product Snow depth: no area nowhere in areas.file, which has rises" in result.stderr
+    assert "stake 1" in result.stdout
+    assert read_site(site.path).product[0].areas == ("nowhere",)
