@@ -45,12 +45,6 @@ class SurfaceTime(Section):
     from_: Annotated[Utc, Field(alias="from")]
     to: Utc
 
-    @model_validator(mode="after")
-    def _in_order(self) -> SurfaceTime:
-        if self.to <= self.from_:
-            raise ValueError("to must be after from")
-        return self
-
 
 class ProductSection(Section):
     """A quantity by name: its kind, where it is measured, and what it is counted from."""
@@ -82,6 +76,8 @@ class ProductSection(Section):
             raise ValueError(f'kind = "{self.kind}" has no {", ".join(unused)}; its keys: {valid}')
         if self.at is not None and self.areas:
             raise ValueError("areas and at both say where: keep one")
+        if isinstance(self.surface, SurfaceTime) and self.surface.to <= self.surface.from_:
+            raise ValueError("surface: to must be after from")
         if self.radius_m and self.at is None:
             raise ValueError("radius_m is that around at: give at = [easting, northing]")
         return self
