@@ -102,9 +102,9 @@ QUANTITIES: dict[str, tuple[Variable, ...]] = {
     ),
     "melt": (*_quantity("melt", "loss of mass by area", "m", None, _WATER), _COVERAGE),
     "volume_budget": (
+        *_quantity("net_change", "volume gained less volume lost", "m3", cell_methods="area: sum"),
         *_quantity("deposition", "volume gained", "m3", cell_methods="area: sum"),
         *_quantity("erosion", "volume lost, negative", "m3", cell_methods="area: sum"),
-        *_quantity("net_change", "volume gained less volume lost", "m3", cell_methods="area: sum"),
         _COVERAGE,
     ),
     "volume_between": (

@@ -37,6 +37,7 @@ def product_curves(products: list[ProductSeries], text: dict[str, str]) -> list[
                 {
                     "product": product.name,
                     "place": place,
+                    "title": product.name if place == product.name else f"{product.name}, {place}",
                     "quantity": text[f"quantity_{name}"],
                     "unit": unit.replace("m3", "m³"),
                     "digits": DIGITS[unit],
