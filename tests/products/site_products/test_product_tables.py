@@ -76,6 +76,15 @@ def test_a_product_over_time_as_csv_and_text(run):
     assert "z " in result.stdout
 
 
+def test_the_csv_export_has_a_file_of_each_product(run, site, tmp_path):
+    expected = run("snow depth", "--csv", "-").stdout
+    CliRunner().invoke(app, ["export", str(site.path), "csv", str(tmp_path / "csv")], catch_exceptions=False)
+    assert {path.name for path in (tmp_path / "csv").glob("*.csv")} == {
+        "scans.csv", "areas.csv", "product_line.csv", "product_snow_depth.csv", "product_stake_1.csv"
+    }  # fmt: skip
+    assert (tmp_path / "csv/product_snow_depth.csv").read_text() == expected
+
+
 def test_a_profile_is_printed_for_the_newest_scan(run):
     lines = run("line").stdout.splitlines()
     assert len(lines) == 22
