@@ -12,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
+from station.archive.derived.product_files import units_of
 from station.archive.reference_files import valid_versions
 from station.config import Site, read_site
 from station.errors import NotReadyError, ScanError, StationError
@@ -39,6 +40,7 @@ from station.processing.scans.open_scans import open_files
 from station.processing.scans.scan_files import inbox_scans, scan_file
 from station.processing.site_files import load_areas, load_products, polygon_cells, series_for
 from station.processing.workers import isolation
+from station.products.site_products.observations import read_observations
 from station.readers.flags import read_flags
 from station.readers.inclination import read_inclination
 from station.readers.polygons import mended_outlines
@@ -204,8 +206,13 @@ def _products(site: Site) -> Iterator[Finding]:
     """Yield which products can be computed, and why others cannot."""
     products, faults = load_products(site)
     for product in products:
-        cells = sum(int(place.sum()) for place in product.places.values())
-        yield _finding("ok", "products", f"{product.section.name}: {cells:,} cells of the grid")
+        section, cells = product.section, sum(int(place.sum()) for place in product.places.values())
+        yield _finding("ok", "products", f"{section.name}: {cells:,} cells of the grid")
+        if section.observations:
+            try:
+                read_observations(section.observations, units_of(section.kind))
+            except StationError as error:
+                yield _finding("fault", "products", f"{section.name}: {error}")
     for fault in faults:
         yield _finding("fault", "products", fault)
 

@@ -95,7 +95,7 @@ def _load_product(site: Site, section: ProductSection, areas: dict[str, Bools]) 
     for key in {"low", "high"} & rasters.keys():
         places = {name: cells & np.isfinite(rasters[key]) for name, cells in places.items()}
     if empty := [name for name, cells in places.items() if not cells.any()]:
-        raise ConfigError(f"no cell of the grid in {', '.join(empty)}")
+        raise ConfigError(f"no cell of the grid in {', '.join(empty)}: are the coordinates those of the map?")
     files = tuple(sha256_file(path) for path in section.rasters.values())
     return Product(section, places, rasters=rasters, files=files)
 

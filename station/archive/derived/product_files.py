@@ -123,6 +123,11 @@ QUANTITIES: dict[str, tuple[Variable, ...]] = {
 }  # fmt: skip
 
 
+def units_of(kind: str) -> dict[str, str]:
+    """Return the units of the quantities of a kind of product by name."""
+    return {spec.name: spec.units or "1" for spec in QUANTITIES[kind] if spec.ancillary}
+
+
 @dataclass(frozen=True)
 class ProductFile:
     """What a product's file is called and contains."""
@@ -308,7 +313,7 @@ class ProductSeries:
     @property
     def units(self) -> dict[str, str]:
         """The units of its quantities by name."""
-        return {spec.name: spec.units or "1" for spec in QUANTITIES[self.kind] if spec.ancillary}
+        return units_of(self.kind)
 
     @property
     def usable(self) -> ProductSeries:

@@ -11,6 +11,7 @@ from typer.testing import CliRunner
 from station.cli import app
 from station.config import read_site
 from station.errors import StationError
+from station.operations.site_check import site_findings
 
 SITE_MORE = """
 [[product]]
@@ -30,6 +31,9 @@ name = "line"
 kind = "profile"
 line = [[632100, 5185905], [632300, 5185905]]
 """
+
+
+FAR = '[[product]]\nname = "far"\nkind = "point"\nat = [0, 0]\n'
 
 
 @pytest.fixture
@@ -103,3 +107,18 @@ def test_a_product_that_cannot_be_computed_is_named_and_keeps_no_other_back(run,
     assert "product Snow depth: no area nowhere in areas.file, which has rises" in result.stderr
     assert "stake 1" in result.stdout
     assert read_site(site.path).product[0].areas == ("nowhere",)
+
+
+def test_check_says_what_keeps_products_and_their_alarms_from_working(site):
+    (site.path.parent / "gauge.csv").write_text("time,depth\n")
+    more = SITE_MORE + FAR + '[[alarms.product]]\nproduct = "line"\nquantity = "hn24"\nabove = 1\n'
+    site.path.write_text(site.path.read_text() + more)
+    findings = site_findings(site.path)
+    faults = [finding["message"] for finding in findings if finding["level"] == "fault"]
+    for expected in (
+        "product far: no cell of the grid in far: are the coordinates those of the map?",
+        "alarms.product: line has no hn24; it has elevation, elevation_change",
+        "gauge.csv: must begin with a line such as time_utc,snow_depth_m",
+    ):
+        assert any(expected in fault for fault in faults)
+    assert any(finding["message"] == "stake 1: 1 cells of the grid" for finding in findings)
