@@ -80,6 +80,7 @@ def test_a_product_over_time_as_csv_and_text(run):
     assert "z " in result.stdout
 
 
+@pytest.mark.integration
 def test_the_csv_export_has_a_file_of_each_product(run, site, tmp_path):
     expected = run("snow depth", "--csv", "-").stdout
     CliRunner().invoke(app, ["export", str(site.path), "csv", str(tmp_path / "csv")], catch_exceptions=False)
@@ -109,6 +110,7 @@ def test_a_product_that_cannot_be_computed_is_named_and_keeps_no_other_back(run,
     assert read_site(site.path).product[0].areas == ("nowhere",)
 
 
+@pytest.mark.integration
 def test_check_says_what_keeps_products_and_their_alarms_from_working(site):
     (site.path.parent / "gauge.csv").write_text("time,depth\n")
     more = SITE_MORE + FAR + '[[alarms.product]]\nproduct = "line"\nquantity = "hn24"\nabove = 1\n'

@@ -124,7 +124,10 @@ def test_snow_depth_above_a_given_surface_has_the_errors_of_the_reference(base, 
     assert_sigmas(depth, "snow_depth", LAST, random=np.nansum(weights**2 * random_m2), total=total)
 
 
-@pytest.mark.parametrize(("kind", "sign"), [("melt", -1.0), ("surface_mass_balance", 1.0)])
+@pytest.mark.parametrize(
+    ("kind", "sign"),
+    [("melt", -1.0), pytest.param("surface_mass_balance", 1.0, marks=pytest.mark.integration)],
+)
 def test_mass_is_change_times_density_with_the_error_of_both(base, stored, box, kind, sign):
     mass, _ = computed(base, {"ice": box}, kind=kind, density_kg_m3=850.0, density_sigma_kg_m3=40.0)
     mean_m = change_m(stored, LAST, box).mean()
@@ -137,6 +140,7 @@ def test_mass_is_change_times_density_with_the_error_of_both(base, stored, box, 
     assert_sigmas(mass, kind, LAST, random=0.85**2 * random, total=expected)
 
 
+@pytest.mark.integration
 def test_a_point_has_elevation_and_change(base, stored, box):
     row, column = np.argwhere(box)[40]
     cell = np.zeros(GRID.shape, bool)
@@ -154,6 +158,7 @@ def test_a_point_has_elevation_and_change(base, stored, box):
     )
 
 
+@pytest.mark.integration
 def test_the_volume_between_two_levels_is_that_of_clipped_heights(base, stored, box):
     low_m, high_m = 2840.0, 2860.0
     volume, _ = computed(base, {"beach": box}, kind="volume_between", low=low_m, high=high_m)
@@ -200,6 +205,7 @@ def test_a_volume_budget_closes_and_has_the_covariance_of_its_classes(base, stor
 ENDS = [(GRID.x_m[4], GRID.y_m[ROW]), (GRID.x_m[34], GRID.y_m[ROW])]  # it climbs by a quarter
 
 
+@pytest.mark.integration
 def test_a_profile_has_the_heights_and_sigmas_of_its_cells(base, stored):
     profile, _ = computed(base, kind="profile", line=ENDS)
     expected_m = stored.elevation.values[LAST, ROW, 4:35]
@@ -263,6 +269,7 @@ def test_only_new_epochs_and_those_that_depend_on_them_are_computed(base, box, t
     assert not path.exists()
 
 
+@pytest.mark.integration
 def test_nothing_is_written_before_the_surface_is_measured(base, box, tmp_path):
     series = copied(base, tmp_path / "store")
     section = {
@@ -275,6 +282,7 @@ def test_nothing_is_written_before_the_surface_is_measured(base, box, tmp_path):
     assert not product_path(series.folder, "test").exists()
 
 
+@pytest.mark.integration
 def test_unusable_scans_are_no_surface_and_no_earlier_snow(base, box, tmp_path):
     series = copied(base, tmp_path / "store")
     epoch = replace(make_epoch(31, "joint", random_parameters(31, 0.3)), verdict="unusable")
