@@ -162,7 +162,8 @@ class Aggregates(EpochReader):
         random_m2 = area.random_m2[0]
         if shared is None:
             return random_m2, np.zeros(len(random_m2))
-        return random_m2, np.asarray(self.jacobian(epoch_cells, area.cells).variance(shared), np.float64)
+        shared_m2 = self.jacobian(epoch_cells, area.cells).variance(shared)
+        return random_m2, np.maximum(shared_m2, 0.0, dtype=np.float64)
 
     def _mean_elevation(self, epoch_cells: EpochCells, cells: Bools) -> Floats:
         """Return the heights (n,) that the change of an epoch is counted from [m]."""

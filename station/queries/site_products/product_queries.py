@@ -284,15 +284,15 @@ class ProductQueries(Aggregates):
         change_m, random_m = np.full((2, *observed.shape), np.nan)
         change_m[observed], random_m[observed] = area.value_m, np.sqrt(np.sum(area.random_m2, axis=0))
         is_gain = gained(change_m, random_m)[observed]
-        size_m2, in_voids = np.count_nonzero(cells) * self.grid.cell_m**2, area.weights
-        in_voids = in_voids - 1 / np.count_nonzero(cells)
+        count = np.count_nonzero(cells)
+        size_m2, in_voids = count * self.grid.cell_m**2, area.weights - 1 / count
         budget = {}
         for name, chosen in (
             ("deposition", is_gain),
             ("erosion", ~is_gain),
             ("net_change", np.ones_like(is_gain)),
         ):
-            share = in_voids[chosen].sum() / max(in_voids.sum(), np.finfo(float).tiny)
+            share = in_voids[chosen].sum() / in_voids.sum() if area.void_m2 else 0.0  # of the voids
             weights = size_m2 * np.where(chosen, area.weights, 0.0)
             budget[name] = self._sum(area, weights, area.value_m, (share * size_m2) ** 2 * area.void_m2)
         return budget, area.coverage
