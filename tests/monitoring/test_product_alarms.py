@@ -2,13 +2,11 @@
 
 import numpy as np
 import pytest
+from support.products import write_melt
 
-from station.archive.derived.boxes import Entries
-from station.archive.derived.product_files import SIGMAS, ProductFile, update_product
 from station.config import read_site
 from station.errors import ConfigError
 from station.monitoring.product_alarms import product_alarms
-from station.processing.site_files import series_for
 from station.sections.results import ProductAlarm
 
 PRODUCT = """
@@ -26,19 +24,7 @@ def alarms(write_site):
     site = read_site(write_site(more=PRODUCT))
 
     def alarms(values, *, verdicts=None, assessed_until=None, **rule):
-        start_s = 3600.0 * np.arange(len(values))
-        texts = np.array([f"e{hour}".encode() for hour in range(len(values))])
-        product = ProductFile(
-            "ice_melt", "Ice melt", "melt", str(values), "place", np.zeros(1), np.zeros(1), ("stake",)
-        )
-
-        def row(index):
-            sigmas = {f"melt_{part}": np.array([0.1]) for part in SIGMAS}
-            return {"melt": np.array([values[index]]), "coverage": np.ones(1), **sigmas}
-
-        verdict = np.zeros(len(values), int) if verdicts is None else np.array(verdicts)
-        entries = Entries(start_s, start_s + 60, texts, texts)
-        update_product(series_for(site), product, entries, verdict, row, lambda: None)
+        write_melt(site, 3600.0 * np.arange(len(values)), values, verdicts)
         settings = {"product": "Ice melt", "quantity": "melt", **({"above": 1.0} | rule)}
         return list(product_alarms(site, ProductAlarm.model_validate(settings), assessed_until))
 

@@ -33,7 +33,7 @@ from station.archive.netcdf_layout import (
 from station.archive.read_errors import read_errors
 from station.archive.schema import BY_NAME, FILL, TEXT, TEXT_LENGTH, VERDICTS, Variable
 from station.errors import StationError, StoreError
-from station.quantities import Floats, Ints
+from station.quantities import Bools, Floats, Ints
 from station.sections.product import product_key
 
 if TYPE_CHECKING:
@@ -318,7 +318,13 @@ class ProductSeries:
     @property
     def usable(self) -> ProductSeries:
         """The same without the scans that must not be used."""
-        rows = self.verdict != VERDICTS.index("unusable")
+        return self._at(self.verdict != VERDICTS.index("unusable"))
+
+    def until(self, end_s: float) -> ProductSeries:
+        """Return the scans that began before a time [s since 1970]."""
+        return self._at(self.start_s < end_s)
+
+    def _at(self, rows: Bools) -> ProductSeries:
         columns = {name: column[rows] for name, column in self.columns.items()}
         return replace(
             self,
