@@ -161,11 +161,14 @@ class ProductQueries(Aggregates):
         return np.stack(columns, axis=-1)
 
     def _surface_epoch(self, span: SurfaceTime) -> int:
-        """Return the usable epoch nearest to the middle of a time span, a good one if there is any."""
+        """Return the usable epoch nearest to the middle of a time span, a good one if there is any.
+
+        NONE until the span is over: as long as it grows, each scan would change all values.
+        """
         from_s, to_s = span.from_.timestamp(), span.to.timestamp()
         time_s = self._epochs.time_s[self._usable]
         within = self._usable[(time_s >= from_s) & (time_s <= to_s)]
-        if not len(within):
+        if not len(within) or self._epochs.time_s[-1] <= to_s:
             return NONE
         distance_s = np.abs(self._epochs.time_s[within] - (from_s + to_s) / 2)
         return int(within[np.lexsort([distance_s, self._verdict[within]])[0]])

@@ -270,15 +270,12 @@ def test_only_new_epochs_and_those_that_depend_on_them_are_computed(base, box, t
 
 
 @pytest.mark.integration
-def test_nothing_is_written_before_the_surface_is_measured(base, box, tmp_path):
+@pytest.mark.parametrize("span", [("2026-07-01", "2026-08-01"), ("2025-11-21", "2025-11-24")])
+def test_nothing_is_written_until_the_time_of_the_surface_is_over(base, box, tmp_path, span):
     series = copied(base, tmp_path / "store")
-    section = {
-        "name": "test",
-        "kind": "snow_depth",
-        "surface": {"from": "2026-07-01T00:00:00Z", "to": "2026-08-01T00:00:00Z"},
-    }
-    product = Product(ProductSection.model_validate(section), {"bowl": box})
-    update_products(series, [product], ["test"], lambda: None)
+    time = dict(zip(("from", "to"), (f"{day}T00:00:00Z" for day in span), strict=True))
+    section = ProductSection.model_validate({"name": "test", "kind": "snow_depth", "surface": time})
+    update_products(series, [Product(section, {"bowl": box})], ["test"], lambda: None)
     assert not product_path(series.folder, "test").exists()
 
 
