@@ -181,6 +181,8 @@ def _keys(section: type[Section], prefix: str) -> typing.Iterator[tuple[str, ...
         key = f"{prefix}{field.alias or name}"
         inner = _sections_in(field.annotation)
         if inner:
+            if Path in typing.get_args(field.annotation):
+                yield f"`{key}`", "path, or the table of the next keys", "", "", ""
             yield from _keys(inner[0], f"{key}.")
             continue
         default = field.default
