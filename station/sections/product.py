@@ -55,7 +55,7 @@ class ProductSection(Section):
     at: tuple[Place, Place] | None = None
     radius_m: NotNegative = 0.0
     line: Annotated[tuple[tuple[Place, Place], ...], Field(min_length=2)] | None = None
-    height_m: float | None = None
+    height_m: float | Literal["crest"] | None = None
     low: float | Path | None = None
     high: float | Path | None = None
     surface: Path | SurfaceTime | None = None

@@ -117,7 +117,7 @@ QUANTITIES: dict[str, tuple[Variable, ...]] = {
         *_quantity("elevation_change", "elevation above the reference surface", "m", dims=_ALONG),
     ),
     "contour": (
-        *_quantity("distance", "distance from the start of the line to where the surface crosses the height",
+        *_quantity("distance", "distance from the start of the line to the height or the crest",
                    "m", None, _MAP, cell_methods=None),
     ),
 }  # fmt: skip

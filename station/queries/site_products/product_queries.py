@@ -37,6 +37,7 @@ from station.queries.epoch_cells import bounding_box
 from station.queries.site_products.profile_lines import Line
 from station.science.analysis.product_estimates import (
     Estimate,
+    crest,
     crossing,
     gained,
     thickness_between,
@@ -199,9 +200,7 @@ class ProductQueries(Aggregates):
         if kind == "profile" and line is not None:
             return self._profile(line, epoch)
         if kind == "contour" and line is not None:
-            return _columns(
-                {"distance": [self._contour(line, epoch, product.section.height_m or 0.0)]}, np.empty(0)
-            )
+            return _columns({"distance": [self._contour(line, epoch, product.section.height_m)]}, np.empty(0))
         values: dict[str, list[Estimate]] = {}
         coverage = []
         for cells in product.places.values():
@@ -314,18 +313,21 @@ class ProductQueries(Aggregates):
             columns |= _parts(name, value, random_m2, systematic_m2)
         return columns
 
-    def _contour(self, line: Line, epoch: EpochRef, height_m: float) -> Estimate:
-        """Return the distance along a line at which the surface crosses a height [m]."""
+    def _contour(self, line: Line, epoch: EpochRef, height_m: float | str | None) -> Estimate:
+        """Return the distance along a line at which the surface crosses a height, or of its crest [m]."""
         area = self.observe(line.cells, epoch, surface_m=self._datum)
         if area is None:
             return Estimate()
         interpolation, complete = line.weights(area.cells)
         profile_m = np.where(complete, interpolation @ area.value_m, np.nan)
-        found = crossing(line.distance_m, profile_m, height_m)
+        found = (
+            crossing(line.distance_m, profile_m, height_m)
+            if isinstance(height_m, float)
+            else crest(line.distance_m, profile_m)
+        )
         if found is None:
             return Estimate()
-        weights = np.asarray(interpolation[found.samples].mean(axis=0)).ravel() / found.slope
-        random, total = self.sum_variance(area, weights)
+        random, total = self.sum_variance(area, found.sensitivity @ interpolation[found.samples])
         return Estimate(found.distance_m, random, total - random)
 
 

@@ -16,7 +16,8 @@ from station.quantities import Bools, Floats, Ints
 WATER_KG_M3 = 1000.0
 SIGN_WINDOW_CELLS = 5  # the neighbours that decide whether a cell lost or gained
 CLEAR_SIGMAS = 4.0  # beyond, a cell decides itself: noise gets there once in 16,000 cells
-SLOPE_SAMPLES = 2  # on either side of a crossing, between which the slope is taken
+CROSSING_SAMPLES = 2  # on either side of a crossing, which make its line
+CREST_SAMPLES = 3  # on either side of the highest, which make its parabola
 
 
 @dataclass(frozen=True)
@@ -78,26 +79,55 @@ def thickness_between(height_m: Floats, low_m: Floats, high_m: Floats) -> tuple[
     return np.clip(height_m, low_m, high_m) - low_m, inside.astype(np.float64)
 
 
-class Crossing(NamedTuple):
-    """Where a profile crosses a height: the distance [m], the slope there, and the samples it is from."""
+class LinePosition(NamedTuple):
+    """A place along a profile: its distance [m], and how far it moves by the height of each sample [m/m]."""
 
     distance_m: float
-    slope: float
-    samples: Ints
+    samples: Ints  # (k,) that it is from
+    sensitivity: Floats  # (k,)
 
 
-def crossing(distance_m: Floats, height_m: Floats, level_m: float) -> Crossing | None:
+def crossing(distance_m: Floats, height_m: Floats, level_m: float) -> LinePosition | None:
     """Return the first place along a profile (n,) where its height crosses a level; None if there is none.
 
     Heights are NaN where not observed. The place is that on the straight line through the samples on either
-    side, whose mean error moves it by error / slope. Source: equations.md, 6.18.
+    side. Source: equations.md, 6.18.
     """
     above, known = height_m > level_m, np.isfinite(height_m)
     for first in np.flatnonzero((above[1:] != above[:-1]) & known[1:] & known[:-1]).tolist():
-        window = np.arange(max(first - SLOPE_SAMPLES + 1, 0), min(first + SLOPE_SAMPLES + 1, len(height_m)))
-        samples = window[known[window]]
-        s, h = distance_m[samples], height_m[samples]
-        slope = float(np.polyfit(s - s.mean(), h, 1)[0])
+        samples = _around(known, first - CROSSING_SAMPLES + 1, first + CROSSING_SAMPLES)
+        offset_m, h = distance_m[samples] - distance_m[samples].mean(), height_m[samples]
+        slope = float(offset_m @ h / (offset_m @ offset_m))
         if slope * (height_m[first + 1] - height_m[first]) > 0:
-            return Crossing(float(s.mean() + (level_m - h.mean()) / slope), slope, samples)
+            shift_m = (level_m - h.mean()) / slope
+            sensitivity = -(1 / len(h) + shift_m * offset_m / (offset_m @ offset_m)) / slope
+            return LinePosition(float(distance_m[samples].mean() + shift_m), samples, sensitivity)
     return None
+
+
+def crest(distance_m: Floats, height_m: Floats) -> LinePosition | None:
+    """Return the place of the crest of a profile (n,); None if its highest sample is at an end or a gap.
+
+    Heights are NaN where not observed. It is the summit of the parabola through the samples around the
+    highest. Source: equations.md, 6.18.
+    """
+    known = np.isfinite(height_m)
+    if not known.any():
+        return None
+    highest = int(np.nanargmax(height_m))
+    samples = _around(known, highest - CREST_SAMPLES, highest + CREST_SAMPLES)
+    if not samples[0] < highest < samples[-1] or len(samples) < 4:
+        return None
+    origin_m = distance_m[highest]
+    fit = np.linalg.pinv(np.vander(distance_m[samples] - origin_m, 3, increasing=True))  # (3, k)
+    _, slope, curvature = fit @ height_m[samples]
+    if curvature >= 0:
+        return None
+    sensitivity = (slope * fit[2] / curvature - fit[1]) / (2 * curvature)
+    return LinePosition(float(origin_m - slope / (2 * curvature)), samples, sensitivity)
+
+
+def _around(known: Bools, first: int, last: int) -> Ints:
+    """Return the known samples from `first` to `last` inclusive, as far as the profile goes."""
+    window = np.arange(max(first, 0), min(last + 1, len(known)))
+    return window[known[window]]

@@ -235,9 +235,14 @@ def test_a_contour_is_where_the_surface_crosses_the_height(base, stored):
     start_m = 2800 + EAST * (GRID.x_m[4] - GRID.west_m) - 0.125 * (GRID.y_m[ROW] - GRID.north_m)
     expected_m = (level_m - start_m - np.nanmean(stored.elevation_change.values[LAST])) / EAST
     assert float(contour.distance[LAST, 0]) == pytest.approx(expected_m, abs=1.0)  # cells scatter by 0.1 m
-    slope = np.polyfit(10.0 * np.arange(4), heights_m[first - 1 : first + 3], 1)[0]
-    weights = np.zeros(GRID.shape)
-    weights[ROW, 4 + first - 1 : 4 + first + 3] = 0.25 / slope
+
+    def place_m(heights):
+        slope, height = np.polyfit(10.0 * np.arange(4) - 15.0, heights, 1)
+        return (level_m - height) / slope
+
+    four_m, weights = heights_m[first - 1 : first + 3], np.zeros(GRID.shape)
+    lifted_m = four_m + 1e-5 * np.eye(4)
+    weights[ROW, 4 + first - 1 : 4 + first + 3] = [(place_m(h) - place_m(four_m)) / 1e-5 for h in lifted_m]
     random_m2 = independent_m2(stored, LAST, reference_random_m2(base))
     total = dense_variance(stored, weights, LAST, random_m2=random_m2, reference=random_parameters(7, 0.5))
     assert_sigmas(contour, "distance", LAST, random=np.nansum(weights**2 * random_m2), total=total)

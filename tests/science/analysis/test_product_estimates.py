@@ -5,6 +5,7 @@ import pytest
 
 from station.science.analysis.product_estimates import (
     Estimate,
+    crest,
     crossing,
     gained,
     thickness_between,
@@ -68,14 +69,35 @@ def test_thickness_between_levels_is_clipped():
     assert derivative.tolist() == [0.0, 1.0, 0.0]
 
 
+def moved(position, distance_m, height_m, sample):
+    """Return how far a position moves by a tenth of a millimetre of one sample, per metre."""
+    lifted_m = height_m.copy()
+    lifted_m[sample] += 1e-4
+    return (position(distance_m, lifted_m).distance_m - position(distance_m, height_m).distance_m) / 1e-4
+
+
 def test_a_crossing_of_a_plane_is_exact_and_the_first_is_taken():
     distance_m = np.arange(0.0, 50.0, 2.0)
-    found = crossing(distance_m, 7.0 - 0.2 * distance_m, 3.1)
-    assert found.distance_m == pytest.approx((7.0 - 3.1) / 0.2)
-    assert found.slope == pytest.approx(-0.2)
+    assert crossing(distance_m, 7.0 - 0.2 * distance_m, 3.1).distance_m == pytest.approx(3.9 / 0.2)
     wave_m = np.sin(distance_m / 5)
     found = crossing(distance_m, wave_m, 0.2)
     assert found.distance_m == pytest.approx(5 * np.arcsin(0.2), abs=0.1)
+    for sample, sensitivity in zip(found.samples, found.sensitivity, strict=True):
+        expected = moved(lambda s, h: crossing(s, h, 0.2), distance_m, wave_m, sample)
+        assert sensitivity == pytest.approx(expected, rel=1e-3)
+
+
+def test_a_crest_is_the_summit_of_a_parabola():
+    distance_m = np.arange(0.0, 50.0, 2.0)
+    height_m = 8.0 - 0.01 * (distance_m - 23.4) ** 2
+    found = crest(distance_m, height_m)
+    assert found.distance_m == pytest.approx(23.4)
+    assert found.sensitivity.sum() == pytest.approx(0.0, abs=1e-9)  # not moved by a common error
+    for sample, sensitivity in zip(found.samples, found.sensitivity, strict=True):
+        expected = moved(crest, distance_m, height_m, sample)
+        assert sensitivity == pytest.approx(expected, rel=1e-2)
+    assert crest(distance_m, distance_m) is None
+    assert crest(distance_m, np.full(25, np.nan)) is None
 
 
 def test_there_is_no_crossing_without_both_sides():
@@ -86,11 +108,13 @@ def test_there_is_no_crossing_without_both_sides():
     assert crossing(distance_m, height_m, 2.5) is None
 
 
-def test_the_scatter_of_a_crossing_is_that_of_the_mean_height_over_the_slope():
+def test_the_scatter_of_positions_is_that_of_their_sensitivity():
     rng, distance_m = np.random.default_rng(3), np.arange(0.0, 40.0, 1.0)
-    places = [
-        crossing(distance_m, 10 - 0.5 * distance_m + rng.normal(0, 0.05, 40), 2.6).distance_m
-        for _ in range(2000)
-    ]
-    assert np.mean(places) == pytest.approx(14.8, abs=0.01)
-    assert np.std(places) == pytest.approx(0.05 / 2 / 0.5, rel=0.1)  # of four heights
+    for height_m, position, expected_m in (
+        (10 - 0.5 * distance_m, lambda s, h: crossing(s, h, 2.6), 14.8),
+        (8 - 0.05 * (distance_m - 19.7) ** 2, crest, 19.7),
+    ):
+        places_m = [position(distance_m, height_m + rng.normal(0, 0.02, 40)).distance_m for _ in range(1500)]
+        sensitivity = position(distance_m, height_m).sensitivity
+        assert np.mean(places_m) == pytest.approx(expected_m, abs=0.01)
+        assert np.std(places_m) == pytest.approx(0.02 * np.sqrt(sensitivity @ sensitivity), rel=0.1)
