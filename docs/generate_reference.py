@@ -21,6 +21,7 @@ import station
 from station import errors
 from station.archive.areas import AREA_VARIABLES
 from station.archive.derived.boxes import DAILY_VARIABLES
+from station.archive.derived.product_files import QUANTITIES
 from station.archive.schema import VARIABLES
 from station.cli import app
 from station.section_types import Section
@@ -160,7 +161,7 @@ def _site_file() -> str:
     ]
     for name, field in SiteFile.model_fields.items():
         (section,) = _sections_in(field.annotation)
-        parts.append(f"## `[{name}]`\n" if name != "sop" else "## `[[sop]]`\n")
+        parts.append(f"## `[[{name}]]`\n" if name in {"sop", "product"} else f"## `[{name}]`\n")
         parts.append((inspect.getdoc(section) or "") + "\n")
         parts.append(_table(("key", "type", "unit", "default", "range"), list(_keys(section, ""))) + "\n")
         lines = re.search(rf"^(?:# )?\[\[?{name}\]\]?\n(?:.+\n)*", explained, re.MULTILINE)
@@ -180,6 +181,8 @@ def _keys(section: type[Section], prefix: str) -> typing.Iterator[tuple[str, ...
         key = f"{prefix}{field.alias or name}"
         inner = _sections_in(field.annotation)
         if inner:
+            if Path in typing.get_args(field.annotation):
+                yield f"`{key}`", "path, or the table of the next keys", "", "", ""
             yield from _keys(inner[0], f"{key}.")
             continue
         default = field.default
@@ -236,6 +239,7 @@ def _variables() -> str:
         ("`series.nc`", [row for row in VARIABLES if row.is_result]),
         ("`processing.nc`", [row for row in VARIABLES if not row.is_result]),
         ("`areas.nc`", AREA_VARIABLES),
+        *((f"`products/`: {kind.replace('_', ' ')}", variables) for kind, variables in QUANTITIES.items()),
         ("`boxes.nc`, `blocks/` and `daily.nc`", DAILY_VARIABLES),
     ):
         rows = [

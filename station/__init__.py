@@ -122,6 +122,19 @@ def levels(
     return filter_levels(series, to_mask(area, series), lambda: None, monthly=every == "1M")
 
 
+def product(site_or_folder: str | Path, name: str) -> xr.Dataset:
+    """Return a product of the site file over time, with one sigma and its random and systematic part.
+
+    Also from a copy of the store: it is the content of `products/NAME.nc`. Places are selected by name, as in
+    `station.product(folder, "snow depth").sel(place="bowl").snow_depth`. Scans whose `verdict` is 2 must not
+    be used. Raises StationError if there is no product of this name.
+    """
+    from station.archive.derived.product_files import open_product
+    from station.archive.series.index import data_folder
+
+    return open_product(data_folder(site_or_folder), name)
+
+
 def view(site_or_folder: str | Path, height_px: int = 900) -> View:
     """Return the page of a station for a notebook, which shows it as the value of a cell.
 

@@ -35,8 +35,8 @@ app = typer.Typer(
 )
 COMMANDS = (
     check.init, check.check, process.process, reprocess.retry, reprocess.reprocess, run.run, run.status,
-    upgrade.upgrade,
-    simulate.simulate, simulate.demo, products.areas, products.trend, products.events, products.plot,
+    upgrade.upgrade, simulate.simulate, simulate.demo, products.areas, products.product, products.trend,
+    products.events, products.plot,
     exports.export, run.publish, products.serve, products.index, calibrate.calibrate,
     sensitivity.sensitivity, papers.papers,
 )  # fmt: skip

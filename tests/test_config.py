@@ -313,3 +313,40 @@ def test_a_scanner_of_its_own_counts_for_its_sop_alone(tmp_path):
     assert site.with_scanner_of(second).instrument.beam_divergence_rad == pytest.approx(0.12e-3)
     assert sop_identity(first) != sop_identity(second)  # epochs of another instrument are stale
     assert sop_identity(second) == sop_identity(second.model_copy(update={"from_": first.from_}))
+
+
+POINT = '[[product]]\nname = "stake 1"\nkind = "point"\nat = [5, 5]\n'
+BACKWARDS = "surface = { from = 2026-05-02T00:00:00Z, to = 2026-05-01T00:00:00Z }\n"
+ALARM = '[[alarms.product]]\nproduct = "{}"\nquantity = "elevation_change"\n'
+
+
+@pytest.mark.parametrize(
+    ("more", "message"),
+    [
+        ('[[product]]\nname = "a"\nkind = "snow_depth"\nat = [1, 2]\n', 'kind = "snow_depth" needs surface'),
+        (f"{POINT}density_kg_m3 = 900\n", 'kind = "point" has no density_kg_m3; its keys: at, observations'),
+        (f"{POINT}{POINT}", "two [[product]] have the name 'stake_1': rename one"),
+        (f"{POINT}desity = 900\n", "product.0.desity: no such key; did you mean 'density_kg_m3'?"),
+        (POINT.replace("point", "points"), "product.0.kind: should be 'point', 'snow_depth'"),
+        ('[[product]]\nname = "a"\nkind = "volume_budget"\n', "product 'a' needs areas: give their file"),
+        (
+            '[[product]]\nname = "a"\nkind = "snow_depth"\nat = [1, 2]\n' + BACKWARDS,
+            "to must be after from",
+        ),
+        ('[[product]]\nname = "a"\nkind = "profile"\nline = [[1, 2]]\n', "product.0.line: "),
+        (
+            POINT + ALARM.format("stake") + "above = 1\n",
+            "alarms.product: no [[product]] has the name 'stake'",
+        ),
+        (POINT + ALARM.format("stake 1"), "give above or below, the level that raises the alarm"),
+    ],
+)
+def test_products_that_contradict_themselves_are_refused(tmp_path, more, message):
+    with pytest.raises(ConfigError, match=re.escape(message)):
+        read(tmp_path, GOOD + more)
+
+
+def test_products_have_the_paths_of_their_files(tmp_path):
+    more = POINT + 'observations = "stake.csv"\n' + ALARM.format("Stake 1") + "above = 1\n"
+    (product,) = read(tmp_path, GOOD + more).product
+    assert (product.key, product.observations) == ("stake_1", tmp_path / "stake.csv")

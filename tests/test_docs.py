@@ -17,7 +17,8 @@ from station.sections.site_file import SiteFile
 ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"
 README = (ROOT / "README.md").read_text(encoding="utf-8")
-SITES = "\n".join(path.read_text(encoding="utf-8") for path in (ROOT / "config").glob("*.toml"))
+EXAMPLES = (*(ROOT / "config").glob("*.toml"), DOCS / "how-to" / "products.md")
+SITES = "\n".join(path.read_text(encoding="utf-8") for path in EXAMPLES)
 
 
 def commands():

@@ -3,6 +3,7 @@
 import shutil
 from collections import defaultdict
 from dataclasses import replace
+from datetime import UTC, timedelta
 
 import laspy
 import numpy as np
@@ -10,6 +11,7 @@ import pytest
 import xarray as xr
 from support.series import open_with_processing
 
+import station
 from station.config import read_site
 from station.inbox.listing import ScanFile
 from station.monitoring.log_clock import log_clock_offset
@@ -18,7 +20,9 @@ from station.products.area_tables import Span
 from station.products.trend_tables import trend_records
 from station.quantities import Quality
 from station.queries.aggregates import Aggregates
+from station.queries.site_products.product_queries import Product, update_products
 from station.science.analysis.inclination_check import MAX_OFFSET_S
+from station.sections.product import ProductSection
 from station.simulation.instrument.motion import sensor_faults
 from station.simulation.scenario import named
 from station.simulation.station import simulate
@@ -244,6 +248,37 @@ def test_area_changes_are_stored_with_every_epoch(calm):
         assert areas.sizes["time"] == 3
         assert (np.abs(areas.mean_change) < 3.5 * areas.mean_change_uncertainty).all()
         assert (areas.mean_change_uncertainty < 0.02).all()
+
+
+def product_of(calm, places, **settings):
+    section = ProductSection.model_validate({"name": "product", **settings})
+    series = scan_tasks.series_for(calm.site)
+    update_products(series, [Product(section, places)], [section.key], lambda: None)
+    return station.product(series.folder, "product")
+
+
+def test_products_are_calibrated(calm):
+    """Depth above the first scan, and gain and loss where nothing changed, in boxes with their voids."""
+    error_m, boxes = calm.error(), {}
+    for top, left in np.ndindex(*(size // (2 * BOX) for size in calm.stable.shape)):
+        cells = np.zeros(calm.stable.shape, bool)
+        cells[2 * BOX * top :, 2 * BOX * left :][:BOX, :BOX] = True
+        if np.isfinite(error_m).all(axis=0)[cells].mean() > 0.75 and not calm.stable[cells].any():
+            boxes[f"{top} {left}"] = cells
+    boxes = dict(list(boxes.items())[::2])
+    assert len(boxes) > 20
+    first = calm.series.time.values[0].astype("M8[s]").item().replace(tzinfo=UTC)
+    span = {"from": first - timedelta(minutes=10), "to": first + timedelta(minutes=10)}
+    depth = product_of(calm, boxes, kind="snow_depth", surface=span)
+    assert not calm.true_change.any()
+    z = depth.snow_depth.values[1:] / depth.snow_depth_uncertainty.values[1:]
+    assert 0.8 < rms(z) < 1.25
+    budget = product_of(calm, boxes, kind="volume_budget")
+    positive_m3 = 100.0 * np.mean([np.nansum(np.maximum(m[c], 0)) for m in error_m for c in boxes.values()])
+    for name in ("net_change", "deposition", "erosion"):
+        z = budget[name].values / budget[f"{name}_uncertainty"].values
+        assert 0.8 < rms(z[np.isfinite(z)]) < 1.25
+        assert abs(float(budget[name].mean())) < 0.1 * positive_m3  # the sum of positive cells is no gain
 
 
 @pytest.fixture(scope="module")

@@ -1,4 +1,4 @@
-"""`station areas`, `station trend`, `station events`, `station plot` and `station serve`."""
+"""`station areas`, `station product`, `station trend`, `station events`, `station plot`, `station serve`."""
 
 from __future__ import annotations
 
@@ -14,10 +14,12 @@ from station.commands._options import (
     Against,
     CsvOption,
     FromOption,
+    Json,
     Period,
     Polygons,
     SiteArgument,
     ToOption,
+    json_safe,
     print_or_write,
     progress_bar,
 )
@@ -77,6 +79,50 @@ def areas(
     _print_epochs(settings, against)
     records = area_records(settings, polygons, span, against, progress_bar("summing up"))
     print_or_write(as_text(records) if table is None else as_csv(records), table)
+
+
+def product(
+    site: SiteArgument,
+    name: Annotated[
+        str | None, typer.Argument(metavar="[NAME]", help="A product of the site.", show_default=False)
+    ] = None,
+    first: FromOption = None,
+    last: ToOption = None,
+    table: CsvOption = None,
+    json_: Json = False,
+) -> None:
+    """Print the products of the site file: the newest values, or with NAME one over time.
+
+    With 95 % intervals. CSV and JSON have one sigma, and its random and systematic part. With observations in
+    the site file, prints how the product agrees with them. Computes what the service has not computed yet.
+    """
+    from json import dumps
+
+    from station.archive.derived.product_files import read_product, read_products
+    from station.config import read_site
+    from station.processing.store_tasks import renew_products
+    from station.products.area_tables import Span
+    from station.products.site_products import observations, product_tables
+
+    settings, span = read_site(site), Span.parse(first, last)
+    for fault in renew_products(settings):
+        print(fault, file=sys.stderr)
+    data = settings.station.data
+    if name is None:
+        newest = list(product_tables.newest_rows(read_products(data)))
+        print(dumps(json_safe(newest), indent=2) if json_ else product_tables.newest_as_text(newest))
+        return
+    chosen = read_product(data, name)
+    rows = list(product_tables.product_rows(chosen, span))
+    if json_:
+        print(dumps(json_safe(rows), indent=2))
+        return
+    text = product_tables.as_text(chosen, rows) if table is None else product_tables.as_csv(rows)
+    print_or_write(text, table)
+    for section in settings.product:
+        if section.observations and section.key == chosen.key:
+            for agreement in observations.compare(chosen, section.observations):
+                print(observations.agreement_text(agreement), file=sys.stderr if table else sys.stdout)
 
 
 def trend(

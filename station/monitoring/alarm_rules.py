@@ -9,6 +9,7 @@ import logging
 import shutil
 from collections.abc import Callable, Iterator
 from datetime import UTC, datetime
+from functools import partial
 from statistics import median
 
 import numpy as np
@@ -22,6 +23,7 @@ from station.logs import logfmt
 from station.monitoring.alarm_state import Alarm
 from station.monitoring.area_curves import AreaCurve, read_curves
 from station.monitoring.preconditions import require_disk_space
+from station.monitoring.product_alarms import product_alarms
 from station.readers.formats.conversion import scan_suffixes
 from station.science.analysis.change_detection import ChangeDetections, detect_changes, threshold_sigmas
 from station.science.geometry.robust_statistics import NORMAL_95
@@ -70,6 +72,9 @@ def evaluate_rules(
     if rules.events:
         events = rules.events
         evaluate_rule("an event began", lambda: _events(site, events, assessed_until_utc_s))
+    for rule in rules.product:
+        watch = partial(product_alarms, site, rule, assessed_until_utc_s)
+        evaluate_rule(f"{rule.quantity} of {rule.product} is beyond its level", watch)
     return alarms
 
 
@@ -155,10 +160,12 @@ def _disk(site: Site, rules: AlarmsSection) -> Iterator[Alarm]:
 
 
 def _inputs(site: Site) -> Iterator[Alarm]:
-    """Yield an alarm if areas, flags, stable ground or the weather log cannot be used."""
-    from station.processing.usable_inputs import usable_site, weather_fault  # noqa: PLC0415 - a second of imports
+    """Yield an alarm if areas, flags, stable ground, products or the weather log cannot be used."""
+    from station.processing.site_files import load_products  # noqa: PLC0415 - a second of imports
+    from station.processing.usable_inputs import usable_site, weather_fault  # noqa: PLC0415
 
-    faults = [*usable_site(site).input_faults, *filter(None, [weather_fault(site)])]
+    usable = usable_site(site)
+    faults = [*usable.input_faults, *filter(None, [weather_fault(site)]), *load_products(usable)[1]]
     if faults:  # an editor may have saved half a file
         yield Alarm("inputs", "; ".join(faults), min_duration_s=EDITING_ALLOWANCE_S)
 

@@ -12,12 +12,14 @@ from statistics import median
 import numpy as np
 
 from station.archive.atomic_files import atomic_write
+from station.archive.derived.product_files import read_products
 from station.config import Site
 from station.inbox.journal_reader import Entry, JournalReader, State
 from station.monitoring.alarm_rules import DAY_S
 from station.monitoring.alarm_state import active
 from station.monitoring.area_curves import AreaCurve, read_curves
 from station.processing.workers.worker_process import Progress
+from station.products.site_products.product_tables import newest_rows, value_and_interval
 from station.science.gridding.significance import SIGNIFICANT_SIGMAS
 
 MAX_BYTES = 10_000
@@ -43,7 +45,7 @@ def newest_digest(data: Path) -> Path | None:
 
 
 def format_digest(site: Site, day: date) -> str:
-    """Return the digest of a day (UTC): scans and verdicts, state of the station, changes of the areas.
+    """Return the digest of a day (UTC): scans, state of the station, changes of the areas, products.
 
     At most 10 kB in UTF-8: the most important comes first, the rest is cut. Raises StoreError.
     """
@@ -63,6 +65,7 @@ def format_digest(site: Site, day: date) -> str:
         f"all: {counts['stored']} stored, {counts['set_aside']} set aside, {waiting} waiting",
         "",
         *_area_changes(read_curves(site, begin_s - 7 * DAY_S), begin_s),
+        *_product_values(site, begin_s + DAY_S),
     ]
     return _truncate(lines)
 
@@ -122,6 +125,15 @@ def _area_changes(curves: list[AreaCurve], begin_s: float) -> Iterator[str]:
         day_change_m = curve.change_m[end] - curve.change_m[start]
         sigma_m = np.hypot(curve.sigma_m[end], curve.sigma_m[start])
         yield f"{curve.name}: {day_change_m:+z.3f} ± {SIGNIFICANT_SIGMAS * sigma_m:.3f}, {since_reference}"
+
+
+def _product_values(site: Site, end_s: float) -> Iterator[str]:
+    """Yield the newest value of each product at the end of the day, with its 95 % interval."""
+    products = [product.until(end_s) for product in read_products(site.station.data)]
+    for row in newest_rows(products):
+        value, half = value_and_interval(row["value"], row["sigma"], row["unit"])
+        when = f"{datetime.fromtimestamp(row['start_s'], UTC):%Y-%m-%d %H:%M}"
+        yield f"{row['product']}, {row['place']}: {row['quantity']} {value} {half} {row['unit']} at {when}"
 
 
 def _truncate(lines: list[str]) -> str:

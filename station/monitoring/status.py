@@ -30,7 +30,8 @@ def status(site: Site) -> Status:
 
     Works with or without a running service. Raises StoreError if the journal cannot be read.
     """
-    from station.processing.usable_inputs import usable_site  # noqa: PLC0415 - a second of imports
+    from station.processing.site_files import load_products  # noqa: PLC0415 - a second of imports
+    from station.processing.usable_inputs import usable_site  # noqa: PLC0415
 
     site, data = usable_site(site), site.station.data
     with JournalReader(data / "journal.sqlite") as journal:
@@ -52,7 +53,7 @@ def status(site: Site) -> Status:
         "stale": _count_outdated(site, queued),
         "series": str(data / "series.nc") if (data / "series.nc").exists() else None,
         "disk_free_gb": round(shutil.disk_usage(data).free / 1e9, 2) if data.is_dir() else None,
-        "faults": [*queue["faults"], *filter(None, [_log_clock_problem(site)])],
+        "faults": [*queue["faults"], *filter(None, [_log_clock_problem(site)]), *load_products(site)[1]],
     }
 
 

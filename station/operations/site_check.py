@@ -12,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
+from station.archive.derived.product_files import units_of
 from station.archive.reference_files import valid_versions
 from station.config import Site, read_site
 from station.errors import NotReadyError, ScanError, StationError
@@ -37,8 +38,9 @@ from station.processing.scanner_pose import map_position, scanner_height_m, scan
 from station.processing.scans.open_scans import open_files
 from station.processing.scans.scan_air import pressure_fault
 from station.processing.scans.scan_files import inbox_scans, scan_file
-from station.processing.site_files import load_areas, polygon_cells, series_for
+from station.processing.site_files import load_areas, load_products, polygon_cells, series_for
 from station.processing.workers import isolation
+from station.products.site_products.observations import read_observations
 from station.readers.flags import read_flags
 from station.readers.inclination import read_inclination
 from station.readers.polygons import mended_outlines
@@ -63,6 +65,7 @@ def site_findings(site_path: Path) -> list[Finding]:
         *_named("settings", setting_findings(site)),
         *_sop_poses(site),
         *_polygons(site),
+        *_products(site),
         *_folders(site),
         *_named("inbox", inbox_findings(site)),
         *_named("rights", rights_findings(site, _files_read(site))),
@@ -197,6 +200,21 @@ def _polygons(site: Site) -> Iterator[Finding]:
     if (stable := areas.get("stable ground")) is not None:
         yield from _named("polygons", overlap_findings(named, stable))
     yield from _named("alarms", alarm_findings(site, set(named)))
+
+
+def _products(site: Site) -> Iterator[Finding]:
+    """Yield which products can be computed, and why others cannot."""
+    products, faults = load_products(site)
+    for product in products:
+        section, cells = product.section, sum(int(place.sum()) for place in product.places.values())
+        yield _finding("ok", "products", f"{section.name}: {cells:,} cells of the grid")
+        if section.observations:
+            try:
+                read_observations(section.observations, units_of(section.kind))
+            except StationError as error:
+                yield _finding("fault", "products", f"{section.name}: {error}")
+    for fault in faults:
+        yield _finding("fault", "products", fault)
 
 
 def _folders(site: Site) -> Iterator[Finding]:

@@ -14,9 +14,11 @@ from pathlib import Path
 from pyproj.crs import Datum  # type: ignore[attr-defined] # documented there, but not declared
 from pyproj.exceptions import CRSError
 
+from station.archive.derived.product_files import units_of
 from station.config import Site
 from station.quantities import Bools
 from station.scanners import SCANNERS
+from station.sections.product import product_key
 
 SERVICE_USER = "station"  # of the systemd unit
 MAX_SCANNER_OFFSET_M = 500.0  # from map.origin; a larger project frame is unusual
@@ -35,6 +37,11 @@ def alarm_findings(site: Site, area_names: set[str]) -> Iterator[LevelAndMessage
     unknown = sorted(set(site.alarms.change.areas) - area_names) if site.alarms.change else []
     for name in unknown:
         yield "fault", f"alarms.change.areas: no area {name!r}; there are {', '.join(sorted(area_names))}"
+    kinds = {section.key: section.kind for section in site.product}
+    for rule in site.alarms.product:
+        units = units_of(kinds[product_key(rule.product)])
+        if rule.quantity not in units:
+            yield "fault", f"alarms.product: {rule.product} has no {rule.quantity}; it has {', '.join(units)}"
     targets = {*site.alarms.targets, *filter(None, [site.alarms.digest])}
     if targets and importlib.util.find_spec("apprise") is None:
         yield "fault", f"{', '.join(sorted(targets))}: sending needs pip install 'tls-station[alarms]'"

@@ -19,6 +19,7 @@ from station.archive.derived.boxes import BOXES, DAILY, block_files
 from station.archive.derived.event_table import FILE_NAME as EVENTS
 from station.archive.derived.fingerprints import is_intact as is_derived_intact
 from station.archive.derived.level_files import damaged_levels
+from station.archive.derived.product_files import product_keys, product_path
 from station.archive.epochs import (
     EpochRef,
     compacted_files,
@@ -276,6 +277,7 @@ def _check_derived(series: Series) -> list[tuple[str, str, str]]:
     """Return findings on the derived files and the tilt offsets, which the service restores while it runs."""
     paths = damaged_tilt_offsets(series.folder)
     derived = [series.folder / name for name in (AREAS, BOXES, DAILY, EVENTS)]
+    derived += [product_path(series.folder, key) for key in product_keys(series.folder)]
     paths += [path for path in derived if path.exists() and not is_derived_intact(path)]
     message = "damaged: the service restores it with the next scan"
     findings = [("fault", "file", f"{path.relative_to(series.folder)}: {message}") for path in paths]

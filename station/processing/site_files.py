@@ -9,11 +9,16 @@ import shapely
 
 from station.archive.netcdf_layout import Series, roundtrip_text
 from station.config import Site
+from station.errors import ConfigError, StationError
 from station.inbox.file_hash import sha256_file, sha256_files
 from station.inbox.listing import ScanFile
-from station.quantities import Bools
+from station.quantities import Bools, Grid
+from station.queries.site_products.product_queries import Product
+from station.queries.site_products.profile_lines import sample_line
 from station.readers.flags import read_flags, reasons_for
 from station.readers.polygons import cells_inside, read_polygons
+from station.readers.raster import read_geotiff
+from station.sections.product import ProductSection
 
 
 def series_for(site: Site) -> Series:
@@ -63,6 +68,54 @@ def load_areas(site: Site) -> dict[str, Bools]:
     """Return the cells (ny, nx) of the areas of a site by name."""
     polygons = load_area_polygons(site)
     return {name: cells_inside(polygon, site.grid_cells) for name, polygon in polygons.items()}
+
+
+def load_products(site: Site) -> tuple[list[Product], list[str]]:
+    """Return the products of a site with what they refer to, and why others of them cannot be computed."""
+    products, faults = [], []
+    areas: dict[str, Bools] = {}
+    for section in site.product:
+        try:
+            if section.needs_areas and not areas:
+                areas = load_areas(site)
+            products.append(_load_product(site, section, areas))
+        except (StationError, OSError) as error:
+            faults.append(f"product {section.name}: {error}")
+    return products, faults
+
+
+def _load_product(site: Site, section: ProductSection, areas: dict[str, Bools]) -> Product:
+    """Return a product; raise ConfigError if a raster, an area or a place of it cannot be used."""
+    grid = site.grid_cells
+    if section.line is not None:
+        line = sample_line(section.line, grid)
+        return Product(section, {section.name: line.cells}, line)
+    places = _areas_of(section, areas) if section.needs_areas else {section.name: _cells_at(section, grid)}
+    rasters = {key: read_geotiff(path, grid, site.map.crs) for key, path in section.rasters.items()}
+    for key in {"low", "high"} & rasters.keys():
+        places = {name: cells & np.isfinite(rasters[key]) for name, cells in places.items()}
+    if empty := [name for name, cells in places.items() if not cells.any()]:
+        raise ConfigError(f"no cell of the grid in {', '.join(empty)}: are the coordinates those of the map?")
+    files = tuple(sha256_file(path) for path in section.rasters.values())
+    return Product(section, places, rasters=rasters, files=files)
+
+
+def _areas_of(section: ProductSection, areas: dict[str, Bools]) -> dict[str, Bools]:
+    unknown = [name for name in section.areas if name not in areas]
+    if unknown:
+        raise ConfigError(f"no area {', '.join(unknown)} in areas.file, which has {', '.join(areas)}")
+    return {name: areas[name] for name in section.areas or areas}
+
+
+def _cells_at(section: ProductSection, grid: Grid) -> Bools:
+    """Return the cells (ny, nx) within a radius of a point, at least the one that contains it."""
+    east_m, north_m = section.at or (np.nan, np.nan)
+    distance_m = np.hypot(grid.x_m[None, :] - east_m, grid.y_m[:, None] - north_m)
+    cells = distance_m <= section.radius_m
+    column, row = (east_m - grid.west_m) / grid.cell_m, (grid.north_m - north_m) / grid.cell_m
+    if 0 <= column < grid.nx and 0 <= row < grid.ny:
+        cells[int(row), int(column)] = True
+    return np.asarray(cells)
 
 
 def sha256_log(scan: ScanFile) -> str:

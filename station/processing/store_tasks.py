@@ -11,6 +11,7 @@ from pathlib import Path
 from station.archive import epochs
 from station.archive.areas import update_areas
 from station.archive.derived.level_files import damaged_levels, delete_levels
+from station.archive.derived.product_files import product_path
 from station.archive.reference_files import repair_reference_link
 from station.archive.series import compaction
 from station.archive.series.manifest import source_count
@@ -18,12 +19,15 @@ from station.archive.series.virtual import build_series
 from station.config import Site
 from station.errors import StoreError
 from station.inbox.file_hash import sha256_file
-from station.processing.site_files import load_area_polygons, load_areas, series_for
+from station.inbox.lock import is_locked
+from station.processing.site_files import load_area_polygons, load_areas, load_products, series_for
 from station.processing.workers.worker_process import Progress
 from station.queries.aggregates import Aggregates
 from station.queries.blocks import BlockQueries, update_boxes
 from station.queries.events import EventQueries
 from station.queries.levels import update_levels
+from station.queries.site_products.product_queries import update_products
+from station.sections.product import ProductSection, SurfaceTime
 
 Checksums = dict[str, str]  # SHA-256 by file, relative to the data folder
 
@@ -47,12 +51,39 @@ def update_series(site: Site, progress: Progress) -> int:
     progress()
     try:
         update_areas(series, load_areas(site), Aggregates(series), progress, load_area_polygons(site))
+        products, _ = load_products(site)  # what is wrong with the others is reported with the input files
+        update_products(series, products, [section.key for section in site.product], progress)
         blocks = BlockQueries(series)
         needed = EventQueries(series, blocks, site.scans.expected_every_s).update(progress)
         update_boxes(series, blocks, progress, needed)
     except (OSError, RuntimeError) as error:
         raise StoreError(f"{series.folder}: an epoch is damaged: {error}") from error
     return compaction.count_compactable(series)
+
+
+def renew_products(site: Site) -> list[str]:
+    """Bring the files of products up to date, unless a service does; return why some have no values."""
+    products, faults = load_products(site)
+    if not is_locked(site.station.data):
+        try:
+            keys = [section.key for section in site.product]
+            update_products(series_for(site), products, keys, lambda: None)
+        except StoreError as error:
+            faults.append(str(error))
+    faults += [
+        f"product {product.section.name}: {_why_empty(product.section)}"
+        for product in products
+        if not product_path(site.station.data, product.section.key).is_file()
+    ]
+    return faults
+
+
+def _why_empty(section: ProductSection) -> str:
+    """Return why a product has no values yet."""
+    if not isinstance(section.surface, SurfaceTime):
+        return "no scan has been measured against the reference yet"
+    span = f"{section.surface.from_:%Y-%m-%d %H:%M} to {section.surface.to:%Y-%m-%d %H:%M} UTC"
+    return f"its surface is that of {span}, which is not over, or has no usable scan"
 
 
 def update_stored_levels(site: Site, verify: bool, progress: Progress) -> int:  # noqa: FBT001 - a task

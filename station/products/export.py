@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
+from station.archive.derived.product_files import read_products
 from station.archive.epochs import EpochRef
 from station.archive.netcdf_layout import Series
 from station.archive.reference_files import valid_versions
@@ -21,6 +22,7 @@ from station.products.epoch_table import EpochTable, csv_times, read_epoch_table
 from station.products.exports.transformations import write_transformations
 from station.products.gallery import default_limit, replace_if_changed
 from station.products.geotiff import export_geotiff
+from station.products.site_products import product_tables
 from station.products.stac import write_stac
 
 Track = Callable[[list[EpochRef]], Iterable[EpochRef]]
@@ -29,7 +31,7 @@ Track = Callable[[list[EpochRef]], Iterable[EpochRef]]
 def export(site: Site, kind: str, span: Span | None, folder: Path, track: Track = iter) -> list[Path]:
     """Write the epochs of a span, by default the newest, as `kind` into a folder; return the files written.
 
-    `kind` is geotiff, csv (scans and areas; by default of all epochs), stac or transformations. Raises
+    `kind` is geotiff, csv (scans, areas, products; by default of all epochs), stac or transformations. Raises
     StationError if there is nothing to write or a library is missing.
     """
     series = series_in(site.station.data)
@@ -85,6 +87,10 @@ def _write_csv(
     files = {"scans.csv": stream.getvalue()}
     if site.areas is not None:
         files["areas.csv"] = as_csv(area_records(site, None, span, REFERENCE))
+    for product in read_products(site.station.data):
+        files[f"product_{product.key}.csv"] = product_tables.as_csv(
+            product_tables.product_rows(product, span)
+        )
     for name, text in files.items():
         replace_if_changed(folder / name, text.encode())
     return [folder / name for name in files]

@@ -15,6 +15,7 @@ import numpy as np
 
 from station._version import __version__
 from station.archive.derived.event_table import read_events
+from station.archive.derived.product_files import ProductSeries, read_products
 from station.archive.netcdf_layout import Series
 from station.archive.series.index import SeriesIndex
 from station.products.epoch_table import AreaSeries, EpochTable, read_epoch_table
@@ -41,6 +42,7 @@ from station.products.web.page_health import (
     summary_of_sigma,
     timeline,
 )
+from station.products.web.page_products import product_curves, product_values
 from station.products.web.page_text import PAGE_TEXT, format_number, format_utc, script_text
 from station.quantities import Floats
 from station.science.geometry.robust_statistics import NORMAL_95
@@ -103,7 +105,7 @@ def write_page(
     """
     table = read_epoch_table(series) if series.path.is_file() else None
     all_areas = usable_area_series(series, table) if table is not None else []
-    areas = all_areas[:MAX_AREAS]
+    areas, products = all_areas[:MAX_AREAS], read_products(series.folder)
     gallery, curves = Gallery([], LevelMaps(), None, (0, 0), {}), None
     if table is not None:
         style = Style(context.name or series.station_id, width_px, limit_m)
@@ -138,6 +140,10 @@ def write_page(
         "curves": curves,
         "area_time_s": _json_numbers(areas[0].start_s[_decimate(len(areas[0].start_s))], 0) if areas else [],
         "areas": [_area_curve(area) for area in areas],
+        "products": [
+            _product_curve(curve)
+            for curve in product_curves(products, PAGE_TEXT[context.language])[:MAX_AREAS]
+        ],
         "health": _health_curves(table, context) if table is not None else None,
     }
     _write_script(folder / "data.js", "STATION", data)
@@ -145,7 +151,7 @@ def write_page(
     _write_summary(series, folder, context, table, gallery)
     replace_if_changed(
         folder / "index.html",
-        _render(series, folder, context, table, areas, gallery, len(all_areas)).encode(),
+        _render(series, folder, context, table, areas, gallery, len(all_areas), products).encode(),
     )
 
 
@@ -259,6 +265,12 @@ def _area_curve(area: AreaSeries) -> dict[str, Any]:
     }
 
 
+def _product_curve(curve: dict[str, Any]) -> dict[str, Any]:
+    kept = _decimate(len(curve["time_s"]))
+    digits = {"time_s": 0, "values": curve["digits"] + 1, "sigma": curve["digits"] + 2}
+    return curve | {key: _json_numbers(curve[key][kept], places) for key, places in digits.items()}
+
+
 def _health_curves(table: EpochTable, context: PageContext) -> dict[str, Any]:
     kept = _decimate(len(table))
     digits = {"platform_roll": 4, "platform_pitch": 4, "air_temperature": 1, "air_pressure": 1}
@@ -280,6 +292,7 @@ def _render(
     areas: list[AreaSeries],
     gallery: Gallery,
     area_count: int,
+    products: list[ProductSeries],
 ) -> str:
     events, text = read_events(series.folder), PAGE_TEXT[context.language]
     by_range = calibration_by_range(series, table, folder, text) if table is not None else []
@@ -291,6 +304,7 @@ def _render(
         gallery=gallery,
         scans=[_scan_row(table, context, index) for index in recent] if table is not None else [],
         areas=[newest_value(area) for area in areas],
+        products=product_values(products, text),
         t=text,
         language=context.language,
         calibration=summary_of_sigma(table, by_range),

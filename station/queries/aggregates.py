@@ -2,18 +2,24 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import h5py
 import numpy as np
 
 from station.archive.areas import AreaChange
-from station.archive.derived.computed_rasters import CHANGE, RANDOM, TOTAL
+from station.archive.derived.computed_rasters import (
+    CHANGE,
+    RANDOM,
+    TOTAL,
+    ReferenceSurfaces,
+    is_value,
+)
 from station.archive.epochs import EpochRef
 from station.archive.netcdf_layout import Series
 from station.archive.small_variables import read_number
-from station.quantities import Bools, Floats, Grid, Quality, Reals
+from station.quantities import Bools, Floats, Grid, Quality, Reals, SharedParameters
 from station.queries.epoch_cells import EpochCells, EpochReader, bounding_box, read_cells_of, read_window
 from station.science.adjustment import ground_classes
 from station.science.adjustment.leverage import leverage
@@ -29,11 +35,30 @@ if TYPE_CHECKING:
 MARGIN_CELLS = 6  # reach of the smoothed gradient around a cell
 
 
+@dataclass(frozen=True)
+class ObservedArea:
+    """The cells (n,) of an area that an epoch observed, or both of two, and how they fill its voids.
+
+    `value_m` is the change, that from another epoch, or with `above_surface` the height above a surface that
+    does not come from the station, which has the errors of the reference too.
+    """
+
+    epochs: list[EpochCells]
+    cells: Bools  # (ny, nx)
+    value_m: Floats
+    random_m2: list[Floats]  # in each epoch
+    weights: Floats  # of the mean of the area, its voids interpolated
+    void_m2: float  # variance of that mean by the interpolation
+    coverage: float  # share of the area
+    above_surface: bool
+
+
 class Aggregates(EpochReader):
     """Means and variances over cells of the epochs of a store."""
 
     def __init__(self, series: Series) -> None:
         super().__init__(series)
+        self._surfaces = ReferenceSurfaces(series)
         # Of the last cells, reused by the median.
         self._jacobian_cache: tuple[EpochCells, Bools, HeightJacobian] | None = None
 
@@ -67,34 +92,85 @@ class Aggregates(EpochReader):
         The sigma of the median is that of the mean, with the random part larger by √(π/2), as for normal
         errors. Source: equations.md, 6.2; voids: Hartzell et al. (2015), see `voids`.
         """
+        area = self.observe(cells, epoch, other)
+        if area is None:
+            return AreaChange(np.nan, np.nan, np.nan, np.nan, 0.0)
+        variance_m2 = self.sum_variance(area, area.weights)[1] + area.void_m2
+        equal_weights = np.full(len(area.value_m), 1 / len(area.value_m))
+        median_variance_m2 = self._weighted_sum_variance(
+            area.epochs, area.cells, equal_weights, area.random_m2, random_factor=np.pi / 2
+        )
+        return AreaChange(
+            mean_m=float(area.weights @ area.value_m),
+            mean_sigma_m=float(np.sqrt(variance_m2)),
+            median_m=float(np.median(area.value_m)),
+            median_sigma_m=float(np.sqrt(median_variance_m2)),
+            coverage=area.coverage,
+        )
+
+    def observe(
+        self, cells: Bools, epoch: EpochRef, other: EpochRef | None = None, surface_m: Floats | None = None
+    ) -> ObservedArea | None:
+        """Return the cells (ny, nx) that an epoch observed, or both of two; None if there are none.
+
+        With `surface_m` (ny, nx), the values are heights above it where it is known.
+        """
         epochs = self._read_epochs(cells, epoch, other)
         common_cells = observed_in_all(epochs, cells)
         bounds = bounding_box(cells, 0)
+        if surface_m is not None:
+            common_cells[bounds] &= np.isfinite(surface_m[bounds])
         observed = common_cells[bounds][cells[bounds]]
         if not observed.any():
-            return AreaChange(np.nan, np.nan, np.nan, np.nan, 0.0)
-        change_m = epochs[0].change_m[observed] - (0.0 if other is None else epochs[1].change_m[observed])
-        random_m2 = self._random_variances(epochs, common_cells, observed)
-        change_map_m, noise_map_m2 = np.full(cells[bounds].shape, np.nan), np.zeros(cells[bounds].shape)
-        change_map_m[common_cells[bounds]], noise_map_m2[common_cells[bounds]] = (
-            change_m,
+            return None
+        value_m = epochs[0].change_m[observed] - (0.0 if other is None else epochs[1].change_m[observed])
+        if surface_m is not None:
+            value_m += self._mean_elevation(epochs[0], common_cells) - surface_m[common_cells]
+        above_surface = surface_m is not None
+        random_m2 = self._random_variances(epochs, common_cells, observed, above_surface=above_surface)
+        value_map_m, noise_map_m2 = np.full(cells[bounds].shape, np.nan), np.zeros(cells[bounds].shape)
+        value_map_m[common_cells[bounds]], noise_map_m2[common_cells[bounds]] = (
+            value_m,
             np.sum(random_m2, axis=0),
         )
         weights, fill_distance = area_weights(cells[bounds], common_cells[bounds])
-        cell_weights = weights[common_cells[bounds]]
-        variance_m2 = self._weighted_sum_variance(epochs, common_cells, cell_weights, random_m2)
-        variance_m2 += void_variance(cells[bounds], fill_distance, change_map_m, noise_map_m2)
-        equal_weights = np.full(len(change_m), 1 / len(change_m))
-        median_variance_m2 = self._weighted_sum_variance(
-            epochs, common_cells, equal_weights, random_m2, random_factor=np.pi / 2
-        )
-        return AreaChange(
-            mean_m=float(cell_weights @ change_m),
-            mean_sigma_m=float(np.sqrt(variance_m2)),
-            median_m=float(np.median(change_m)),
-            median_sigma_m=float(np.sqrt(median_variance_m2)),
+        return ObservedArea(
+            epochs=epochs,
+            cells=common_cells,
+            value_m=value_m,
+            random_m2=random_m2,
+            weights=weights[common_cells[bounds]],
+            void_m2=void_variance(cells[bounds], fill_distance, value_map_m, noise_map_m2),
             coverage=float(observed.mean()),
+            above_surface=above_surface,
         )
+
+    def sum_variance(self, area: ObservedArea, weights: Floats) -> tuple[float, float]:
+        """Return the random and the total variance of a weighted sum of the cells (n,) of an area.
+
+        The unit is m² times that of the squared weights. Source: equations.md, 6.2.
+        """
+        total = self._weighted_sum_variance(
+            area.epochs, area.cells, weights, area.random_m2, above_surface=area.above_surface
+        )
+        return min(float(weights**2 @ np.sum(area.random_m2, axis=0)), total), total
+
+    def cell_variances(self, area: ObservedArea) -> tuple[Floats, Floats]:
+        """Return the random and the systematic variance (n,) of each cell of an area in one epoch [m²]."""
+        epoch_cells = area.epochs[0]
+        shared = _shared_of(area.epochs, epoch_cells, above_surface=area.above_surface)
+        random_m2 = area.random_m2[0]
+        if shared is None:
+            return random_m2, np.zeros(len(random_m2))
+        shared_m2 = self.jacobian(epoch_cells, area.cells).variance(shared)
+        return random_m2, np.maximum(shared_m2, 0.0, dtype=np.float64)
+
+    def _mean_elevation(self, epoch_cells: EpochCells, cells: Bools) -> Floats:
+        """Return the heights (n,) that the change of an epoch is counted from [m]."""
+        rows, columns = bounding_box(cells, 0)
+        height_m = self._surfaces.height_m(epoch_cells.reference.version, rows, columns)
+        selected_m = np.asarray(height_m[cells[rows, columns]], dtype=np.float64)
+        return np.where(is_value(selected_m), selected_m, np.nan)
 
     def shared_variance_between(
         self, epoch: EpochRef, other: EpochRef, grid: Grid, elevation_m: Reals, cells: Bools
@@ -134,18 +210,22 @@ class Aggregates(EpochReader):
         ]
 
     def _random_variances(
-        self, epochs: list[EpochCells], common_cells: Bools, observed: Bools
+        self,
+        epochs: list[EpochCells],
+        common_cells: Bools,
+        observed: Bools,
+        *,
+        above_surface: bool = False,
     ) -> list[Floats]:
         """Return the random variance of the cells (n,) in each epoch [m²]."""
         variances = []
         for epoch_cells in epochs:
             random_m2 = epoch_cells.random_m[observed] ** 2
-            if len(epochs) > 1:  # errors of a common reference cancel in the difference
+            if len(epochs) > 1 or above_surface:  # errors of a common reference cancel in the difference
                 reference_m2 = epoch_cells.reference.random_variance_m2[common_cells]
-                random_m2 = (
-                    np.maximum(random_m2 - reference_m2, 0.0)
-                    + self._references_differ(epochs, common_cells) * reference_m2
-                )
+                random_m2 = np.maximum(random_m2 - reference_m2, 0.0)
+                if len(epochs) > 1:
+                    random_m2 = random_m2 + self._references_differ(epochs, common_cells) * reference_m2
             variances.append(random_m2)
         return variances
 
@@ -156,6 +236,8 @@ class Aggregates(EpochReader):
         weights: Floats,
         random_m2: list[Floats],
         random_factor: float = 1.0,
+        *,
+        above_surface: bool = False,
     ) -> float:
         """Return the variance of the weighted sum of the cells (n,) over the epochs.
 
@@ -164,14 +246,13 @@ class Aggregates(EpochReader):
         """
         variance, lower_bound, aggregated = 0.0, 0.0, []
         for epoch_cells, independent_m2 in zip(epochs, random_m2, strict=True):
-            shared, scaled_m2 = epoch_cells.shared, random_factor * independent_m2
+            shared = _shared_of(epochs, epoch_cells, above_surface=above_surface)
+            scaled_m2 = random_factor * independent_m2
             if shared is None:
                 variance, lower_bound = (
                     value + float(np.sum(weights**2 * scaled_m2)) for value in (variance, lower_bound)
                 )
                 continue
-            if len(epochs) == 1 and not epoch_cells.adjusted:
-                shared = difference_to_reference(shared, epoch_cells.reference.shared)
             jacobian = self.jacobian(epoch_cells, common_cells)
             aggregated.append(jacobian.aggregate(weights))
             noise_leverage = (
@@ -278,6 +359,20 @@ class Aggregates(EpochReader):
 
 
 LEVERAGE_VARIABLES = ("adjustment_leverage_moving", "adjustment_leverage_stable")
+
+
+def _shared_of(
+    epochs: list[EpochCells], epoch_cells: EpochCells, *, above_surface: bool
+) -> SharedParameters | None:
+    """Return the shared parameters of one of the epochs whose cells are summed; None if it has none.
+
+    Those of an adjusted epoch are relative to the reference, those of another one to the map. The errors of
+    the reference are added where it takes part and does not cancel.
+    """
+    shared = epoch_cells.shared
+    if shared is None or len(epochs) > 1 or epoch_cells.adjusted != above_surface:
+        return shared
+    return difference_to_reference(shared, epoch_cells.reference.shared)
 
 
 def common_error_covariance(epochs: list[EpochCells]) -> Floats | None:

@@ -31,6 +31,7 @@ SCANNER_VARIABLES = (
     "scanner_axis_east",
     "scanner_axis_north",
 )
+MAX_CACHED = 4  # epochs whose parameters are kept: an epoch and those that it is compared with
 PARAMETER_VARIABLES = ("parameter_name", "parameter_unit")
 SHARED_VARIABLES = ("shared_parameter", "shared_parameter_covariance", "shared_parameter_line_tilt_variance")
 CHANGE_ERROR_VARIABLES = ("change_errors", "change_pattern")  # in the order of the fields of `ChangeErrors`
@@ -56,7 +57,7 @@ class EpochReader:
         self.series = series
         self.grid = series.grid
         self._references: dict[str | None, Reference] = {}
-        self._shared_cache: tuple[EpochRef, SharedParameters] | None = None  # areas are queried one by one
+        self._shared_cache: dict[EpochRef, SharedParameters] = {}  # areas are queried one by one
 
     def reference(self, version: str | None = None) -> Reference:
         """Return the newest reference surface or a version; raise StoreError if there is none."""
@@ -109,7 +110,9 @@ class EpochReader:
         """Return the shared parameters of an epoch; None if the file does not contain them."""
         if "parameter_name" not in file or not np.isfinite(scanner).all():
             return None
-        if self._shared_cache is None or self._shared_cache[0] != epoch:
+        if epoch not in self._shared_cache:
+            if len(self._shared_cache) == MAX_CACHED:
+                self._shared_cache.clear()
             names, units = (
                 tuple(decode_parameters(read_variable(file, name))) for name in PARAMETER_VARIABLES
             )
@@ -121,8 +124,8 @@ class EpochReader:
             )
             change_errors = ChangeErrors(*change_fields) if change_fields else None
             shared = SharedParameters(names, units, estimate, covariance, line_tilt_variance, change_errors)
-            self._shared_cache = epoch, align_to(self.parameter_layout_of(scanner)[0], shared)
-        return self._shared_cache[1]
+            self._shared_cache[epoch] = align_to(self.parameter_layout_of(scanner)[0], shared)
+        return self._shared_cache[epoch]
 
     def parameter_layout_of(
         self, scanner: tuple[float, ...]

@@ -193,6 +193,22 @@ class EventAlarm(Section):
     least_m3: NotNegative = 0.0
 
 
+class ProductAlarm(Section):
+    """The value of a product that raises an alarm: beyond a level by more than its 95 % interval."""
+
+    product: str
+    quantity: str
+    above: float | None = None
+    below: float | None = None
+    scans: Annotated[int, Field(ge=1, le=24)] = 2
+
+    @model_validator(mode="after")
+    def _has_a_level(self) -> ProductAlarm:
+        if self.above is None and self.below is None:
+            raise ValueError("give above or below, the level that raises the alarm")
+        return self
+
+
 class AlarmsSection(Section):
     """The alarm rules, and the targets (names of credentials) that are notified. 0 disables a rule."""
 
@@ -207,6 +223,7 @@ class AlarmsSection(Section):
     moved: bool = True
     change: ChangeAlarm | None = None
     events: EventAlarm | None = None
+    product: tuple[ProductAlarm, ...] = ()
 
 
 class ProductsSection(Section):

@@ -21,6 +21,7 @@ from station.sections.inputs import (
     SopSection,
     WeatherSection,
 )
+from station.sections.product import ProductSection, product_key
 from station.sections.publish import PublishSection
 from station.sections.results import (
     AdjustmentSection,
@@ -63,6 +64,7 @@ class SiteFile(Section):
     retention: RetentionSection = RetentionSection()
     service: ServiceSection = ServiceSection()
     products: ProductsSection = ProductsSection()
+    product: tuple[ProductSection, ...] = ()
     mirror: MirrorSection | None = None
     publish: PublishSection | None = None
     alarms: AlarmsSection | None = None
@@ -95,7 +97,20 @@ class SiteFile(Section):
             raise ValueError("map.pop and map.origin both place the project frame on the map: keep one")
         if self.alarms and self.alarms.change and not self.areas:
             raise ValueError("alarms.change needs areas: give their file in [areas]")
+        self._require_products()
         return self
+
+    def _require_products(self) -> None:
+        """Raise ValueError if two products have one file, or one has no areas."""
+        keys = [product.key for product in self.product]
+        if twice := sorted({key for key in keys if keys.count(key) > 1}):
+            raise ValueError(f"two [[product]] have the name {twice[0]!r}: rename one")
+        for product in self.product:
+            if product.needs_areas and not self.areas:
+                raise ValueError(f"product {product.name!r} needs areas: give their file in [areas]")
+        for alarm in self.alarms.product if self.alarms else ():
+            if product_key(alarm.product) not in keys:
+                raise ValueError(f"alarms.product: no [[product]] has the name {alarm.product!r}")
 
     @property
     def row_pattern(self) -> str:

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import shapely
 import xarray as xr
+from support.epochs import START_S
 from support.programs import (
     assert_gdal_knows_the_place,
     filled_metadata,
@@ -23,6 +24,8 @@ from support.programs import (
 
 from station.archive import epochs, reference_files
 from station.archive.areas import AreaChange, update_areas
+from station.archive.derived.boxes import Entries
+from station.archive.derived.product_files import ProductFile, update_product
 from station.archive.series.compaction import compact
 from station.archive.series.virtual import build_series
 from station.quantities import Reference
@@ -128,6 +131,19 @@ def areas_file(series, epoch):
 
 def test_compliance_checker_accepts_areas(areas_file, tmp_path):
     assert findings(tmp_path / "report.json", areas_file) == []
+
+
+def test_compliance_checker_accepts_products_of_places_and_along_lines(series, tmp_path):
+    paths = []
+    for kind, dim in (("snow_depth", "place"), ("point", "place"), ("profile", "distance")):
+        x_m = 632_100.0 + 10.0 * np.arange(2)
+        places = {"names": ("Süd", "gauge")} if dim == "place" else {"distance_m": x_m - x_m[0]}
+        product = ProductFile(kind, kind, kind, "recipe", dim, x_m, x_m + 4_553_000, **places)
+        row = {spec.name: np.array([0.5, np.nan]) for spec in product.variables}
+        entries = Entries(START_S + np.zeros(1), START_S + np.full(1, 900), *[np.array([b"1"])] * 2)
+        compute = {0: row}.__getitem__
+        paths.append(update_product(series, product, entries, np.zeros(1, int), compute, lambda: None))
+    assert findings(tmp_path / "report.json", *paths) == []
 
 
 def test_compliance_checker_accepts_outlines_of_areas(areas_file, series, tmp_path):

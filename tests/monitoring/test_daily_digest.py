@@ -8,6 +8,7 @@ from datetime import UTC, date, datetime
 
 import numpy as np
 import pytest
+from support.products import write_melt
 
 from station.archive.schema import FILL
 from station.errors import StoreError
@@ -61,6 +62,15 @@ def test_area_change_is_relative_to_the_last_scan_of_the_previous_day(site, writ
     text = format_digest(site, DAY)
     assert "tongue: +2.500 ± 0.980, +3.500 ± 0.784" in text
     assert "Hütte: +0.000 ± 2.772" in text  # not observed at 23 h: its change at 3 h
+
+
+def test_products_have_the_newest_usable_value_of_the_day(site):
+    fill(site, [(1, "good", "")])
+    hours = np.array([-2.0, 5.0, 20.0, 23.0, 24.5])
+    write_melt(site, DAY_S + 3600 * hours, [0.1, 0.2, 0.3, 9.0, 0.4], [0, 0, 1, 2, 0])
+    assert format_digest(site, DAY).splitlines()[-1] == (
+        "Ice melt, stake: melt 0.300 ±0.196 m at 2026-11-20 20:00"
+    )
 
 
 def test_unusable_epochs_are_excluded(site, write_series):

@@ -86,6 +86,7 @@ def test_status_lists_the_offset_among_the_faults(problem_of, tmp_path, monkeypa
         adjusts=True,
         weather=None,
         mirror=None,
+        product=(),
         products=SimpleNamespace(levels=False),
         input_faults=(),
     )

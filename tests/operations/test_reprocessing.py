@@ -36,6 +36,8 @@ SCANS = [f"250715_{hour:02d}0000" for hour in range(5)]
 LAST = SCANS[-1]  # the only one that is not part of the reference
 FILE_NAMES = {"epoch_file"}  # the only variable that reprocessing may change
 
+MELT = '[[product]]\nname = "melt"\nkind = "melt"\ndensity_kg_m3 = 900\n'
+
 integration = pytest.mark.integration
 
 
@@ -205,19 +207,18 @@ def test_service_drops_a_damaged_epoch_and_reprocesses_its_scan(folder):
 @integration
 def test_service_restores_damaged_derived_files(folder):
     """A reference needs no second scan: nothing of what is damaged here is a source."""
-    site, data = edited_site(folder), folder / "data"
+    site, data = edited_site(folder, more=MELT), folder / "data"
     with Journal(data / "journal.sqlite") as journal:
         Worker(site, journal, in_service=True).recover()  # the store is a copy
-    original = {
-        name: without_dates(xr.open_dataset(data / name).load()) for name in ("series.nc", "areas.nc")
-    }
+    names = "series.nc", "areas.nc", "products/melt.nc"
+    original = {name: without_dates(xr.open_dataset(data / name).load()) for name in names}
     (tilt_offset,) = (data / "sop_tilt_offset").iterdir()
     text = tilt_offset.read_text()
-    derived = [data / "series.nc", data / "areas.nc", tilt_offset]
+    derived = [*(data / name for name in names), tilt_offset]
     for content in (b"", b"garbage"):
         for path in derived:
             path.write_bytes(content)
-        assert len(faults(folder)) == 3
+        assert len(faults(folder)) == 4
         assert station_status(site)["counts"][State.STORED] == len(SCANS)
         with Journal(data / "journal.sqlite") as journal:
             worker = Worker(site, journal, in_service=True)

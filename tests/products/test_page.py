@@ -16,12 +16,15 @@ from station.archive import epochs
 from station.archive.reference_files import write_reference
 from station.archive.series import index
 from station.archive.series.virtual import build_series
+from station.processing.site_files import load_areas
 from station.products import gallery, page
 from station.products.epoch_table import AreaSeries, EpochTable, read_epoch_table
 from station.products.gallery import MeasuredEpoch, Style, cached_base_map, retention_indices, update_gallery
 from station.products.maps import MAX_BYTES
 from station.products.overview import base_map
 from station.products.web.page_areas import mask_unusable
+from station.queries.site_products.product_queries import Product, update_products
+from station.sections.product import ProductSection
 
 NOW_S = 1_763_710_000.0
 
@@ -280,3 +283,19 @@ def test_maps_use_the_reference_version_of_their_epoch(write, series, site, smal
     assert (folder / ".terrain_2_600.npz").is_file()
     assert page_data(folder)["maps"][-1]["time_s"] == small.START_S + 8 * 3600
     assert site.station.data.is_dir()
+
+
+def test_products_have_values_and_curves(write, context, site, series, small):
+    """The box rises by 5 cm an hour, of half the density of water; the last scan may not be used."""
+    settings = {"name": "deposit", "kind": "surface_mass_balance", "density_kg_m3": 500}
+    product = Product(ProductSection.model_validate(settings), load_areas(site))
+    epochs.write_epoch(series, replace(small.make_epoch(6), verdict="unusable"))
+    build_series(series)
+    update_products(series, [product], ["deposit"], lambda: None)
+    folder = write(replace(context, language="de"))
+    curve, evil = page_data(folder)["products"]
+    assert (curve["product"], curve["place"], evil["place"]) == ("deposit", "rises", small.EVIL)
+    assert curve["time_s"] == [small.START_S + 3600 * hour for hour in range(6)]
+    assert curve["values"] == pytest.approx([0.025 * (hour + 1) for hour in range(6)], abs=0.003)
+    html = Elements((folder / "index.html").read_text()).text
+    assert re.search(r"Massenbilanz, Wasseräquivalent\s*2025-11-21 05:00\s*0\.15\d ± 0\.00\d m", html)

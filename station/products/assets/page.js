@@ -202,11 +202,17 @@
       if (plotBox.closest(".curves")) chart.destroy(); else charts.push([chart, plotBox]);
     });
     const areas = byId("area-curves"), health = byId("health-curves");
+    const products = byId("product-curves");
     if (areas) areas.replaceChildren();
+    if (products) products.replaceChildren();
     health.replaceChildren();
     for (const area of data.areas) {
       curve(areas, fill(text.js_area_curve, { area: area.name }), data.area_time_s, [
         { values: area.mean_m, half: area.sigma_m.map((s) => s == null ? null : 1.959964 * s), digits: 3 }]);
+    }
+    for (const product of data.products) {
+      curve(products, fill(text.js_product_curve, product), product.time_s, [
+        { values: product.values, half: product.sigma.map((s) => s == null ? null : 1.959964 * s), digits: product.digits }]);
     }
     if (data.health) drawHealth(health, data.health);
     flush();

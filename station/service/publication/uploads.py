@@ -20,7 +20,7 @@ from station.service.publication.upload_record import SourceFile, UploadRecord
 
 FILES = {  # patterns below the data folder, by the word for them in the site file
     "page": ("page/**/*",),
-    "areas": ("areas.nc",),
+    "areas": ("areas.nc", "products/*.nc"),
     "events": ("events.geojson",),
     "digest": ("digest/*.txt",),
     "geotiff": ("geotiff/**/*",),

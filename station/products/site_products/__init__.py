@@ -1,0 +1,1 @@
+"""Products of the site file as tables, and compared with what others observed."""

@@ -1,0 +1,1 @@
+"""Products of the site file: the quantities of `[[product]]`."""
