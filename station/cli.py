@@ -37,7 +37,7 @@ COMMANDS = (
     check.init, check.check, process.process, retry.retry, reprocess.reprocess, run.run, run.status,
     simulate.simulate, simulate.demo, products.areas, products.trend, products.events, products.plot,
     exports.export, run.publish, products.serve, products.index, calibrate.calibrate,
-    sensitivity.sensitivity, papers.papers,
+    sensitivity.sensitivity, calibrate.score, papers.papers,
 )  # fmt: skip
 for command in COMMANDS:
     app.command()(command)
