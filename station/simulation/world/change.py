@@ -215,6 +215,8 @@ def _snow_share(scenario: Scenario, valley: Valley) -> Floats:
     down, across = np.gradient(valley.ground.node, valley.ground.step_m)
     slope_deg = np.degrees(np.arctan(np.hypot(across, down)))
     snow_share = np.clip((50 - slope_deg) / 10, 0, 1)
+    if scenario.kind != "valley":  # where it lay at the start
+        snow_share *= valley.ice.node
     if scenario.stable_ground == "poor":
         snow_share[roof(scenario, valley)] = 0
     return np.asarray(snow_share)

@@ -1,4 +1,4 @@
-"""A snow slope opposite a mast: 50 to 300 m away, with bands of rock too steep for snow.
+"""A snow slope opposite a mast: 50 to 300 m away, with bands of rock too steep for snow, and roofs.
 
 East-north-up at the mark, on a knoll; the slope rises to the north, beyond a gully.
 """
@@ -19,6 +19,11 @@ BAND_HEIGHT_M, BAND_RUN_M = 9.0, 6.0
 BAND_WAVES_M = (40.0, 160.0)  # wavelengths of their gaps
 GULLIES_M, GULLY_WAVES_M = 0.8, (30.0, 120.0)
 BARE_SLOPE = (1.15, 1.25)  # tangents: snow lies below the first, none above the second
+ROOFS_M = (  # east, north of galleries and huts, as steep as the slope, on which no snow stays
+    (-70.0, 85.0), (-25.0, 70.0), (35.0, 78.0), (75.0, 95.0), (-50.0, 125.0), (60.0, 140.0), (-75.0, 165.0),
+    (15.0, 165.0), (70.0, 185.0),
+)  # fmt: skip
+ROOF_M = 14.0  # length and width
 AREAS_M = {  # east, north, half diagonals: of rectangles
     "slope": (0.0, 135.0, 84.0, 28.0),
     "upper slope": (0.0, 200.0, 98.0, 28.0),
@@ -48,4 +53,9 @@ def build_snow_slope(scenario: Scenario) -> Valley:
     ground = NodeField(WEST_M, SOUTH_M, step_m, up_m)
     low, high = BARE_SLOPE
     steepness = np.hypot(*np.gradient(up_m, step_m))
-    return Valley(ground, ground.with_nodes(np.clip((high - steepness) / (high - low), 0, 1)), scenario.size)
+    snow = np.clip((high - steepness) / (high - low), 0, 1)
+    east_m = WEST_M + step_m * np.arange(nx, dtype=np.float64)[None, :]
+    for roof_east_m, roof_north_m in ROOFS_M:
+        away_m = np.maximum(np.abs(east_m - roof_east_m), np.abs(north_m - roof_north_m))
+        snow[away_m <= ROOF_M / 2] = 0
+    return Valley(ground, ground.with_nodes(snow), scenario.size)
