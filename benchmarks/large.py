@@ -24,7 +24,7 @@ from station.quantities import Floats, WeatherLog
 from station.simulation import files
 from station.simulation.instrument import motion
 from station.simulation.randomness import rng_for
-from station.simulation.scenario import Scenario
+from station.simulation.scenario import Mark, Scenario
 from station.simulation.truth import grid_of, map_from_enu
 from station.simulation.world.air import SCANNER_SETTING
 
@@ -149,7 +149,7 @@ def _weather(scenario: Scenario) -> WeatherLog:
 
 def _squares(size: float, half_m: float, spacing_m: float) -> dict[str, Floats]:
     """Return squares on the map, one in each `spacing_m` of the grid, as rings (n, 2)."""
-    to_map = map_from_enu()
+    to_map = map_from_enu(Mark())
     rings: dict[str, Floats] = {}
     for north_m in np.arange(NEAREST_M * size + spacing_m / 2, (NEAREST_M + LENGTH_M) * size, spacing_m):
         for east_m in np.arange((spacing_m - WIDTH_M * size) / 2, WIDTH_M * size / 2, spacing_m):

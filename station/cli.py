@@ -38,7 +38,7 @@ COMMANDS = (
     upgrade.upgrade, simulate.simulate, simulate.demo, products.areas, products.product, products.trend,
     products.events, products.plot,
     exports.export, run.publish, products.serve, products.index, calibrate.calibrate,
-    sensitivity.sensitivity, papers.papers,
+    sensitivity.sensitivity, calibrate.score, papers.papers,
 )  # fmt: skip
 for command in COMMANDS:
     app.command()(command)

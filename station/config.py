@@ -37,6 +37,12 @@ ALTERNATIVES = {  # to a word, by the fault that pydantic reports for them
     "float_parsing": "a number",
     "int_parsing": "a whole number",
 }
+KINDS = {  # of stations with a commented site file in config/, by the values of --like
+    "hef": "hintereisferner",
+    "mammoth": "mammoth",
+    "low-cost-snow": "low-cost-snow",
+    "beach": "beach",
+}
 SCHEMA_NAME = "station-site.schema.json"  # next to the site file, whose first line refers to it
 
 
@@ -157,13 +163,12 @@ def site_schema() -> str:
 
 
 def write_site(folder: Path, like: str) -> Path:
-    """Write the commented site file of a known station as `site.toml`, and its JSON Schema for editors.
+    """Write the commented site file of a kind of station as `site.toml`, and its JSON Schema for editors.
 
     Returns the path of the site file; raises ConfigError if it exists.
     """
-    names = {"hef": "hintereisferner", "mammoth": "mammoth"}
-    if like not in names:
-        raise ConfigError(f"--like {like}: choose from {', '.join(names)}")
+    if like not in KINDS:
+        raise ConfigError(f"--like {like}: choose from {', '.join(KINDS)}")
     installed = Path(__file__).parent / "sites"
     source = installed if installed.is_dir() else Path(__file__).parents[1] / "config"
     path = folder / "site.toml"
@@ -171,7 +176,7 @@ def write_site(folder: Path, like: str) -> Path:
         folder.mkdir(parents=True, exist_ok=True)
         with path.open("x", encoding="utf-8") as file:
             file.write(f"#:schema ./{SCHEMA_NAME}\n")
-            file.write((source / f"{names[like]}.toml").read_text(encoding="utf-8"))
+            file.write((source / f"{KINDS[like]}.toml").read_text(encoding="utf-8"))
         (folder / SCHEMA_NAME).write_text(site_schema(), encoding="utf-8")
     except FileExistsError as error:
         raise ConfigError(f"{path}: already exists; nothing is overwritten") from error

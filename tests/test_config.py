@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
-from station.config import SCHEMA_NAME, read_site, site_schema, write_site
+from station.config import KINDS, SCHEMA_NAME, read_site, site_schema, write_site
 from station.errors import ConfigError
 from station.processing.scanner_pose import sop_identity
 from station.scanners import KEYS, SCANNERS, missing_values
@@ -230,7 +230,7 @@ def as_json(value):
     return value.isoformat() if isinstance(value, datetime) else value
 
 
-@pytest.mark.parametrize("name", ["hintereisferner", "mammoth"])
+@pytest.mark.parametrize("name", KINDS.values())
 def test_shipped_site_files_satisfy_the_schema(name):
     from jsonschema import Draft7Validator
 

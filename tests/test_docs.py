@@ -49,11 +49,13 @@ def test_every_key_of_the_site_file_is_in_the_examples():
     assert not missing
 
 
-@pytest.mark.parametrize("like", ["hef", "mammoth"])
+@pytest.mark.parametrize("like", config.KINDS)
 def test_site_files_are_complete(tmp_path, like):
-    """They can be read as they are, but for the files with the SOP of a station."""
+    """They can be read as they are, but for the files with the SOP of a station, and its polygons."""
     site = write_site(tmp_path, like)
     text = site.read_text(encoding="utf-8")
+    for name in re.findall(r'^(?:stable|file) = "([^"]+\.geojson)"', text, re.MULTILINE):
+        (tmp_path / name).write_text("{}")
     for name in re.findall(r'(?:file|pop) = "([^"]+\.dat)"', text):
         (tmp_path / name).write_text("1 0 0 0\n0 1 0 0\n0 0 1 0\n0 0 0 1\n")
     assert read_site(site).station.id == like

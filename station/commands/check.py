@@ -14,7 +14,13 @@ from station.commands._options import Json, SiteArgument
 
 def init(
     folder: Annotated[Path, typer.Argument(metavar="DIR", help="Where to write it.", show_default=False)],
-    like: Annotated[str, typer.Option(help="hef: glacier, VZ-6000. mammoth: snow field, VZ-400i.")] = "hef",
+    like: Annotated[
+        str,
+        typer.Option(
+            help="hef: glacier, VZ-6000. mammoth: snow field, VZ-400i. low-cost-snow: snow slope, Livox."
+            " beach: VZ-2000."
+        ),
+    ] = "hef",
     source: Annotated[
         Path | None,
         typer.Option(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
@@ -10,10 +11,10 @@ import laspy
 import numpy as np
 from numpy.typing import NDArray
 
+from station import config
 from station.quantities import Floats, Grid, InclinationLog, WeatherLog
 from station.simulation.instrument.scan import SimulatedScan
 from station.simulation.scenario import SCANNER_MODELS, Scenario
-from station.simulation.truth import CRS, HEIGHT_M, LATITUDE_DEG, LONGITUDE_DEG
 from station.simulation.world.air import SCANNER_SETTING
 
 NAME_FORMAT = "%y%m%d_%H%M%S"  # RIEGL's convention: start of the scan in UTC
@@ -96,12 +97,12 @@ def write_weather(path: Path, log: WeatherLog) -> None:
     path.write_text("\r\n".join([*lines, ""]), encoding="ascii", newline="")
 
 
-def write_sop(path: Path, matrix: Floats) -> None:
-    """Write a 4 x 4 matrix as text."""
-    np.savetxt(path, matrix, fmt="%.16f", header="scanner's frame to east-north-up at the mark")
+def write_matrix(path: Path, matrix: Floats, meaning: str) -> None:
+    """Write a 4 x 4 matrix, of an SOP or a POP, as text."""
+    np.savetxt(path, matrix, fmt="%.16f", header=meaning)
 
 
-def write_polygons(path: Path, rings_m: dict[str, Floats]) -> None:
+def write_polygons(path: Path, rings_m: dict[str, Floats], map_crs: str) -> None:
     """Write named polygons as GeoJSON with map eastings and northings, to the millimetre.
 
     The member `crs` is that of GeoJSON 2008, which GIS programs still read.
@@ -114,21 +115,24 @@ def write_polygons(path: Path, rings_m: dict[str, Floats]) -> None:
         }
         for name, ring_m in rings_m.items()
     ]
-    crs = {"type": "name", "properties": {"name": f"urn:ogc:def:crs:EPSG::{CRS.removeprefix('EPSG:')}"}}
+    crs = {"type": "name", "properties": {"name": f"urn:ogc:def:crs:EPSG::{map_crs.removeprefix('EPSG:')}"}}
     lines = ",\n".join(json.dumps(feature) for feature in features)
     head = f'{{"type": "FeatureCollection", "crs": {json.dumps(crs)}, "features": [\n'
     path.write_text(f"{head}{lines}\n]}}\n", encoding="ascii")
 
 
-def write_site(path: Path, scenario: Scenario, grid: Grid) -> None:
-    """Write the site file of the simulated station, with comments."""
+def write_site(folder: Path, scenario: Scenario, grid: Grid) -> None:
+    """Write the site file of the simulated station, with comments, as `site.toml`."""
+    if scenario.kind != "valley":
+        _adapt_site(config.write_site(folder, scenario.kind), scenario, grid)
+        return
     text = SITE.format(
         first=stem(scenario, 0),
         sop_from=f"{scenario.start.astimezone(UTC) - timedelta(hours=1):%Y-%m-%dT%H:%M:%SZ}",
-        crs=CRS,
-        latitude=LATITUDE_DEG,
-        longitude=LONGITUDE_DEG,
-        height=HEIGHT_M,
+        crs=scenario.mark.crs,
+        latitude=scenario.mark.latitude_deg,
+        longitude=scenario.mark.longitude_deg,
+        height=scenario.mark.height_m,
         west=grid.west_m,
         south=grid.north_m - grid.ny * grid.cell_m,
         east=grid.west_m + grid.nx * grid.cell_m,
@@ -141,7 +145,28 @@ def write_site(path: Path, scenario: Scenario, grid: Grid) -> None:
         reach=scenario.range_max_m,
         reference=scenario.reference_scans,
     )
-    path.write_text(text + (WEATHER if scenario.air else ""), encoding="utf-8")
+    (folder / "site.toml").write_text(text + (WEATHER if scenario.air else ""), encoding="utf-8")
+
+
+def _adapt_site(path: Path, scenario: Scenario, grid: Grid) -> None:
+    """Change what a simulated station of a kind has otherwise than its site file: folders, times, grid."""
+    south_m, east_m = grid.north_m - grid.ny * grid.cell_m, grid.west_m + grid.nx * grid.cell_m
+    bounds = f"west = {grid.west_m}, south = {south_m}, east = {east_m}, north = {grid.north_m}"
+    text = re.sub(r'"[^"]*SOP\.dat"', '"sop.dat"', path.read_text(encoding="utf-8"))
+    values = {
+        "data": '"data"',
+        "inbox": '"inbox"',
+        "settle_s": "2",
+        "from": f"{scenario.start - timedelta(hours=1):%Y-%m-%dT%H:%M:%SZ}",
+        "file": f'"sop.dat"\nscan = "{stem(scenario, 0)}"',
+        "pop": '"pop.dat"',
+        "bounds_m": f"{{ {bounds} }}",
+        "cell_m": f"{grid.cell_m}",
+        "scans": f"{scenario.reference_scans}",
+    }
+    for key, value in values.items():
+        text = re.sub(rf"(?m)^{key} = (\{{.*?\}}|\".*?\"|\S+)", f"{key} = {value}", text, count=1)
+    path.write_text(text, encoding="utf-8")
 
 
 SITE = """\

@@ -16,9 +16,10 @@ NAMES = (  # for `named`
     "log-time", "log-swapped", "breathing",
 )  # fmt: skip
 
-SCANNER_MODELS = {1064: "riegl-vz-6000", 1550: "riegl-vz-4000"}  # by wavelength [nm]
+SCANNER_MODELS = {905: "livox-avia", 1064: "riegl-vz-6000", 1550: "riegl-vz-4000"}  # by wavelength [nm]
 
 SEASON_S = 120 * 86_400.0
+MAX_SCAN_SHARE = 5 / 6  # of the time from scan to scan
 
 # Fields set to zero by without_errors(): every difference between a shot and its ideal point.
 ERRORS = (
@@ -26,12 +27,36 @@ ERRORS = (
     "refraction_patch_sigma", "refraction_ice_sigma", "ice_layer_k", "fog_visibility_m",
     "tilt_drift_deg", "tilt_within_scan_deg", "sway_deg", "wind_sway_deg", "tilt_jerk_deg",
     "tilt_daily_deg", "tilt_walk_deg", "season_deg",
-    "line_jitter_deg", "mirror_wobble_deg", "heading_deg", "position_m", "moved_hour", "moved_deg", "moved_m",
+    "line_jitter_deg", "mirror_wobble_deg", "angle_step_deg", "heading_deg", "position_m", "moved_hour",
+    "moved_deg", "moved_m",
     "range_bias_m", "range_noise_m", "beam_divergence_mrad", "echo_loss", "airborne_share", "airborne_clouds",
     "log_noise_deg", "log_bias_deg", "log_cyclic_deg", "log_cyclic_change", "log_clock_s", "log_fault",
     "melt_m_per_h", "snowfall_m", "avalanche_m", "settling_m_per_h", "winter_m", "summer_melt_m",
-    "heave_m", "creep_m",
+    "heave_m", "creep_m", "sand_m",
 )  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Mark:
+    """The mark of a station in UTM, and the air there; by default on the ridge above Hintereisferner."""
+
+    latitude_deg: float = 46.7958
+    longitude_deg: float = 10.7828
+    height_m: float = 3245.0
+    epsg: int = 32632
+    pressure_hpa: float = 688.0  # on average
+    # Temperature [°C], pressure [hPa], humidity [%] set in the scanner: Voordendag et al. (2023), 3.1.2
+    scanner_setting: tuple[float, float, float] = (-2.0, 684.0, 28.0)
+
+    @property
+    def crs(self) -> str:
+        """The map of the station."""
+        return f"EPSG:{self.epsg}"
+
+    @property
+    def zone(self) -> int:
+        """Zone of UTM."""
+        return self.epsg % 100
 
 
 @dataclass(frozen=True)
@@ -43,9 +68,12 @@ class Scenario:
 
     seed: int = 1
     start: datetime = datetime(2025, 7, 15, tzinfo=UTC)
-    hours: int = 24  # one scan per hour
+    hours: int = 24
+    interval_s: float = 3600.0  # from scan to scan
 
     # the place
+    kind: Literal["valley", "mammoth", "low-cost-snow", "beach"] = "valley"  # its landscape and site file
+    mark: Mark = Mark()
     size: float = 1.0  # of the valley relative to the real one, heights included
     terrain_step_m: float = 2.0
     roughness_m: float = 0.10
@@ -57,11 +85,13 @@ class Scenario:
     # the scan pattern
     lines: int = 2700
     shots_per_line: int = 1000
+    pattern: Literal["lines", "rosette"] = "lines"  # of a mirror, or of two rotating prisms
     scan_s: float = 900.0
     azimuth_deg: tuple[float, float] = (97.0, 245.0)  # first and last, about the scanner's z axis from its x
     elevation_deg: tuple[float, float] = (-31.0, 9.0)  # lowest and highest, from the scanner's xy plane
     incidence_max_deg: float = 85.0  # no echo beyond
     range_max_m: float = 6000.0
+    faintest: float = 0.0  # reflectance that, square to the beam, just gives an echo at range_max_m
     reference_scans: int = 8
 
     # the mount, all of it contained in the SOP
@@ -104,6 +134,7 @@ class Scenario:
     range_bias_m: float = 0.004  # of each scan
     range_noise_m: float = 0.010
     beam_divergence_mrad: float = 0.12
+    angle_step_deg: float = 0.0  # width of the even distribution of the error of each angle
     echo_loss: float = 0.02  # share of shots without an echo
 
     # snow, rain, dust and birds: echoes from the air instead of the ground
@@ -114,7 +145,7 @@ class Scenario:
     # brightness in the files: linear in 16 bit; the same with RIEGL's extra bytes "Reflectance" in dB; -25 to
     # 5 dB in 16 bit; linear in 8 bit; none
     brightness: Literal["linear", "reflectance", "decibel", "8bit", "none"] = "linear"
-    wavelength_nm: Literal[1064, 1550] = 1064
+    wavelength_nm: Literal[905, 1064, 1550] = 1064
     intensity_reference_m: float = (
         0.0  # raw intensity falls with the square of the range over this; 0: corrected
     )
@@ -144,6 +175,8 @@ class Scenario:
     summer_melt_m: float = 0.0  # what melted in them at the end of the tongue; zero 450 m (times size) higher
     heave_m: float = 0.0  # of rock: half of its variance over the day, half random from scan to scan
     creep_m: float = 0.0  # displacement of part of the rock over the whole series
+    tide_m: float = 0.0  # amplitude of the tide at a beach
+    sand_m: float = 0.0  # height of the bar that grows on a beach over the whole series
 
     # known stable ground: rock all round, or only a far ridge and a hut that snow never covers
     stable_ground: Literal["good", "poor"] = "good"
@@ -152,8 +185,11 @@ class Scenario:
         """Raise ConfigError for a scenario that cannot be simulated."""
         if self.hours < 1 or self.lines < 2 or self.shots_per_line < 2:
             raise ConfigError("a simulated station needs at least 1 hour, 2 lines and 2 shots per line")
-        if not 0 < self.scan_s <= 3000:
-            raise ConfigError("scan_s must be above 0 and at most 3000, to end before the next hour")
+        longest_s = self.interval_s * MAX_SCAN_SHARE
+        if not 0 < self.scan_s <= longest_s:
+            raise ConfigError(
+                f"scan_s must be above 0 and at most {longest_s:g}, to end before the next scan"
+            )
         if self.start.tzinfo is None:
             raise ConfigError("start has no time zone: use datetime(..., tzinfo=UTC)")
         if not 0 <= self.airborne_share <= 1 or not 0 <= self.airborne_clouds <= 1:
@@ -168,6 +204,11 @@ class Scenario:
         return replace(self, **{name: type(getattr(self, name))() for name in ERRORS})
 
     @property
+    def scans(self) -> int:
+        """Number of scans."""
+        return max(1, round(self.hours * 3600 / self.interval_s))
+
+    @property
     def start_utc_s(self) -> float:
         """Start of the first scan [s since 1970]."""
         return self.start.timestamp()
@@ -179,7 +220,7 @@ class Scenario:
 
     def scan_start_s(self, scan: int) -> float:
         """Return the start of one scan [s since the start of the first]."""
-        return 3600.0 * scan
+        return self.interval_s * scan
 
     def scan_start_utc_s(self, scan: int) -> float:
         """Return the start of one scan [s since 1970]."""
@@ -189,7 +230,7 @@ class Scenario:
 
     def hours_at(self, scan: int) -> float:
         """Return the middle of one scan in hours since the series began; the ground is fixed at that time."""
-        return scan + self.scan_s / 7200
+        return scan * self.interval_s / 3600 + self.scan_s / 7200
 
     @property
     def azimuth_rad(self) -> tuple[float, float]:

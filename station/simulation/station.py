@@ -15,10 +15,12 @@ from station.simulation.instrument import motion
 from station.simulation.instrument.scan import ScanConditions, SimulatedScan, scan_conditions, simulate_scan
 from station.simulation.scenario import Scenario, demo, full_resolution, named, small
 from station.simulation.true_errors import CONVENTIONS, true_errors
-from station.simulation.truth import CRS, TrueSurface, grid_of, true_surface
+from station.simulation.truth import TrueSurface, geocentric_from_enu, grid_of, true_surface
 from station.simulation.world.air import weather
+from station.simulation.world.beach import build_beach, sea_level_m, wet_ground
 from station.simulation.world.change import BREATHING, SurfaceChange, ground_at, snow_cover, surface_changes
 from station.simulation.world.relief import with_rock_relief
+from station.simulation.world.snow_slope import build_snow_slope
 from station.simulation.world.stable import Rectangle, areas, inside_rectangles, stable_ground
 from station.simulation.world.terrain import NodeField, Valley, build_valley
 
@@ -37,8 +39,10 @@ class Station:
 
     @cached_property
     def valley(self) -> Valley:
-        """The valley before any surface change."""
+        """The valley, or another landscape, before any surface change."""
         scenario = self.scenario
+        if scenario.kind != "valley":
+            return build_beach(scenario) if scenario.kind == "beach" else build_snow_slope(scenario)
         valley = build_valley(
             scenario.seed,
             scenario.size,
@@ -63,7 +67,7 @@ class Station:
     @cached_property
     def surface(self) -> TrueSurface:
         """The true cell means on the map's grid."""
-        return true_surface(self.valley, self.changes, grid_of(self.scenario))
+        return true_surface(self.valley, self.changes, grid_of(self.scenario), self.scenario.mark)
 
     @cached_property
     def stable(self) -> list[Rectangle]:
@@ -82,9 +86,13 @@ class Station:
 
     def scan(self, scan: int) -> SimulatedScan:
         """Simulate one scan."""
-        cover = snow_cover(self.valley, self.changes, self.scenario.hours_at(scan))
+        scenario, hours = self.scenario, self.scenario.hours_at(scan)
         ground, conditions = self.ground(scan), self.conditions(scan)
-        return simulate_scan(self.scenario, ground, cover, conditions, self.valley.ice)
+        if scenario.kind == "beach":
+            wet, sea_m = wet_ground(scenario, ground, hours), sea_level_m(scenario, hours)
+            return simulate_scan(scenario, ground, wet, conditions, self.valley.ice, sea_m)
+        cover = snow_cover(self.valley, self.changes, hours)
+        return simulate_scan(scenario, ground, cover, conditions, self.valley.ice)
 
     def log(self, scan: int) -> InclinationLog | None:
         """Return the inclination log of one scan, with its fault if there is one; None if it is missing."""
@@ -93,7 +101,7 @@ class Station:
 
     def truth(self) -> xr.Dataset:
         """Return all true values, scan by scan, at the middle of each."""
-        scenario, scans = self.scenario, range(self.scenario.hours)
+        scenario, scans = self.scenario, range(self.scenario.scans)
         errors = true_errors(scenario, [self.conditions(scan) for scan in scans], self.tilt)
         middle = [scenario.scan_start_utc_s(scan) + scenario.scan_s / 2 for scan in scans]
         return xr.merge([self._true_surfaces(), errors]).assign_coords(
@@ -101,13 +109,13 @@ class Station:
             scan_id=("time", [files.stem(scenario, scan) for scan in scans]),
         ).assign_attrs(
             title="The truth of a simulated station",
-            crs=CRS,
+            crs=scenario.mark.crs,
             comment=f"Elevations are cell means above the WGS 84 ellipsoid. {CONVENTIONS}",
             seed=scenario.seed,
         )  # fmt: skip
 
     def _true_surfaces(self) -> xr.Dataset:
-        surface, scans = self.surface, range(self.scenario.hours)
+        surface, scans = self.surface, range(self.scenario.scans)
         change_m = np.stack([surface.change_m(self.changes, self.scenario.hours_at(scan)) for scan in scans])
         plane, cube = ("y", "x"), ("time", "y", "x")
         dataset = xr.Dataset(
@@ -145,17 +153,23 @@ def simulate(folder: Path, scenario: Scenario) -> None:
         raise ConfigError(f"{folder} already holds a station: choose another folder")
     try:
         inbox.mkdir(parents=True)
-        files.write_sop(folder / "sop.dat", motion.sop(scenario))
-        files.write_site(folder / "site.toml", scenario, grid_of(scenario))
+        files.write_matrix(
+            folder / "sop.dat", motion.sop(scenario), "scanner's frame to east-north-up at the mark"
+        )
+        if scenario.kind == "mammoth":
+            pop = geocentric_from_enu(scenario.mark)
+            files.write_matrix(folder / "pop.dat", pop, "east-north-up at the mark to WGS 84 geocentric")
+        files.write_site(folder, scenario, grid_of(scenario))
         grid = station.surface.grid
         files.write_polygons(
             folder / "stable.geojson",
             {rectangle.name: rectangle.ring_m(grid) for rectangle in station.stable},
+            scenario.mark.crs,
         )
-        files.write_polygons(folder / "areas.geojson", areas(scenario, station.valley))
+        files.write_polygons(folder / "areas.geojson", areas(scenario, station.valley), scenario.mark.crs)
         if scenario.air:
             files.write_weather(folder / "weather.dat", weather(scenario, _minutes(scenario)))
-        for scan in range(scenario.hours):
+        for scan in range(scenario.scans):
             stem = files.stem(scenario, scan)
             start_utc_s = scenario.scan_start_utc_s(scan)
             files.write_scan(inbox / f"{stem}.laz", station.scan(scan), start_utc_s, scenario)
@@ -168,7 +182,7 @@ def simulate(folder: Path, scenario: Scenario) -> None:
 
 def _minutes(scenario: Scenario) -> Floats:
     """Return the minutes of the weather log: those around any scan [s since 1970]."""
-    starts_s = np.array([scenario.scan_start_utc_s(scan) for scan in range(scenario.hours)])
+    starts_s = np.array([scenario.scan_start_utc_s(scan) for scan in range(scenario.scans)])
     around_s = np.arange(-WEATHER_MARGIN_S, scenario.scan_s + WEATHER_MARGIN_S, 60.0)
     return np.asarray(np.unique(np.ceil((starts_s[:, None] + around_s) / 60) * 60))
 

@@ -14,31 +14,43 @@ from pyproj import Transformer
 from scipy.interpolate import RectBivariateSpline
 
 from station.quantities import Bools, Floats, Grid
-from station.simulation.scenario import Scenario
+from station.simulation.scenario import Mark, Scenario
 from station.simulation.world.change import SurfaceChange
 from station.simulation.world.terrain import NodeField, Valley
 
-CRS = "EPSG:32632"
-LATITUDE_DEG, LONGITUDE_DEG, HEIGHT_M = 46.7958, 10.7828, 3245.0  # the scanner above Hintereisferner
 KNOT_SPACING_M = 250.0  # of the verticals: a cubic between them errs by less than a nanometre
 FINENESS = 4.0  # sample points per node spacing in each direction, for cell means
 STRIP_POINTS = 400_000  # per strip, which bounds the memory
 
 
-def map_from_enu() -> Transformer:
+def map_from_enu(mark: Mark) -> Transformer:
     """Return pyproj's transformation from east-north-up at the mark to map and ellipsoidal height."""
     return Transformer.from_pipeline(
         "+proj=pipeline"
         " +step +inv +proj=topocentric +ellps=WGS84"
-        f" +lon_0={LONGITUDE_DEG} +lat_0={LATITUDE_DEG} +h_0={HEIGHT_M}"
-        " +step +inv +proj=cart +ellps=WGS84 +step +proj=utm +zone=32 +ellps=WGS84"
+        f" +lon_0={mark.longitude_deg} +lat_0={mark.latitude_deg} +h_0={mark.height_m}"
+        f" +step +inv +proj=cart +ellps=WGS84 +step +proj=utm +zone={mark.zone} +ellps=WGS84"
     )
+
+
+def geocentric_from_enu(mark: Mark) -> Floats:
+    """Return the matrix (4, 4) from east-north-up at the mark to WGS 84 geocentric coordinates: a POP."""
+    to_geocentric = Transformer.from_pipeline(
+        "+proj=pipeline +step +inv +proj=topocentric +ellps=WGS84"
+        f" +lon_0={mark.longitude_deg} +lat_0={mark.latitude_deg} +h_0={mark.height_m}"
+    )
+    span_m = 1000.0
+    corners_m = np.array(to_geocentric.transform(*(span_m * np.eye(3, 4, 1))))
+    matrix = np.eye(4)
+    matrix[:3, 3] = corners_m[:, 0]
+    matrix[:3, :3] = (corners_m[:, 1:] - corners_m[:, :1]) / span_m
+    return matrix
 
 
 def grid_of(scenario: Scenario) -> Grid:
     """Return the map raster that covers the scenario's extent, its edges at whole multiples of a cell."""
     west, south, east, north = (scenario.size * edge for edge in scenario.extent_m)
-    to_map = map_from_enu()
+    to_map = map_from_enu(scenario.mark)
     eastings, northings, _ = to_map.transform([0.0, 0.0], [0.0, 0.0], [0.0, 1.0])
     cell_m = scenario.cell_m
     west_m = np.floor((eastings[0] + west) / cell_m) * cell_m
@@ -61,6 +73,7 @@ class Verticals:
 
     base: tuple[RectBivariateSpline, ...]  # east, north, up at ellipsoidal height 0, by (northing, easting)
     up: tuple[RectBivariateSpline, ...]  # the same of the unit vector upwards
+    height_m: float  # of the mark
 
     def at(self, northing_m: Floats, easting_m: Floats) -> tuple[list[Floats], list[Floats]]:
         """Return base and upward vector on the mesh of northings and eastings, each as three (ny, nx)."""
@@ -70,13 +83,13 @@ class Verticals:
         )
 
 
-def fit_verticals(grid: Grid) -> Verticals:
+def fit_verticals(grid: Grid, mark: Mark) -> Verticals:
     """Fit splines to pyproj's verticals over the grid and a margin."""
     nx, ny = (int(cells * grid.cell_m / KNOT_SPACING_M) + 6 for cells in (grid.nx, grid.ny))
     easting_m = grid.west_m + KNOT_SPACING_M * (np.arange(nx) - 2)
     northing_m = grid.north_m - grid.ny * grid.cell_m + KNOT_SPACING_M * (np.arange(ny) - 2)
     mesh_e, mesh_n = np.meshgrid(easting_m, northing_m)
-    to_map = map_from_enu()
+    to_map = map_from_enu(mark)
     span_m = 4000.0
     base = to_map.transform(mesh_e, mesh_n, np.zeros_like(mesh_e), direction="INVERSE")
     upper = to_map.transform(mesh_e, mesh_n, np.full_like(mesh_e, span_m), direction="INVERSE")
@@ -86,13 +99,14 @@ def fit_verticals(grid: Grid) -> Verticals:
             RectBivariateSpline(northing_m, easting_m, (top - part) / span_m)
             for top, part in zip(upper, base, strict=True)
         ),
+        mark.height_m,
     )
 
 
 def surface_heights(ground: NodeField, verticals: Verticals, northing_m: Floats, easting_m: Floats) -> Floats:
     """Return the ground's ellipsoidal height on the mesh of northings and eastings (ny, nx) [m]."""
     base, up = verticals.at(northing_m, easting_m)
-    height_m = np.full(base[0].shape, HEIGHT_M)
+    height_m = np.full(base[0].shape, verticals.height_m)
     for _ in range(4):  # each iteration reduces the error of 800 m by the ground's slope times 0.0007
         ground_m = ground.at(base[0] + height_m * up[0], base[1] + height_m * up[1])
         height_m = (ground_m - base[2]) / up[2]
@@ -129,10 +143,10 @@ class TrueSurface:
         return ~touched
 
 
-def true_surface(valley: Valley, changes: tuple[SurfaceChange, ...], grid: Grid) -> TrueSurface:
+def true_surface(valley: Valley, changes: tuple[SurfaceChange, ...], grid: Grid, mark: Mark) -> TrueSurface:
     """Average the ground and its change patterns over the cells of the map, from many points in each."""
     fine = max(2, round(FINENESS * grid.cell_m / valley.ground.step_m))
-    verticals = fit_verticals(grid)
+    verticals = fit_verticals(grid, mark)
     share = (np.arange(fine) + 0.5) / fine - 0.5
     easting_m = (grid.x_m[:, None] + share * grid.cell_m).ravel()
     rows = max(1, STRIP_POINTS // (len(easting_m) * fine))

@@ -90,12 +90,13 @@ def test_snow_is_dark_at_1550_nm():
 @pytest.mark.parametrize(("wavelength_nm", "model"), [(1064, "riegl-vz-6000"), (1550, "riegl-vz-4000")])
 def test_site_file_names_a_scanner_of_the_wavelength(tmp_path, wavelength_nm, model):
     scenario = replace(small(), wavelength_nm=wavelength_nm, air=False)
-    files.write_site(tmp_path / "site.toml", scenario, grid_of(scenario))
+    files.write_site(tmp_path, scenario, grid_of(scenario))
     assert tomllib.loads((tmp_path / "site.toml").read_text())["scanner"]["model"] == model
     assert SCANNERS[model]["wavelength_um"] == pytest.approx(wavelength_nm / 1000, rel=1e-3)
     for name in ("stable.geojson", "areas.geojson"):
-        files.write_polygons(tmp_path / name, {"a": np.array([[0, 0], [9, 0], [0, 9], [0, 0]]) + 6e5})
-    files.write_sop(tmp_path / "sop.dat", np.eye(4))
+        ring_m = np.array([[0, 0], [9, 0], [0, 9], [0, 0]]) + 6e5
+        files.write_polygons(tmp_path / name, {"a": ring_m}, scenario.mark.crs)
+    files.write_matrix(tmp_path / "sop.dat", np.eye(4), "SOP")
     (tmp_path / "inbox").mkdir()
     read_site(tmp_path / "site.toml")
 

@@ -14,7 +14,7 @@ from station.config import read_site
 from station.errors import ConfigError, StoreError
 from station.simulation import truth
 from station.simulation.instrument.motion import sop
-from station.simulation.scenario import ERRORS
+from station.simulation.scenario import ERRORS, Mark
 from station.simulation.station import Scenario, Station, demo, simulate, small
 
 LATITUDE, LONGITUDE, HEIGHT = 46.7958, 10.7828, 3245.0
@@ -58,7 +58,7 @@ def test_points_without_errors_lie_on_the_true_surface_within_a_millimetre(scena
     chosen = np.random.default_rng(1).permutation(np.flatnonzero(inside))[:150]
     e, n = np.argsort(easting[chosen]), np.argsort(northing[chosen])
     mesh = truth.surface_heights(
-        station.ground(0), truth.fit_verticals(grid), northing[chosen][n], easting[chosen][e]
+        station.ground(0), truth.fit_verticals(grid, Mark()), northing[chosen][n], easting[chosen][e]
     )
     true_m = mesh[np.argsort(n), np.argsort(e)]
     assert len(chosen) == 150
@@ -69,7 +69,7 @@ def test_points_without_errors_lie_on_the_true_surface_within_a_millimetre(scena
 def test_true_elevation_is_the_cell_mean_of_the_changed_ground():
     station = Station(replace(small(), snowfall_m=0.4, snow_hours=(0.0, 2.0)))
     surface, grid = station.surface, station.surface.grid
-    verticals = truth.fit_verticals(grid)
+    verticals = truth.fit_verticals(grid, Mark())
     share = (np.arange(40) + 0.5) / 40 - 0.5
     rng = np.random.default_rng(2)
     errors_m = []

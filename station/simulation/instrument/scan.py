@@ -24,15 +24,17 @@ from station.simulation.world.air import (
     fog_visibility_m,
     range_ratio,
 )
+from station.simulation.world.beach import SAND
 from station.simulation.world.cold_air import ICE, ColdAir, added_coefficient, cold_air_of_scan
-from station.simulation.world.terrain import EAST_M, NORTH_M, SOUTH_M, WEST_M, NodeField
+from station.simulation.world.terrain import NodeField
 
 SHOTS_PER_BLOCK = 50_000  # fits the cache
 RETRACE = 0.25  # share of each line without shots, while the mirror swings back
 ROCK, WHITE = 0.25, 0.60  # reflectance of rock, and of snow and ice, at 1064 nm
-REFLECTANCE = {1064: (ROCK, WHITE), 1550: (0.30, 0.10)}  # ice absorbs at 1550 nm: snow is dark
+REFLECTANCE = {905: (ROCK, 0.80), 1064: (ROCK, WHITE), 1550: (0.30, 0.10)}  # at 1550 nm snow is dark
 SPECKLE = 0.08  # relative scatter of the intensity of single shots
 GAIN = 0.05  # largest relative change of the receiver's gain in a scan
+PRISMS_PER_S = (7294 / 60, -4664 / 60)  # of a Livox Mid-40, see `_rosette`
 BENDING_PASSES = 3  # the point hit and the bending depend on each other
 FADING = 0.3  # relative scatter of the detection limit: the edge of visibility in fog is not sharp
 
@@ -100,10 +102,12 @@ def simulate_scan(
     cover: NodeField,
     conditions: ScanConditions,
     ice: NodeField | None = None,
+    sea_m: float = -np.inf,
 ) -> SimulatedScan:
     """Simulate one scan of a ground whose `cover` is 1 for ice and snow and 0 for rock.
 
-    `ice` is where cold air lies; without it, that is `cover`.
+    On a beach it is 1 where the ground is wet, and below the level of the sea there are no echoes. `ice` is
+    where cold air lies; without it, that is `cover`.
     """
     aim_rng, receiver_rng, air_rng = (rng_for(scenario.seed, kind, conditions.scan) for kind in (51, 52, 54))
     lines = max(1, SHOTS_PER_BLOCK // scenario.shots_per_line)
@@ -115,6 +119,7 @@ def simulate_scan(
             cover if ice is None else ice,
             conditions,
             np.arange(first, min(first + lines, scenario.lines)),
+            sea_m,
             (aim_rng, receiver_rng, air_rng),
         )
         for first in range(0, scenario.lines, lines)
@@ -133,12 +138,15 @@ def _simulate_lines(
     ice: NodeField,
     conditions: ScanConditions,
     lines: Ints,
+    sea_m: float,
     rngs: tuple[np.random.Generator, np.random.Generator, np.random.Generator],
 ) -> SimulatedScan:
     rng, receiver_rng, air_rng = rngs
     azimuth_rad, elevation_rad, elapsed_s, line = _angles(scenario, conditions, lines, rng)
     eye_m = np.array(scenario.mount_position_m) + conditions.pose_offset.position_m
     beam_error = scenario.beam_sigma_rad * rng.standard_normal((2, len(line)))
+    if scenario.angle_step_deg:
+        beam_error += np.radians(scenario.angle_step_deg) * rng.uniform(-0.5, 0.5, (2, len(line)))
     direction = _directions(
         scenario,
         conditions,
@@ -150,7 +158,7 @@ def _simulate_lines(
     air = conditions.air
     coefficient_at = air.coefficient_at if air else np.zeros_like
     slope = direction[2] / np.hypot(direction[0], direction[1])
-    hits = cast_rays(ground, eye_m, bearing_rad, slope, _reach_m(scenario), coefficient_at)
+    hits = cast_rays(ground, eye_m, bearing_rad, slope, _reach_m(ground), coefficient_at)
     if conditions.cold_air:
         rays = (bearing_rad, slope, coefficient_at(bearing_rad))
         hits = bend_over_ice(conditions.cold_air, ground, ice, eye_m, rays, hits)
@@ -158,10 +166,11 @@ def _simulate_lines(
     range_m = np.hypot(hits.along_m, rise_m)
     cos_incidence = _cos_incidence(hits, direction)
     echo = (cos_incidence > np.cos(np.radians(scenario.incidence_max_deg))) & (range_m < scenario.range_max_m)
-    echo &= rng.random(len(line)) >= scenario.echo_loss
+    echo &= (hits.up_m > sea_m) & (rng.random(len(line)) >= scenario.echo_loss)
     true_m = np.stack((hits.east_m, hits.north_m, hits.up_m), axis=1)
-    rock, white = REFLECTANCE[scenario.wavelength_nm]
+    rock, white = _reflectances(scenario)
     intensity = (rock + (white - rock) * cover.at(hits.east_m, hits.north_m)) * cos_incidence
+    echo &= intensity * (scenario.range_max_m / range_m) ** 2 > scenario.faintest
     echo &= _detected_in_fog(scenario, conditions, intensity, range_m, receiver_rng)
     airborne = np.zeros(len(line), dtype=np.bool_)
     if scenario.airborne_share or conditions.cloud:
@@ -225,10 +234,15 @@ def _detected_in_fog(
     """
     if np.isinf(conditions.visibility_m):
         return np.ones(len(range_m), dtype=np.bool_)
-    faintest = REFLECTANCE[scenario.wavelength_nm][0] * np.cos(np.radians(scenario.incidence_max_deg))
+    faintest = _reflectances(scenario)[0] * np.cos(np.radians(scenario.incidence_max_deg))
     margin = intensity / faintest * (scenario.range_max_m / range_m) ** 2
     needed = np.exp(FADING * receiver_rng.standard_normal(len(range_m)))
     return np.asarray(margin * fog_transmission(range_m, conditions.visibility_m) > needed)
+
+
+def _reflectances(scenario: Scenario) -> tuple[float, float]:
+    """Return the reflectance of bare ground and of its cover: of rock and snow, or of dry and wet sand."""
+    return SAND if scenario.kind == "beach" else REFLECTANCE[scenario.wavelength_nm]
 
 
 def _recorded_intensity(
@@ -248,6 +262,8 @@ def _angles(
     rng: np.random.Generator,
 ) -> tuple[Floats, Floats, Floats, Ints]:
     """Return recorded azimuth and elevation, seconds into the scan and line of each shot of these lines."""
+    if scenario.pattern == "rosette":
+        return _rosette(scenario, conditions, lines)
     shots = scenario.shots_per_line
     first, last = scenario.azimuth_rad
     low, high = np.radians(scenario.elevation_deg)
@@ -259,6 +275,23 @@ def _angles(
     elevation_rad = high - step * (shot + phase)
     elapsed_s = scenario.scan_s / scenario.lines * (line + (1 - RETRACE) * shot / shots)
     return azimuth_rad, elevation_rad, elapsed_s, line
+
+
+def _rosette(
+    scenario: Scenario, conditions: ScanConditions, lines: Ints
+) -> tuple[Floats, Floats, Floats, Ints]:
+    """Return what `_angles` does for two prisms that deflect the beam equally and rotate at constant speed.
+
+    Source: Brazeal et al. (2021), the Livox Mid-40: 7294 and -4664 turns a minute.
+    """
+    shots = scenario.shots_per_line
+    line, shot = np.repeat(lines, shots), np.tile(np.arange(shots), len(lines))
+    elapsed_s = scenario.scan_s * (line + shot / shots) / scenario.lines
+    turns = np.outer(PRISMS_PER_S, elapsed_s) + conditions.start_share[:, None]
+    across, up = (part(2 * np.pi * turns).mean(axis=0) for part in (np.cos, np.sin))
+    low, high = np.radians(scenario.elevation_deg)
+    (first, last), middle = scenario.azimuth_rad, (low + high) / 2
+    return (first + last) / 2 + (last - first) / 2 * across, middle + (high - low) / 2 * up, elapsed_s, line
 
 
 def _directions(
@@ -289,6 +322,8 @@ def _cos_incidence(hits: RayHits, direction: Floats) -> Floats:
     return np.asarray(along / np.sqrt(1 + hits.slope_east**2 + hits.slope_north**2))
 
 
-def _reach_m(scenario: Scenario) -> float:
-    """Return the distance to the furthest corner of the valley [m]."""
-    return float(scenario.size * np.hypot(max(-WEST_M, EAST_M), max(-SOUTH_M, NORTH_M)))
+def _reach_m(ground: NodeField) -> float:
+    """Return the distance from the mark to the furthest corner of the ground [m]."""
+    (ny, nx), step_m = ground.node.shape, ground.step_m
+    east_m, north_m = ground.west_m + (nx - 1) * step_m, ground.south_m + (ny - 1) * step_m
+    return float(np.hypot(max(-ground.west_m, east_m), max(-ground.south_m, north_m)))

@@ -10,10 +10,10 @@ import numpy as np
 
 from station.quantities import Air, Floats, WeatherLog
 from station.simulation.randomness import RandomFourierSeries, random_fourier, rng_for
-from station.simulation.scenario import Scenario
+from station.simulation.scenario import Mark, Scenario
 
 WAVELENGTH_UM = 1.064  # VZ-6000, Voordendag et al. (2023), section 2.2
-SCANNER_SETTING = Air(-2.0, 684.0, 28.0)  # Voordendag et al. (2023), section 3.1.2
+SCANNER_SETTING = Air(*Mark.scanner_setting)
 LAPSE_K_PER_M = 0.0065  # ICAO standard atmosphere
 SCALE_K_PER_M = 9.80665 * 0.0289644 / 8.314462  # g M / R: pressure falls by this over temperature
 EARTH_M = 6.371e6
@@ -33,6 +33,7 @@ class AirOfScan:
     by_azimuth: RandomFourierSeries  # added to it, by the ray's direction [rad, counter-clockwise from east]
     by_patch: Callable[[Floats], Floats] = np.zeros_like  # the same, with sharp edges
     wavelength_um: float = WAVELENGTH_UM
+    scanner_setting: Air = SCANNER_SETTING
 
     def coefficient_at(self, bearing_rad: Floats) -> Floats:
         """Return the coefficient of refraction in each direction, counter-clockwise from east [1]."""
@@ -71,9 +72,8 @@ def group_refractivity_ppm(
     return np.asarray(standard * (273.15 / kelvin) * (pressure_hpa / 1013.25) - 11.27 * vapour_hpa / kelvin)
 
 
-def assumed_refractivity_ppm(wavelength_um: float = WAVELENGTH_UM) -> float:
+def assumed_refractivity_ppm(wavelength_um: float = WAVELENGTH_UM, setting: Air = SCANNER_SETTING) -> float:
     """Return the refractivity with which the scanner converts travel times into ranges [ppm]."""
-    setting = SCANNER_SETTING
     air = (setting.temperature_c, setting.pressure_hpa, setting.humidity_pct)
     return float(group_refractivity_ppm(*air, wavelength_um))
 
@@ -108,7 +108,7 @@ def range_ratio(air: AirOfScan | None, rise_m: Floats) -> Floats:
     """
     if air is None:
         return np.ones_like(rise_m)
-    assumed_ppm = assumed_refractivity_ppm(air.wavelength_um)
+    assumed_ppm = assumed_refractivity_ppm(air.wavelength_um, air.scanner_setting)
     return (1 + 1e-6 * path_refractivity_ppm(air, rise_m)) / (1 + 1e-6 * assumed_ppm)
 
 
@@ -121,7 +121,7 @@ def weather(scenario: Scenario, time_utc_s: Floats) -> WeatherLog:
     return WeatherLog(
         time_utc_s,
         temperature_c=2.0 + 2.5 * daily + 1.2 * slow[0](series_s) + quick(series_s),
-        pressure_hpa=688.0 + 1.8 * slow[1](series_s),
+        pressure_hpa=scenario.mark.pressure_hpa + 1.8 * slow[1](series_s),
         humidity_pct=np.clip(62.0 - 10.0 * daily + 9.0 * slow[2](series_s), 5.0, 100.0),
     )
 
@@ -148,6 +148,7 @@ def air_of_scan(scenario: Scenario, scan: int) -> AirOfScan | None:
         random_fourier(rng, scenario.refraction_azimuth_sigma, np.radians(12), np.radians(90)),
         _refraction_patches(scenario, scan) if scenario.refraction_patch_sigma else np.zeros_like,
         scenario.wavelength_nm / 1000,
+        Air(*scenario.mark.scanner_setting),
     )
 
 

@@ -15,6 +15,7 @@ from scipy.ndimage import gaussian_filter
 from station.quantities import Floats
 from station.simulation.randomness import rng_for
 from station.simulation.scenario import Scenario
+from station.simulation.world.beach import bar
 from station.simulation.world.places import roof
 from station.simulation.world.terrain import NodeField, Valley, bumps
 
@@ -56,6 +57,7 @@ def surface_changes(scenario: Scenario, valley: Valley) -> tuple[SurfaceChange, 
             (_winter, scenario.winter_m),
             (_summer, scenario.summer_melt_m),
             (_creep, scenario.creep_m),
+            (_sand, scenario.sand_m),
         )
         if size
     )
@@ -178,6 +180,16 @@ def _creep(scenario: Scenario, valley: Valley) -> SurfaceChange:
     return SurfaceChange("creep", ground.with_nodes(pattern), amount)
 
 
+def _sand(scenario: Scenario, valley: Valley) -> SurfaceChange:
+    """Build the bar of a beach up after the scans of the reference."""
+    begin = scenario.reference_scans * scenario.interval_s / 3600
+
+    def amount(hours: float) -> float:
+        return scenario.sand_m * float(np.clip((hours - begin) / max(scenario.hours - begin, 1.0), 0, 1))
+
+    return SurfaceChange("sand", bar(valley), amount)
+
+
 def _rock(valley: Valley) -> Floats:
     """Return the share of rock on the nodes, zero on ice."""
     return np.asarray(np.clip(1 - 2 * valley.ice.node, 0, 1))
@@ -203,6 +215,8 @@ def _snow_share(scenario: Scenario, valley: Valley) -> Floats:
     down, across = np.gradient(valley.ground.node, valley.ground.step_m)
     slope_deg = np.degrees(np.arctan(np.hypot(across, down)))
     snow_share = np.clip((50 - slope_deg) / 10, 0, 1)
+    if scenario.kind != "valley":  # where it lay at the start
+        snow_share *= valley.ice.node
     if scenario.stable_ground == "poor":
         snow_share[roof(scenario, valley)] = 0
     return np.asarray(snow_share)

@@ -9,13 +9,14 @@ from itertools import pairwise
 import numpy as np
 
 from station.quantities import Bools, Floats, Grid
-from station.simulation.scenario import Scenario
+from station.simulation.scenario import Mark, Scenario
 from station.simulation.truth import TrueSurface, map_from_enu
+from station.simulation.world import beach, snow_slope
 from station.simulation.world.change import DEPOSIT, ON_STABLE_GROUND, SurfaceChange
 from station.simulation.world.places import RIDGE_DEG, RIDGE_FROM_M, ROCK_ICE, hut_cells, hut_m
 from station.simulation.world.terrain import Valley
 
-BLOCK_M = 50.0  # times size
+BLOCK_M = {"valley": 50.0, "mammoth": 3.0, "low-cost-snow": 3.0, "beach": 5.0}  # times size
 GLACIER = (-700.0, 1020.0, 280.0, 280.0)  # octagon on the ice: east, north, half axes, times size [m]
 ROCK = (-250.0, 1850.0, 100.0)  # square on the northern wall: east, north, half length, times size [m]
 
@@ -44,11 +45,11 @@ def stable_ground(
 
     "good": blocks all round. "poor": the blocks of a far ridge, and a hut.
     """
-    block = max(1, round(BLOCK_M * scenario.size / scenario.cell_m))
+    block = max(1, round(BLOCK_M[scenario.kind] * scenario.size / scenario.cell_m))
     whole = _whole_blocks(_bare_rock(changes, surface), block)
     if scenario.stable_ground == "good":
         return _merge_blocks("rock", whole, block)
-    ridge = _merge_blocks("far ridge", whole & _on_ridge(valley, surface, block), block)
+    ridge = _merge_blocks("far ridge", whole & _on_ridge(scenario, valley, surface, block), block)
     return [*ridge, _hut(scenario, valley, surface.grid)]
 
 
@@ -61,14 +62,25 @@ def inside_rectangles(grid: Grid, rectangles: list[Rectangle]) -> Bools:
 
 
 def areas(scenario: Scenario, valley: Valley) -> dict[str, Floats]:
-    """Return the rings of the areas to watch on the map (n, 2): glacier, avalanche deposit, rock."""
-    east, north, length, width = DEPOSIT
+    """Return the rings of the areas to watch on the map (n, 2).
+
+    In the valley they are glacier, avalanche deposit and rock.
+    """
+    if scenario.kind != "valley":
+        places_m = beach.AREAS_M if scenario.kind == "beach" else snow_slope.AREAS_M
+        return {
+            name: _on_map(scenario.mark, valley, _ring(east, north, half_x, half_y, corners=4))
+            for name, (east, north, half_x, half_y) in places_m.items()
+        }
+    mark, (east, north, length, width) = scenario.mark, DEPOSIT
     size_factor = scenario.avalanche_size
     corner = np.sqrt(2) * ROCK[2]
     return {
-        "glacier": _on_map(valley, _ring(*GLACIER, corners=8)),
-        "deposit": _on_map(valley, _ring(east, north, size_factor * length, size_factor * width, corners=16)),
-        "rock": _on_map(valley, _ring(ROCK[0], ROCK[1], corner, corner, corners=4)),
+        "glacier": _on_map(mark, valley, _ring(*GLACIER, corners=8)),
+        "deposit": _on_map(
+            mark, valley, _ring(east, north, size_factor * length, size_factor * width, corners=16)
+        ),
+        "rock": _on_map(mark, valley, _ring(ROCK[0], ROCK[1], corner, corner, corners=4)),
     }
 
 
@@ -87,10 +99,10 @@ def _whole_blocks(suitable: Bools, block: int) -> Bools:
     return np.asarray(cells.all(axis=(1, 3)))
 
 
-def _on_ridge(valley: Valley, surface: TrueSurface, block: int) -> Bools:
+def _on_ridge(scenario: Scenario, valley: Valley, surface: TrueSurface, block: int) -> Bools:
     """Return a mask of the blocks entirely on the far ridge (blocks down, blocks across)."""
     grid = surface.grid
-    east_m, north_m, _ = map_from_enu().transform(
+    east_m, north_m, _ = map_from_enu(scenario.mark).transform(
         *np.meshgrid(grid.x_m, grid.y_m), surface.elevation_m, direction="INVERSE"
     )
     bearing_deg = np.degrees(np.arctan2(north_m, east_m))
@@ -114,7 +126,9 @@ def _runs(line: Bools) -> Iterator[tuple[int, int]]:
 
 
 def _hut(scenario: Scenario, valley: Valley, grid: Grid) -> Rectangle:
-    ((easting_m, northing_m),) = _on_map(valley, np.array([hut_m(scenario, valley)]) / valley.size)
+    ((easting_m, northing_m),) = _on_map(
+        scenario.mark, valley, np.array([hut_m(scenario, valley)]) / valley.size
+    )
     cells = hut_cells(scenario)
     row = round((grid.north_m - northing_m) / grid.cell_m - cells / 2)
     column = round((easting_m - grid.west_m) / grid.cell_m - cells / 2)
@@ -127,8 +141,10 @@ def _ring(east_m: float, north_m: float, half_x_m: float, half_y_m: float, corne
     return np.stack((east_m + half_x_m * np.cos(turn_rad), north_m + half_y_m * np.sin(turn_rad)), axis=1)
 
 
-def _on_map(valley: Valley, at_full_size_m: Floats) -> Floats:
+def _on_map(mark: Mark, valley: Valley, at_full_size_m: Floats) -> Floats:
     """Return easting and northing of places on the ground, given east and north at full size (n, 2)."""
     east_m, north_m = valley.size * at_full_size_m.T
-    easting_m, northing_m, _ = map_from_enu().transform(east_m, north_m, valley.ground.at(east_m, north_m))
+    easting_m, northing_m, _ = map_from_enu(mark).transform(
+        east_m, north_m, valley.ground.at(east_m, north_m)
+    )
     return np.stack((easting_m, northing_m), axis=1)

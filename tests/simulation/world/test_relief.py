@@ -97,7 +97,7 @@ def test_same_seed_gives_the_same_relief(stations):
     [
         ({"airborne_share": 1.5}, "0 to 1"),
         ({"line_jitter_freedom": 2.0}, "above 2"),
-        ({"wavelength_nm": 905}, "1064, 1550"),
+        ({"wavelength_nm": 532}, "905, 1064, 1550"),
     ],
 )
 def test_impossible_magnitudes_raise_config_error(settings, message):

@@ -14,7 +14,7 @@ from station import cli
 from station.config import read_site
 from station.errors import ScanError, StationError
 from station.operations.batch import process_scans
-from station.operations.calibration_report import (
+from station.operations.reports.calibration_report import (
     _site_file_keys,
     calibration_report,
     format_report,

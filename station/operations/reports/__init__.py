@@ -1,0 +1,1 @@
+"""Reports on how good the results of a station are, and why."""

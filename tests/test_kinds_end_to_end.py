@@ -1,0 +1,86 @@
+"""A station of each kind: its site file is clean, and its numbers agree with the truth."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import xarray as xr
+
+import station
+from station.config import read_site
+from station.operations.batch import process_scans
+from station.operations.site_check import site_findings
+from station.processing.epoch_recorder import page_folder
+from station.products.area_tables import area_cells
+from station.science.geometry.robust_statistics import nmad
+from station.simulation.kinds import beach, low_cost_snow
+from station.simulation.station import simulate
+
+pytestmark = pytest.mark.integration
+
+SMALL = {"cell_m": 4.0, "terrain_step_m": 2.0, "reference_scans": 2}
+SCENARIOS = {
+    "low-cost-snow": replace(
+        low_cost_snow(hours=1), interval_s=900.0, lines=10, shots_per_line=2000, **SMALL
+    ),
+    "beach": replace(beach(hours=4), lines=150, shots_per_line=150, **SMALL),
+}
+
+# Limits of z of cells and areas. On calm sand sigma is too large (accuracy.md, known limits): a change that
+# all stable ground shares cannot be excluded, and cells at the edge of stone count for the noise of all.
+LIMITS = {
+    "low-cost-snow": ((0.8, 1.25), (0.3, 1.6)),
+    "beach": ((0.4, 1.25), (0.2, 1.6)),
+}
+
+
+@pytest.fixture(scope="module", params=SCENARIOS)
+def run(request, tmp_path_factory):
+    """Return site and truth of a processed station."""
+    folder = tmp_path_factory.mktemp(request.param) / "station"
+    simulate(folder, SCENARIOS[request.param])
+    findings = site_findings(folder / "site.toml")
+    faults = [f for f in findings if f["level"] != "ok" and f["what"] != "rights"]  # those of root
+    site = read_site(folder / "site.toml")
+    assert process_scans(site, sorted(site.scans.inbox.glob("*.laz")), lambda _: None) == 0
+    with xr.open_dataset(folder / "truth.nc") as truth:
+        return site, truth.load(), faults
+
+
+def errors(site, truth):
+    """Return error and sigma of the change in the scans after the reference (n, ny, nx)."""
+    series, first = station.open(site.path), site.reference.scans
+    true_m = truth["change"].to_numpy()
+    true_m = true_m - true_m[:first].mean(axis=0)
+    error_m = series["elevation_change"].to_numpy() - true_m
+    return error_m[first:], series["elevation_change_uncertainty"].to_numpy()[first:]
+
+
+def test_check_finds_nothing_and_the_page_is_there(run):
+    site, _, faults = run
+    assert not faults
+    assert (page_folder(site) / "index.html").is_file()
+
+
+def test_cells_are_as_far_from_the_truth_as_sigma_says(run):
+    error_m, sigma_m = errors(*run[:2])
+    known = np.isfinite(error_m)
+    assert known.mean() > 0.15
+    low, high = LIMITS[run[0].station.id][0]
+    assert low < nmad((error_m / sigma_m)[known]) < high
+
+
+def test_areas_are_as_far_from_the_truth_as_sigma_says(run):
+    site, truth, _ = run
+    error_m, _ = errors(site, truth)
+    z = []
+    for cells in area_cells(site, None).values():
+        for number, epoch_m in enumerate(error_m):
+            inside = cells & np.isfinite(epoch_m)
+            if inside.sum() > 0.5 * cells.sum():
+                weights = inside / inside.sum()
+                sigma_m = station.variance(site.path, weights, site.reference.scans + number) ** 0.5
+                z.append(np.sum(weights * np.nan_to_num(epoch_m)) / sigma_m)
+    assert len(z) >= 2
+    low, high = LIMITS[site.station.id][1]
+    assert low < np.sqrt(np.mean(np.square(z))) < high
