@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import Any
 
 import h5py
-import jinja2
 import numpy as np
 
 from station._version import __version__
@@ -29,6 +28,7 @@ from station.monitoring.alarm_rules import change_alarms
 from station.monitoring.area_curves import read_curves
 from station.operations.batch import process_scans
 from station.operations.reports.calibration_report import sigma_report
+from station.operations.reports.report_pages import write_page
 from station.processing.scans.scan_files import inbox_scans
 from station.processing.site_files import series_for
 from station.processing.workers import fork_server, isolation
@@ -44,7 +44,6 @@ Score = dict[str, Any]
 Errors = Mapping[str, tuple[Ints, Floats]]  # cells and their change [m], by scan
 Report = Callable[[Entry], None]
 
-ASSETS = Path(__file__).parent / "assets"
 OWN, OTHER = "own", "registration"  # folders of the two stores
 
 
@@ -254,15 +253,8 @@ def write_score(result: object, out: Path) -> list[Path]:
 
     Raises StoreError if they cannot be written.
     """
-    templates = jinja2.Environment(
-        loader=jinja2.FileSystemLoader(ASSETS), autoescape=True, undefined=jinja2.StrictUndefined,
-        trim_blocks=True, lstrip_blocks=True,
-    )  # fmt: skip
-    texts = {
-        "score.html": templates.get_template("score.html").render(score=result),
-        "score.json": json.dumps(result, indent=2) + "\n",
-    }
-    for name, text in texts.items():
-        with atomic_write(out / name) as tmp_path:
-            tmp_path.write_text(text, encoding="utf-8")
-    return [out / name for name in texts]
+    paths = [out / "score.html", out / "score.json"]
+    write_page(paths[0], "score.html", score=result)
+    with atomic_write(paths[1]) as tmp_path:
+        tmp_path.write_text(json.dumps(result, indent=2) + "\n", encoding="utf-8")
+    return paths
