@@ -67,12 +67,13 @@ def large_station(folder: Path, points: int, *, scans: int = 1, size: float = 1.
         for path in (laz, laz.with_name(f"{laz.stem}-incl.txt")):
             if not (inbox / path.name).exists():
                 os.link(path, inbox / path.name)
-    files.write_sop(home / "sop.dat", motion.sop(scenario))
+    files.write_matrix(home / "sop.dat", motion.sop(scenario), "scanner's frame to east-north-up at the mark")
     files.write_weather(home / "weather.dat", _weather(scenario))
-    files.write_polygons(home / "stable.geojson", _squares(size, STABLE_M * size, 500.0 * size))
+    crs = scenario.mark.crs
+    files.write_polygons(home / "stable.geojson", _squares(size, STABLE_M * size, 500.0 * size), crs)
     areas = _squares(size, 200.0 * size, 1000.0 * size)
-    files.write_polygons(home / "areas.geojson", dict(list(areas.items())[8:11]))
-    files.write_site(home / "site.toml", scenario, grid_of(scenario))
+    files.write_polygons(home / "areas.geojson", dict(list(areas.items())[8:11]), crs)
+    files.write_site(home, scenario, grid_of(scenario))
     return home / "site.toml"
 
 

@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import Any
 
 import h5py
-import jinja2
 import numpy as np
 
 from station._version import __version__
@@ -29,6 +28,7 @@ from station.monitoring.alarm_rules import change_alarms
 from station.monitoring.area_curves import read_curves
 from station.operations.batch import process_scans
 from station.operations.reports.calibration_report import sigma_report
+from station.operations.reports.report_pages import write_page
 from station.processing.scans.scan_files import inbox_scans
 from station.processing.site_files import series_for
 from station.processing.workers import fork_server, isolation
@@ -37,13 +37,13 @@ from station.queries.epoch_cells import read_window
 from station.queries.stable_ground import sample_epochs
 from station.science.adjustment import ground_classes
 from station.science.analysis import calibration
+from station.science.geometry.robust_statistics import MEDIAN_ABSOLUTE_NORMAL
 from station.sections.results import ChangeAlarm, ProductsSection, RetentionSection
 
 Score = dict[str, Any]
 Errors = Mapping[str, tuple[Ints, Floats]]  # cells and their change [m], by scan
 Report = Callable[[Entry], None]
 
-ASSETS = Path(__file__).parent / "assets"
 OWN, OTHER = "own", "registration"  # folders of the two stores
 
 
@@ -68,8 +68,9 @@ def score(site: Site, out: Path, max_epochs: int, report: Report) -> Score:
     _processed(other, list(files), report)
     gain: list[Score] = []
     if other_series.path.is_file():
-        errors = [withheld_errors(stored, max_epochs) for stored in (series, other_series)]
-        gain = gain_by_scale(errors[0], errors[1], series.grid)
+        errors = withheld_errors(series, max_epochs)
+        other_errors = withheld_errors(other_series, max_epochs, adjusted=False)
+        gain = gain_by_scale(errors, other_errors, series.grid)
     return {
         "station": site.station.name or site.station.id,
         "version": __version__,
@@ -170,8 +171,13 @@ def _verdicts(entries: Iterable[Entry]) -> dict[str, int]:
     return dict(Counter(words))
 
 
-def withheld_errors(series: Series, max_epochs: int) -> dict[str, tuple[Ints, Floats]]:
-    """Return the change of withheld stable ground in the scans after the reference: cells, change [m]."""
+def withheld_errors(
+    series: Series, max_epochs: int, *, adjusted: bool = True
+) -> dict[str, tuple[Ints, Floats]]:
+    """Return the change of withheld ground in the scans after the reference: cells, change [m].
+
+    Only of stable ground if the scans are `adjusted`; others do not tell which ground is stable.
+    """
     grid, reference = series.grid, read_reference(series)
     holdout = ground_classes.is_holdout(grid.x_m[None, :], grid.y_m[:, None])
     errors = {}
@@ -180,7 +186,9 @@ def withheld_errors(series: Series, max_epochs: int) -> dict[str, tuple[Ints, Fl
             scan_id = read_text(file, "scan_id", epoch.index)
             if reference is not None and scan_id in reference.scan_ids:
                 continue
-            withheld = holdout & ((file["quality"][epoch.index] & Quality.STABLE_GROUND) > 0)
+            withheld = holdout
+            if adjusted:
+                withheld = holdout & ((file["quality"][epoch.index] & Quality.STABLE_GROUND) > 0)
             change_m = read_window(file, CHANGE, epoch.index, (slice(None), slice(None)))
         cell = np.flatnonzero(withheld & np.isfinite(change_m))
         errors[scan_id] = cell, change_m.ravel()[cell].astype(np.float64)
@@ -188,9 +196,10 @@ def withheld_errors(series: Series, max_epochs: int) -> dict[str, tuple[Ints, Fl
 
 
 def gain_by_scale(own: Errors, other: Errors, grid: Grid) -> list[dict[str, Any]]:
-    """Return the rms error of withheld ground in both results, on the cells common to both, and the gain.
+    """Return the size of the errors of withheld ground in both results, on the cells of both, and the gain.
 
-    By scale: a cell, blocks of 10 m and 100 m, all of it.
+    By scale: a cell, blocks of 10 m and 100 m, all of it. The size is the median of the absolute errors, as
+    the standard deviation of normal ones: a few cells at edges have gross errors in both.
     """
     pairs: dict[str, list[Floats]] = {}
     for scan in own.keys() & other.keys():
@@ -207,7 +216,7 @@ def gain_by_scale(own: Errors, other: Errors, grid: Grid) -> list[dict[str, Any]
         pairs.setdefault("all", []).append(errors_m.mean(axis=0, keepdims=True))
     table = []
     for scale, errors in pairs.items():
-        own_m, other_m = np.sqrt(np.mean(np.concatenate(errors) ** 2, axis=0)).tolist()
+        own_m, other_m = (np.median(np.abs(np.concatenate(errors)), axis=0) / MEDIAN_ABSOLUTE_NORMAL).tolist()
         values = sum(len(part) for part in errors)
         table.append(
             {"scale": scale, "values": values, "own_m": own_m, "other_m": other_m, "gain": other_m / own_m}
@@ -244,15 +253,8 @@ def write_score(result: object, out: Path) -> list[Path]:
 
     Raises StoreError if they cannot be written.
     """
-    templates = jinja2.Environment(
-        loader=jinja2.FileSystemLoader(ASSETS), autoescape=True, undefined=jinja2.StrictUndefined,
-        trim_blocks=True, lstrip_blocks=True,
-    )  # fmt: skip
-    texts = {
-        "score.html": templates.get_template("score.html").render(score=result),
-        "score.json": json.dumps(result, indent=2) + "\n",
-    }
-    for name, text in texts.items():
-        with atomic_write(out / name) as tmp_path:
-            tmp_path.write_text(text, encoding="utf-8")
-    return [out / name for name in texts]
+    paths = [out / "score.html", out / "score.json"]
+    write_page(paths[0], "score.html", score=result)
+    with atomic_write(paths[1]) as tmp_path:
+        tmp_path.write_text(json.dumps(result, indent=2) + "\n", encoding="utf-8")
+    return paths

@@ -11,13 +11,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import jinja2
 import numpy as np
 
-from station.archive.atomic_files import atomic_write
 from station.config import Site
 from station.errors import ConfigError
-from station.operations.reports.score import ASSETS
+from station.operations.reports.report_pages import write_page
 from station.processing.site_files import load_areas, series_for
 from station.processing.workers import isolation
 from station.quantities import Bools, SharedParameters
@@ -172,10 +170,4 @@ def format_budget(budget: dict[str, Any]) -> str:
 
 def write_budget(budget: dict[str, Any], path: Path) -> None:
     """Write diagram and table as one HTML page; raise StoreError if that fails."""
-    templates = jinja2.Environment(
-        loader=jinja2.FileSystemLoader(ASSETS), autoescape=True, undefined=jinja2.StrictUndefined,
-        trim_blocks=True, lstrip_blocks=True,
-    )  # fmt: skip
-    page = templates.get_template("budget.html").render(budget=budget)
-    with atomic_write(path) as tmp_path:
-        tmp_path.write_text(page, encoding="utf-8")
+    write_page(path, "budget.html", budget=budget)

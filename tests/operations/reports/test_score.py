@@ -23,18 +23,18 @@ def test_gain_is_that_of_the_cells_common_to_both():
     }
     table = {row["scale"]: row for row in gain_by_scale(own, other, GRID)}
     assert table["cell"]["values"] == 2
-    assert table["cell"]["own_m"] == pytest.approx(np.sqrt((0.03**2 + 0.02**2) / 2))
+    assert table["cell"]["own_m"] == pytest.approx(0.025 / 0.67449, rel=1e-4)  # of a normal distribution
     assert table["cell"]["gain"] == pytest.approx(2.0)
     assert table["10 m"]["values"] == 2
-    assert table["all"]["own_m"] == pytest.approx(0.005)
-    assert table["all"]["other_m"] == pytest.approx(0.01)
+    assert table["all"]["own_m"] == pytest.approx(0.005 / 0.67449, rel=1e-4)
+    assert table["all"]["other_m"] == pytest.approx(0.01 / 0.67449, rel=1e-4)
 
 
 def test_blocks_are_means():
     own = {"a": (np.array([0, 1]), np.array([0.03, -0.01]))}
     other = {"a": (np.array([0, 1]), np.array([0.05, 0.03]))}
     table = {row["scale"]: row for row in gain_by_scale(own, other, GRID)}
-    assert table["10 m"]["own_m"] == pytest.approx(0.01)
+    assert table["10 m"]["own_m"] == pytest.approx(0.01 / 0.67449, rel=1e-4)
     assert table["10 m"]["gain"] == pytest.approx(4.0)
 
 
@@ -54,6 +54,7 @@ def test_an_archive_is_scored_and_not_touched(tmp_path):
     score = json.loads((out / "score.json").read_text(encoding="utf-8"))
     assert sum(score["scans"].values()) == 3
     assert score["registration"] == "SOP and log"
+    assert {"cell", "all"} <= {row["scale"] for row in score["gain"]}  # unadjusted scans have it, too
     assert 0.1 < score["cpu_s_per_scan"] < 60
     page = (out / "score.html").read_text(encoding="utf-8")
     assert str(tmp_path) not in page
