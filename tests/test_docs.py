@@ -17,8 +17,7 @@ from station.sections.site_file import SiteFile
 ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"
 README = (ROOT / "README.md").read_text(encoding="utf-8")
-EXAMPLES = (*(ROOT / "config").glob("*.toml"), DOCS / "how-to" / "products.md")
-SITES = "\n".join(path.read_text(encoding="utf-8") for path in EXAMPLES)
+SITES = "\n".join(path.read_text(encoding="utf-8") for path in (ROOT / "config").glob("*.toml"))
 
 
 def commands():
