@@ -32,7 +32,7 @@ def low_cost_snow(hours: int = 24, seed: int = 1) -> Scenario:
         azimuth_deg=(55.0, 125.0),
         elevation_deg=(-33.0, 37.0),
         range_max_m=450.0,
-        faintest=0.56,  # 0.1 at 190 m
+        faintest_reflectance=0.56,  # 0.1 at 190 m
         reference_scans=reference_scans,
         mount_roll_deg=0.0,
         mount_pitch_deg=0.0,
@@ -106,7 +106,7 @@ def beach(hours: int = 24, seed: int = 1) -> Scenario:
         elevation_deg=(-48.0, -4.0),
         incidence_max_deg=88.0,
         range_max_m=2000.0,
-        faintest=0.6,
+        faintest_reflectance=0.6,
         reference_scans=min(13, max(1, hours // 2)),
         mount_heading_deg=0.0,
         mount_position_m=(0.0, 0.0, 3.0),
@@ -115,7 +115,7 @@ def beach(hours: int = 24, seed: int = 1) -> Scenario:
         brightness="reflectance",
         wavelength_nm=1550,
         tide_m=0.9,
-        sand_m=0.3,
+        bar_growth_m=0.3,
     )
 
 

@@ -32,7 +32,7 @@ ERRORS = (
     "range_bias_m", "range_noise_m", "beam_divergence_mrad", "echo_loss", "airborne_share", "airborne_clouds",
     "log_noise_deg", "log_bias_deg", "log_cyclic_deg", "log_cyclic_change", "log_clock_s", "log_fault",
     "melt_m_per_h", "snowfall_m", "avalanche_m", "settling_m_per_h", "winter_m", "summer_melt_m",
-    "heave_m", "creep_m", "sand_m",
+    "heave_m", "creep_m", "bar_growth_m",
 )  # fmt: skip
 
 
@@ -91,7 +91,7 @@ class Scenario:
     elevation_deg: tuple[float, float] = (-31.0, 9.0)  # lowest and highest, from the scanner's xy plane
     incidence_max_deg: float = 85.0  # no echo beyond
     range_max_m: float = 6000.0
-    faintest: float = 0.0  # reflectance that, square to the beam, just gives an echo at range_max_m
+    faintest_reflectance: float = 0.0  # that just gives an echo, square to the beam, at range_max_m
     reference_scans: int = 8
 
     # the mount, all of it contained in the SOP
@@ -176,7 +176,7 @@ class Scenario:
     heave_m: float = 0.0  # of rock: half of its variance over the day, half random from scan to scan
     creep_m: float = 0.0  # displacement of part of the rock over the whole series
     tide_m: float = 0.0  # amplitude of the tide at a beach
-    sand_m: float = 0.0  # height of the bar that grows on a beach over the whole series
+    bar_growth_m: float = 0.0  # height of the bar that grows on a beach over the whole series
 
     # known stable ground: rock all round, or only a far ridge and a hut that snow never covers
     stable_ground: Literal["good", "poor"] = "good"

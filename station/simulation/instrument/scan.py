@@ -170,7 +170,7 @@ def _simulate_lines(
     true_m = np.stack((hits.east_m, hits.north_m, hits.up_m), axis=1)
     rock, white = _reflectances(scenario)
     intensity = (rock + (white - rock) * cover.at(hits.east_m, hits.north_m)) * cos_incidence
-    echo &= intensity * (scenario.range_max_m / range_m) ** 2 > scenario.faintest
+    echo &= intensity * (scenario.range_max_m / range_m) ** 2 > scenario.faintest_reflectance
     echo &= _detected_in_fog(scenario, conditions, intensity, range_m, receiver_rng)
     airborne = np.zeros(len(line), dtype=np.bool_)
     if scenario.airborne_share or conditions.cloud:

@@ -57,7 +57,7 @@ def surface_changes(scenario: Scenario, valley: Valley) -> tuple[SurfaceChange, 
             (_winter, scenario.winter_m),
             (_summer, scenario.summer_melt_m),
             (_creep, scenario.creep_m),
-            (_sand, scenario.sand_m),
+            (_sand, scenario.bar_growth_m),
         )
         if size
     )
@@ -185,7 +185,8 @@ def _sand(scenario: Scenario, valley: Valley) -> SurfaceChange:
     begin = scenario.reference_scans * scenario.interval_s / 3600
 
     def amount(hours: float) -> float:
-        return scenario.sand_m * float(np.clip((hours - begin) / max(scenario.hours - begin, 1.0), 0, 1))
+        share = (hours - begin) / max(scenario.hours - begin, 1.0)
+        return scenario.bar_growth_m * float(np.clip(share, 0, 1))
 
     return SurfaceChange("sand", bar(valley), amount)
 
