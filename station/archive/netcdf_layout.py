@@ -51,6 +51,12 @@ EXTENTS = {  # variables: axis in the names of ACDD's attributes, attributes of 
         },
     ),
 }
+TIME_ATTRS = {
+    "standard_name": "time",
+    "units": "seconds since 1970-01-01 00:00:00",
+    "units_metadata": "leap_seconds: none",
+    "calendar": "standard",
+}
 RENAMED_PARAMETERS = {"refraction_moving": "refraction_ice"}  # older names of shared parameters
 
 
@@ -199,17 +205,7 @@ def create_time_axis(file: netCDF4.Dataset, times: int) -> None:
     """Create the time coordinate and its bounds, chunked for a file of `times` epochs."""
     chunk_times = min(times, TIMES_PER_CHUNK)
     time = file.createVariable("time", "f8", ("time",), chunksizes=(chunk_times,))
-    time.setncatts(
-        {
-            "standard_name": "time",
-            "long_name": "middle of the scan",
-            "units": "seconds since 1970-01-01 00:00:00",
-            "units_metadata": "leap_seconds: none",
-            "calendar": "standard",
-            "axis": "T",
-            "bounds": "time_bnds",
-        }
-    )
+    time.setncatts(TIME_ATTRS | {"long_name": "middle of the scan", "axis": "T", "bounds": "time_bnds"})
     file.createVariable("time_bnds", "f8", ("time", "bnds"), chunksizes=(chunk_times, 2))
 
 

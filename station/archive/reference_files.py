@@ -18,6 +18,7 @@ from station.archive.atomic_files import atomic_write
 from station.archive.discovery import NO_HEIGHTS, time_coverage
 from station.archive.netcdf_layout import (
     RENAMED_PARAMETERS,
+    TIME_ATTRS,
     Series,
     create_file,
     create_variable,
@@ -198,6 +199,10 @@ def _write(
             [float(scan[name]) for scan in provenance.scan_provenance] for name in ("start_s", "end_s")
         )
         file.setncatts(time_coverage(min(starts_s), max(ends_s)))
+        file.createDimension("scan", len(starts_s))
+        time = file.createVariable("scan_time", "f8", ("scan",))
+        time.setncatts(TIME_ATTRS | {"long_name": "middle of each scan of the reference"})
+        time[:] = (np.array(starts_s) + ends_s) / 2
     file.setncatts(
         {f"{COMPONENT_PREFIX}{name}": value for name, value in asdict(reference.components).items()}
     )

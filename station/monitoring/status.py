@@ -21,7 +21,11 @@ if TYPE_CHECKING:
     from station.config import Site
 
 MAX_LISTED = 50  # scans of a kind, in the text
-RENEWALS = {"mirror": "the mirror is", "levels": "the files of levels are"}  # in the background, by name
+RENEWALS = {  # in the background, by name
+    "mirror": "the mirror is",
+    "levels": "the files of levels are",
+    "derived": "the files of areas, products, events and blocks are",
+}
 Status = dict[str, Any]  # printed by `station status --json`
 
 
@@ -110,7 +114,7 @@ def fault_file(site: Site, name: str) -> Path:
 
 def _renewal_fault(site: Site, name: str) -> str:
     """Return why the service could not renew some files; '' if it could, or is not to."""
-    is_wanted = {"mirror": site.mirror is not None, "levels": site.products.levels}[name]
+    is_wanted = {"mirror": site.mirror is not None, "levels": site.products.levels}.get(name, True)
     try:
         fault = fault_file(site, name).read_text(encoding="utf-8") if is_wanted else ""
     except (OSError, ValueError):

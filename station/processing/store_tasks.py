@@ -6,7 +6,9 @@ import os
 from collections.abc import Mapping
 from contextlib import suppress
 from datetime import UTC, datetime
+from itertools import count
 from pathlib import Path
+from typing import NamedTuple
 
 from station.archive import epochs
 from station.archive.areas import update_areas
@@ -36,6 +38,18 @@ MAX_SOURCES = 250
 MAX_STORE_TASK_S = 12 * 3600.0  # verifying terabytes takes hours; a task beyond this is in an endless loop
 LOWEST_PRIORITY = 19  # nice value
 MAX_UNCOMPACTED = 48  # of closed days, before they are compacted during a backlog
+MAX_COMPUTED = 100  # entries of derived files and searches for events, for which the next scan waits
+
+
+class SeriesUpdate(NamedTuple):
+    """What an update of the series between two scans leaves to do."""
+
+    compactable: int  # epochs
+    is_behind: bool  # derived files lack so many epochs that the background completes them
+
+
+class _TooManyError(Exception):
+    """Derived files lack more epochs than the next scan can wait for."""
 
 
 def update_series(site: Site, progress: Progress) -> int:
@@ -43,12 +57,54 @@ def update_series(site: Site, progress: Progress) -> int:
 
     If there are too many source files, epochs are compacted first.
     """
+    _update_virtual(site, progress)
+    _update_derived(site, progress)
+    return compaction.count_compactable(series_for(site))
+
+
+def update_between_scans(site: Site, progress: Progress) -> SeriesUpdate:
+    """Do as `update_series`, but leave derived files that lack many epochs to `renew_derived`.
+
+    Otherwise scans would wait for hours when a file of a year is computed again.
+    """
+    computed = count(1)
+
+    def limited() -> None:
+        progress()
+        if next(computed) > MAX_COMPUTED:
+            raise _TooManyError
+
+    _update_virtual(site, progress)
+    is_behind = False
+    try:
+        _update_derived(site, limited)
+    except _TooManyError:
+        is_behind = True
+    return SeriesUpdate(compaction.count_compactable(series_for(site)), is_behind)
+
+
+def renew_derived(site: Site, progress: Progress) -> str:
+    """Bring the files derived from the epochs up to date; return why they could not be, or ''."""
+    try:
+        _update_derived(site, progress)
+    except StoreError as error:
+        return str(error)
+    return ""
+
+
+def _update_virtual(site: Site, progress: Progress) -> None:
+    """Update `series.nc`."""
     series = series_for(site)
     repair_reference_link(series)
     if source_count(series) > MAX_SOURCES:
         compaction.compact(series, compaction.latest_start(series), progress)
     build_series(series)
     progress()
+
+
+def _update_derived(site: Site, progress: Progress) -> None:
+    """Update the files of areas, products, events and blocks; `progress` is called for each epoch."""
+    series = series_for(site)
     try:
         update_areas(series, load_areas(site), Aggregates(series), progress, load_area_polygons(site))
         products, _ = load_products(site)  # what is wrong with the others is reported with the input files
@@ -58,7 +114,6 @@ def update_series(site: Site, progress: Progress) -> int:
         update_boxes(series, blocks, progress, needed)
     except (OSError, RuntimeError) as error:
         raise StoreError(f"{series.folder}: an epoch is damaged: {error}") from error
-    return compaction.count_compactable(series)
 
 
 def renew_products(site: Site) -> list[str]:

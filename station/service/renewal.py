@@ -26,16 +26,16 @@ RenewalTask = Callable[[Site, Progress], str]  # returns why files could not be 
 class Renewal:
     """A thread that waits for the process of a renewal; one that hangs delays no scan.
 
-    A fault is logged once, and shown by `station status` until it is gone.
+    A fault is logged once, and shown by `station status` until it is gone. `is_due`: renew at the start.
     """
 
-    def __init__(self, site: Site, name: str, task: RenewalTask, host: Host) -> None:
+    def __init__(self, site: Site, name: str, task: RenewalTask, host: Host, *, is_due: bool = True) -> None:
         self._site, self._name, self._task = site, name, task
         self._stop = threading.Event()
         self._tasks = host.tasks
         self._executor = host.make_executor()
         self._future: Future[str] | None = None
-        self._is_due, self._fault = True, ""
+        self._is_due, self._fault = is_due or fault_file(site, name).is_file(), ""
 
     def require(self) -> None:
         """Renew the files when no scan waits: the series has changed."""

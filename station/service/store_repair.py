@@ -30,7 +30,6 @@ from station.processing.provenance import stored_epochs
 from station.processing.scanner_pose import NO_SOP
 from station.processing.scans.scan_files import ScanFinder
 from station.processing.site_files import series_for
-from station.processing.store_tasks import update_series
 from station.science.geometry.pose import horizontal_crs, is_same_map
 
 log = logging.getLogger("station")
@@ -45,13 +44,19 @@ class RunTask(Protocol):
 
 
 class StoreRepair:
-    """Finds and repairs what is damaged or missing in the store; the tasks run in a worker process."""
+    """Finds and repairs what is damaged or missing in the store; the tasks run in a worker process.
 
-    def __init__(self, site: Site, journal: Journal, run: RunTask, clock: Clock) -> None:
+    `update_series` brings the series up to date.
+    """
+
+    def __init__(
+        self, site: Site, journal: Journal, run: RunTask, update_series: Callable[[], object], clock: Clock
+    ) -> None:
         self._site = site
         self._series = series_for(site)
         self._journal = journal
         self._run = run
+        self._update_series = update_series
         self._clock = clock
         self._last_verified_s = -math.inf
 
@@ -66,7 +71,7 @@ class StoreRepair:
         self._import_unjournaled()
         self._requeue_missing()
         if holds_epochs(self._series):
-            self.with_repair(update_series)
+            self._update_series()
 
     def add_checksums(self) -> None:
         """Record the checksums of files that have none; quarantine files that cannot be read."""

@@ -31,7 +31,9 @@ from station.processing.store_tasks import (
     Checksums,
     compact_epochs,
     delete_expired,
+    renew_derived,
     renew_levels,
+    update_between_scans,
     update_series,
     update_stored_levels,
 )
@@ -89,7 +91,7 @@ class Worker:
         self._processed: dict[str, ScanFile] = {}
         self._reported_outdated = 0
         self._reported_faults: tuple[str, ...] = ()
-        self.store = StoreRepair(site, journal, self.run, self._host.clock)
+        self.store = StoreRepair(site, journal, self.run, self._update_series, self._host.clock)
         self._reference = ReferenceBuilder(site, journal, self.run, self.store, self._processed)
         self._compaction = BackgroundCompaction(site, on_compacted, self._host)
         self._renewals = [
@@ -100,6 +102,7 @@ class Worker:
             )
             if is_wanted
         ]
+        self._catch_up = Renewal(site, "derived", renew_derived, self._host, is_due=False)
 
     def process(self, scan: ScanFile, *, ahead: bool = False) -> bool:
         """Measure and store a scan, record it in journal and log; return True if it is stored.
@@ -198,12 +201,12 @@ class Worker:
     def close(self) -> None:
         """Stop what runs in the background."""
         self._compaction.close()
-        for renewal in self._renewals:
+        for renewal in (*self._renewals, self._catch_up):
             renewal.close()
 
     def proceed_with_renewals(self) -> None:
-        """Renew in the background what follows the series: the mirror, the files of levels."""
-        for renewal in self._renewals:
+        """Renew in the background what follows the series: the mirror, levels, derived files far behind."""
+        for renewal in (*self._renewals, self._catch_up):
             renewal.proceed()
 
     def finish_levels(self, *, verify: bool) -> None:
@@ -216,9 +219,14 @@ class Worker:
 
     def _update_series(self) -> int:
         """Update the series and what is derived from it; return the number of epochs to compact."""
-        uncompacted = self.store.with_repair(update_series)
+        if self._in_service:
+            uncompacted, is_behind = self.store.with_repair(update_between_scans)
+        else:
+            uncompacted, is_behind = self.store.with_repair(update_series), False
         for renewal in self._renewals:
             renewal.require()
+        if is_behind:
+            self._catch_up.require()
         return uncompacted
 
     def _record_compacted(self, checksums: Checksums) -> None:

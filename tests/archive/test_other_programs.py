@@ -268,7 +268,21 @@ def test_data_discovery_checker_recommends_nothing(box_files, series, tmp_path):
         described, {"all": np.ones(series.grid.shape, bool)}, ConstantAggregator(), lambda: None
     )
     epoch_path = next((series.folder / "epochs").rglob("*.nc"))
-    paths = *box_files, areas, series.path, series.processing_path, epoch_path
+    surface = Reference.from_elevation(series.grid, "2", np.full(series.grid.shape, 2900.0))
+    scans = tuple(
+        {
+            "scan_id": f'"{hour}"',
+            "start_s": str(START_S + 3600 * hour),
+            "end_s": str(START_S + 3600 * hour + 900),
+        }
+        for hour in range(2)
+    )
+    provenance = reference_files.ReferenceProvenance("2", scan_provenance=scans)
+    reference_files.write_reference(described, surface, provenance)
+    reference = reference_files.version_path(series, "2")
+    with xr.open_dataset(reference) as ds:
+        assert ds.scan_time.dt.minute.to_numpy().tolist() == [7, 7]  # of scans of 15 minutes
+    paths = *box_files, areas, reference, series.path, series.processing_path, epoch_path
     ((name, check, messages),) = recommendations(tmp_path / "report.json", *paths)
     assert (name, check) == ("daily.nc", "time_coverage_extents_match")
     assert all("T12:00:00+00:00 (time" in message for message in messages)

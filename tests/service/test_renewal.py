@@ -6,8 +6,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import xarray as xr
 from support.epochs import make_epoch
 
+import station
 from station.archive.derived.level_files import level_files
 from station.archive.epochs import write_epoch
 from station.archive.reference_files import write_reference
@@ -15,12 +17,13 @@ from station.archive.series.virtual import build_series
 from station.config import read_site
 from station.inbox.journal import Journal
 from station.monitoring.status import queue_status
+from station.processing import store_tasks
 from station.processing.site_files import series_for
 from station.processing.store_tasks import renew_levels
 from station.quantities import Reference
 from station.service.host import Host
 from station.service.mirror import update_mirror
-from station.service.renewal import Renewal
+from station.service.renewal import Renewal, renew_low_priority
 from station.service.worker import Worker
 
 MORE = """
@@ -71,7 +74,12 @@ class Tasks:
 
 
 @pytest.mark.parametrize(
-    ("name", "subject"), [("mirror", "the mirror is"), ("levels", "the files of levels are")]
+    ("name", "subject"),
+    [
+        ("mirror", "the mirror is"),
+        ("levels", "the files of levels are"),
+        ("derived", "the files of areas, products, events and blocks are"),
+    ],
 )
 def test_a_fault_is_logged_once_and_shown_until_it_is_gone(site, caplog, name, subject):
     caplog.set_level("INFO")
@@ -113,6 +121,43 @@ def test_a_damaged_epoch_is_a_fault_of_the_levels_and_no_error(site):
     epoch = next((series.folder / "epochs").glob("**/*T01*.nc"))
     epoch.write_bytes(epoch.read_bytes()[:2000])
     assert "cannot be read" in renew_levels(site, lambda: None)
+
+
+class InProcess:
+    """Runs tasks in this process, at its own priority."""
+
+    def run(self, function, site, task, *args, **_):
+        if function is renew_low_priority:
+            return task(site, lambda: None)
+        return function(site, task, *args, lambda: None)
+
+
+def test_files_that_lack_many_epochs_are_completed_while_no_scan_waits(write_site, monkeypatch):
+    monkeypatch.setattr(store_tasks, "MAX_COMPUTED", 3)
+    site = read_site(write_site())
+    store(site, *range(1, 7))
+    boxes = site.station.data / "boxes.nc"
+    host = replace(Host(), tasks=InProcess(), make_executor=AtOnce)
+    with Journal(site.station.data / "journal.sqlite") as journal:
+        worker = Worker(site, journal, in_service=True, host=host)
+        worker.recover()
+        assert len(station.open(site.station.data).time) == 6
+        assert not boxes.exists()
+        worker.proceed_with_renewals()
+        assert len(xr.open_dataset(boxes).time) == 6
+        write_epoch(series_for(site), make_epoch(7, grid=site.grid_cells))
+        worker.recover()  # one epoch more does not have to wait
+        worker.close()
+    with xr.open_dataset(boxes) as written:
+        completed = written.load()
+    update_from_nothing(site)
+    xr.testing.assert_equal(completed, xr.open_dataset(boxes))
+
+
+def update_from_nothing(site):
+    for name in ("boxes.nc", "daily.nc", "events.geojson", ".boxes.json"):
+        (site.station.data / name).unlink(missing_ok=True)
+    store_tasks.update_series(site, lambda: None)
 
 
 @pytest.mark.integration

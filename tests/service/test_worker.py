@@ -23,6 +23,7 @@ from station.inbox.lock import exclusive_lock
 from station.operations.retry import retry_scans
 from station.processing.scan_tasks import StoredResult
 from station.processing.scans.scan_files import scan_file
+from station.processing.store_tasks import SeriesUpdate
 from station.processing.workers import fork_server
 from station.service.host import Host
 from station.service.worker import Worker
@@ -52,7 +53,12 @@ class PretendingWorker(Worker):
             return self.measure(*args)
         if task.__name__ == "build_reference_version":
             self.references.append([scan.name for scan in args[0]])
-        results = {"update_series": 0, "delete_expired": (), "late_inputs": (), "_count_outdated": 0}
+        results = {
+            "update_between_scans": SeriesUpdate(0, is_behind=False),
+            "delete_expired": (),
+            "late_inputs": (),
+            "_count_outdated": 0,
+        }
         nothing = SimpleNamespace(warning="", fault="", input_faults=(), damaged=(), new_checksums={})
         return results.get(task.__name__, nothing)
 
