@@ -328,7 +328,7 @@ class ProductQueries(Aggregates):
         if found is None:
             return Estimate()
         random, total = self.sum_variance(area, found.sensitivity @ interpolation[found.samples])
-        return Estimate(found.distance_m, random, total - random)
+        return Estimate(found.distance_m, max(random, found.scatter_variance), total - random)
 
 
 def _columns(values: dict[str, list[Estimate]], coverage: Floats) -> Row:

@@ -18,6 +18,7 @@ SIGN_WINDOW_CELLS = 5  # the neighbours that decide whether a cell lost or gaine
 CLEAR_SIGMAS = 4.0  # beyond, a cell decides itself: noise gets there once in 16,000 cells
 CROSSING_SAMPLES = 2  # on either side of a crossing, which make its line
 CREST_SAMPLES = 3  # on either side of the highest, which make its parabola
+SCATTER_SAMPLES = 10  # on either side, which show how the ground scatters about lines and parabolas
 
 
 @dataclass(frozen=True)
@@ -85,6 +86,12 @@ class LinePosition(NamedTuple):
     distance_m: float
     samples: Ints  # (k,) that it is from
     sensitivity: Floats  # (k,)
+    scatter_m2: float  # variance of a height about such a line or parabola, of the samples around
+
+    @property
+    def scatter_variance(self) -> float:
+        """Variance of the distance that the scatter of the heights causes [m²]."""
+        return float(self.scatter_m2 * self.sensitivity @ self.sensitivity)
 
 
 def crossing(distance_m: Floats, height_m: Floats, level_m: float) -> LinePosition | None:
@@ -101,7 +108,8 @@ def crossing(distance_m: Floats, height_m: Floats, level_m: float) -> LinePositi
         if slope * (height_m[first + 1] - height_m[first]) > 0:
             shift_m = (level_m - h.mean()) / slope
             sensitivity = -(1 / len(h) + shift_m * offset_m / (offset_m @ offset_m)) / slope
-            return LinePosition(float(distance_m[samples].mean() + shift_m), samples, sensitivity)
+            scatter_m2 = _scatter(distance_m, height_m, first, 2 * CROSSING_SAMPLES, 1)
+            return LinePosition(float(distance_m[samples].mean() + shift_m), samples, sensitivity, scatter_m2)
     return None
 
 
@@ -124,7 +132,25 @@ def crest(distance_m: Floats, height_m: Floats) -> LinePosition | None:
     if curvature >= 0:
         return None
     sensitivity = (slope * fit[2] / curvature - fit[1]) / (2 * curvature)
-    return LinePosition(float(origin_m - slope / (2 * curvature)), samples, sensitivity)
+    scatter_m2 = _scatter(distance_m, height_m, highest, 2 * CREST_SAMPLES + 1, 2)
+    return LinePosition(float(origin_m - slope / (2 * curvature)), samples, sensitivity, scatter_m2)
+
+
+def _scatter(distance_m: Floats, height_m: Floats, place: int, count: int, degree: int) -> float:
+    """Return the mean variance of heights about the polynomials through `count` consecutive ones [m²].
+
+    Of the samples around a place; 0 if nowhere enough of them are known.
+    """
+    around = slice(max(place - SCATTER_SAMPLES, 0), place + SCATTER_SAMPLES + 1)
+    if len(height_m[around]) < count:
+        return 0.0
+    windows_m = np.lib.stride_tricks.sliding_window_view(height_m[around], count)
+    windows_m = windows_m[np.isfinite(windows_m).all(axis=1)]
+    if not len(windows_m):
+        return 0.0
+    basis = np.vander(distance_m[around][:count] - distance_m[around][0], degree + 1)
+    residuals_m = windows_m - windows_m @ (basis @ np.linalg.pinv(basis)).T
+    return float(np.mean(residuals_m**2) * count / (count - degree - 1))
 
 
 def _around(known: Bools, first: int, last: int) -> Ints:

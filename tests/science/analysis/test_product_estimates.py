@@ -118,3 +118,18 @@ def test_the_scatter_of_positions_is_that_of_their_sensitivity():
         sensitivity = position(distance_m, height_m).sensitivity
         assert np.mean(places_m) == pytest.approx(expected_m, abs=0.01)
         assert np.std(places_m) == pytest.approx(0.02 * np.sqrt(sensitivity @ sensitivity), rel=0.1)
+
+
+def test_a_position_on_rough_ground_is_as_uncertain_as_repetitions_show():
+    """Positions on 2,000 rough slopes and ridges with one truth, scatter of 0.3 m."""
+    rng, distance_m = np.random.default_rng(1), np.arange(0.0, 400.0, 10.0)
+    shapes = {
+        200.0: (100.0 - 0.5 * distance_m, lambda h: crossing(distance_m, h, 0.0)),
+        195.0: (-2e-3 * (distance_m - 195.0) ** 2, lambda h: crest(distance_m, h)),
+    }
+    for true_m, (height_m, find) in shapes.items():
+        found = [find(height_m + 0.3 * rng.standard_normal(len(height_m))) for _ in range(2000)]
+        assert np.mean([place.scatter_m2 for place in found]) == pytest.approx(0.3**2, rel=0.05)
+        error_m = [place.distance_m - true_m for place in found]
+        stated_m2 = np.mean([place.scatter_variance for place in found])
+        assert np.var(error_m) == pytest.approx(stated_m2, rel=0.15)
