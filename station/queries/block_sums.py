@@ -94,8 +94,11 @@ def _block_sums(block: Array, fields: Mapping[str, Array | None], shape: tuple[i
     }
 
 
-def epoch_sums(series: Series, epoch: EpochRef) -> Sums:
-    """Return the sums of an epoch: those kept while it was written, otherwise of its stored rasters."""
+def epoch_sums(series: Series, epoch: EpochRef, *, keep: bool = False) -> Sums:
+    """Return the sums of an epoch: those kept while it was written, otherwise of its stored rasters.
+
+    `keep` keeps the latter too.
+    """
     path = _path(series, epoch.epoch_file)
     kept = _read(path, epoch.path)
     if kept is not None:
@@ -105,7 +108,10 @@ def epoch_sums(series: Series, epoch: EpochRef) -> Sums:
     for top in range(0, series.grid.ny, CHUNK):
         rows = slice(top, min(top + CHUNK, series.grid.ny))
         summer.add(rows, {name: np.asarray(raster[rows]) for name, raster in rasters.items()})
-    return summer.sums()
+    sums = summer.sums()
+    if keep:
+        _keep(path, epoch.path, sums)
+    return sums
 
 
 def keep_epoch_sums(series: Series, epoch_path: Path, summer: EpochSummer) -> None:

@@ -200,7 +200,8 @@ class EventQueries:
 
     def _read_levels(self, scan: int) -> BlockLevels:
         """Return the levels of a scan: of its sums alone, which is all that most scans of a window need."""
-        sums = epoch_sums(self._series, self._epoch(scan))
+        is_needed_again = scan >= len(self._names) - 1 - HISTORY
+        sums = epoch_sums(self._series, self._epoch(scan), keep=is_needed_again)
         surface = self._queries.reference_blocks(self._version(scan))
         count, known = np.maximum(sums["count"], 1), np.maximum(surface["known"], 1)
         observed = (sums["count"] > 0) & (surface["known"] > 0)

@@ -11,6 +11,7 @@ from support.series import copied
 from support.shared_parameters import SCANNER, random_shared
 
 from station.archive import epochs
+from station.archive.derived import computed_rasters
 from station.archive.derived.event_table import (
     FOUND_NAME,
     decode_blocks,
@@ -21,6 +22,7 @@ from station.archive.netcdf_layout import Series
 from station.archive.reference_files import write_reference
 from station.archive.series.virtual import build_series
 from station.quantities import Grid, Quality, Reference
+from station.queries import block_sums
 from station.queries.blocks import BlockQueries
 from station.queries.events import LEAST_HISTORY, EventQueries
 
@@ -173,6 +175,24 @@ def test_a_damaged_file_is_built_again(stored, base, name):
 
 def test_the_sums_that_the_next_scan_needs_are_named(stored):
     assert len(update(stored)[1]) == HOURS
+
+
+def test_sums_of_scans_that_were_read_back_are_kept_for_the_next_search(base, tmp_path, monkeypatch):
+    """As those kept while a scan was written are: reading two days of scans back takes half a minute."""
+    series = empty_store(tmp_path / "store")
+    copy_scans(base, series, range(HOURS - 1))
+    update(series)
+    read = []
+    monkeypatch.setattr(
+        block_sums, "open_raster", lambda *place: read.append(place) or computed_rasters.open_raster(*place)
+    )
+    copy_scans(base, series, [HOURS - 1])
+    assert update(series)[0] == 1
+    assert {path.name for path, *_ in read} == {series_path(base, HOURS - 1).name}
+
+
+def series_path(series, hour):
+    return sorted((series.folder / "epochs").rglob("*.nc"))[hour]
 
 
 def test_an_outline_is_that_of_its_blocks(base):
