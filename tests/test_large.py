@@ -49,11 +49,8 @@ def test_a_small_machine_processes_a_scan_of_14_million_points(folder):
     limited.write_text(f"{site.read_text()}\n[service]\nmemory_gb = {SMALL_MACHINE_GB}\n")
     scan = max((site.parent / "inbox").glob("*.laz"))
     command = [sys.executable, "-m", "station", "process", str(limited), str(scan)]
-    done = subprocess.run(
-        ["prlimit", f"--cpu={SMALL_MACHINE_CPU_S}", *command], capture_output=True, text=True
-    )
-    assert done.returncode == 0, done.stderr
-    assert "verdict=good" in done.stderr or "good" in done.stdout
+    subprocess.run(["prlimit", f"--cpu={SMALL_MACHINE_CPU_S}", *command], check=True)
+    assert len(station.open(site.parent / "data").time) == 1
 
 
 @pytest.mark.slow
