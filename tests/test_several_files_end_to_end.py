@@ -327,4 +327,5 @@ def test_sigma_contains_the_errors_of_positions_against_each_other(tmp_path):
             covariance = np.squeeze(epoch["shared_parameter_covariance"].to_numpy())
         sigma_rad.append(np.sqrt(covariance[0, 0]))
     added_rad = np.sqrt(sigma_rad[1] ** 2 - sigma_rad[0] ** 2)
-    assert np.degrees(added_rad) == pytest.approx(0.008 * np.sqrt(2 / 3), rel=0.4)  # equations.md, 6.13
+    # Each third is seen by one of three, and by one of three in the two scans of the reference.
+    assert np.degrees(added_rad) == pytest.approx(0.008 * np.sqrt(2 / 3 * (1 + 1 / 2)), rel=0.4)

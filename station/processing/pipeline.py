@@ -35,6 +35,7 @@ from station.science.gridding.gridder import Gridder
 from station.science.gridding.reference_cells import CellClass
 from station.science.gridding.significance import supported_variance
 from station.science.gridding.viewing_geometry import ViewingGeometry, compute_viewing_geometry
+from station.science.gridding.viewpoints import PositionErrors
 from station.science.uncertainty import propagation
 from station.science.uncertainty.jacobian import HeightJacobian
 from station.science.uncertainty.parameters import ParameterLayout
@@ -297,6 +298,7 @@ def variance_factors(
     viewing: ViewingGeometry,
     adjustment: tuple[AdjustmentInputs, Adjustment],
     posterior: SharedParameters,
+    position_errors: PositionErrors | None = None,
 ) -> VarianceFactors:
     """Return the variance factors of an adjusted scan, from a sample of its cells."""
     test = snow_test(gridder, scan_geometry, viewing)
@@ -309,12 +311,16 @@ def variance_factors(
             continue
         sector, sums = whole.take(cell_index - first), gridder.take(cell_index.astype(np.int32))
         jacobian = viewing.jacobian(sector)
-        east_m, north_m, _ = viewing.offset_m(sector.cell, sector.height_m)
+        offset_m = east_m, north_m, _ = viewing.offset_m(sector.cell, sector.height_m)
         range_bin = (np.hypot(east_m, north_m) / RESIDUAL_GROUP_M).astype(np.int64)
         intensity, steep = viewing.intensity(cell_index), sector.in_class(CellClass.STEEP)
         snow = test.changed(gridder.intensity(cell_index), intensity, steep)
         residual_m = sums.mean_residual() - sector.mean_residual_m - _correction(adjustment, jacobian)
         point_m2 = supported_variance(sector.point_variance_m2, sums.standard_deviation(), sums.count)
+        scan_m2, systematic_m2 = point_m2 / sums.count, jacobian.variance(posterior)
+        if position_errors is not None:
+            own_m2 = position_errors.height_variances(cell_index, sector.cell, jacobian, offset_m)
+            scan_m2, systematic_m2 = scan_m2 + own_m2[1], systematic_m2 + own_m2[0]
         parts.append(
             Residuals(
                 east_m,
@@ -323,9 +329,9 @@ def variance_factors(
                 class_with_excess(sector.noise_class, point_m2 > sector.point_variance_m2),
                 sector.in_class(CellClass.STABLE) & ~snow,
                 residual_m.astype(np.float32),
-                point_m2 / sums.count,
+                scan_m2,
                 sector.reference_variance_m2,
-                jacobian.variance(posterior),
+                systematic_m2,
                 np.nan_to_num(sums.standard_deviation()) ** 2,
                 sums.count.astype(np.int64) - 1,
             )
@@ -340,19 +346,22 @@ def measure(
     viewing: ViewingGeometry | None,
     adjustment: tuple[AdjustmentInputs, Adjustment] | None = None,
     factors: VarianceFactors = UNIT_FACTORS,
+    position_errors: PositionErrors | None = None,
 ) -> Measurement:
     """Return surface, change and their uncertainty of a gridded scan; overwrites the gridder's buffers.
 
     `posterior` are the parameters that all points of the scan share: relative to the reference if
     `adjustment` is given, which adjusted the scan to it; None if nothing is known of them. Of the `factors`
-    the posterior already contains the systematic one.
+    the posterior and the errors of several scan positions already contain the systematic one.
     """
     independent = posterior
     if adjustment is None and posterior is not None and viewing is not None:
         posterior = propagation.difference_to_reference(posterior, viewing.reference.shared)
     correction = None if adjustment is None else partial(_correction, adjustment)
     test = None if adjustment is None or viewing is None else snow_test(gridder, scan_geometry, viewing)
-    estimator = CellEstimator(scan_geometry, posterior, independent, correction, test, factors.random)
+    estimator = CellEstimator(
+        scan_geometry, posterior, independent, correction, test, factors.random, position_errors
+    )
     return estimate_cells(gridder, viewing, estimator)
 
 
