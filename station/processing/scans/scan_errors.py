@@ -6,12 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from station.processing.pipeline import (
-    AdjustmentInputs,
-    stable_sampling_ratio,
-    variance_factors,
-)
+from station.processing.pipeline import AdjustmentInputs, stable_sampling_ratio
 from station.processing.scans.scan_inputs import ScanInputs
+from station.processing.scans.scan_residuals import variance_factors, with_motion_seen
 from station.processing.workers.worker_process import trim_heap
 from station.quantities import Floats, Reference, SharedParameters, VarianceComponents
 from station.science.adjustment.joint import Adjustment
@@ -55,6 +52,8 @@ def scan_errors(
         return ScanErrors(shared)
     variance = _motion_variance(viewing.reference, components)
     positions = position_errors(gridder, inputs.geometry, viewing, variance)
+    if positions is not None:
+        positions = with_motion_seen(positions, gridder, viewing, adjustment, shared)
     factors = variance_factors(gridder, inputs.geometry, viewing, adjustment, shared, positions)
     trim_heap()
     factor = factors.systematic

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from station.quantities import Reals
 from station.science.geometry.observation import Observation, Points
 from station.science.gridding.reference_cells import CellClass
 from station.science.uncertainty import shot_noise
@@ -15,12 +16,15 @@ from station.science.uncertainty.jacobian import height_jacobian
 from station.science.uncertainty.parameters import GLOBAL
 
 if TYPE_CHECKING:
-    from station.quantities import Floats, Ints, Ints32, Reals, ScanGeometry, SharedParameters, Viewpoint
+    from station.quantities import Floats, Ints, Ints32, ScanGeometry, SharedParameters, Viewpoint
     from station.science.gridding.gridder import Gridder
     from station.science.gridding.viewing_geometry import ViewingGeometry
     from station.science.uncertainty.jacobian import HeightJacobian
 
 OWN = slice([name for name, _ in GLOBAL].index("range_bias") + 1)  # parameters that each position has itself
+Offsets = tuple[Reals, Reals, Reals]
+Observations = tuple[Reals, Reals, Reals]  # design (7 k, n), residuals [m], variance of other errors [m²]
+OUTLIER_SIGMAS = 3.0  # of a residual, at which it counts by half
 BLOCK_CELLS = 10  # rows and columns of a block whose cells are seen alike
 MAX_SAMPLED_CELLS = 100_000  # of more cells a sample tells the shares of the positions
 
@@ -79,13 +83,15 @@ def seen_from_viewpoints(
 class PositionErrors:
     """Errors of the positions of a gridded scan against each other, after an adjustment as one cloud.
 
-    `variance` (7,) is that of tilt, heading, translation and range bias of each position, `baseline_m` (k, 3)
-    its offset from the position of the adjustment, `adjusted_share` (k,) its mean share in the adjusted cells
-    and `local_share` (k, by, bx) that in the cells of a block.
+    `variance` (7,) is that of tilt, heading, translation and range bias of each position, in blocks of cells,
+    and `local_variance` that between the cells of a block. `baseline_m` (k, 3) is the offset of a position
+    from that of the adjustment, `adjusted_share` (k,) its mean share in the adjusted cells and `local_share`
+    (k, by, bx) that in the cells of a block.
     """
 
     gridder: Gridder
     variance: Floats
+    local_variance: Floats
     baseline_m: Floats
     adjusted_share: Floats
     local_share: Floats
@@ -95,7 +101,7 @@ class PositionErrors:
         cell_index: Ints | Ints32,
         cell: Ints | Ints32,
         jacobian: HeightJacobian,
-        offset_m: tuple[Reals, Reals, Reals],
+        offset_m: Offsets,
     ) -> tuple[Reals, Reals]:
         """Return the variances of cells (n,) that cells around them share, and do not share [m²].
 
@@ -104,23 +110,52 @@ class PositionErrors:
         """
         systematic_m2: Reals = np.zeros_like(jacobian.sight_tilt)
         random_m2: Reals = np.zeros_like(jacobian.sight_tilt)
-        east, north = jacobian.gradient
         row, column = self.gridder.grid.row_and_column(cell.astype(np.int64))
         shares = self.gridder.viewpoint_shares(cell_index.astype(np.int32))
         local_shares = self.local_share[:, row // BLOCK_CELLS, column // BLOCK_CELLS]
-        for share, local, adjusted, baseline_m in zip(
-            shares, local_shares, self.adjusted_share, self.baseline_m, strict=True
-        ):
-            own_m = (offset_m[0] - baseline_m[0], offset_m[1] - baseline_m[1], offset_m[2] - baseline_m[2])
-            effects = height_jacobian(jacobian.params, own_m, east, north, jacobian.knot_position).pose[OWN]
-            variance_m2 = self.variance @ effects**2
-            systematic_m2 += (local - adjusted) ** 2 * variance_m2
-            random_m2 += (share - local) ** 2 * variance_m2
+        for position, (share, local) in enumerate(zip(shares, local_shares, strict=True)):
+            effects2 = self._effects(position, jacobian, offset_m) ** 2
+            systematic_m2 += (local - self.adjusted_share[position]) ** 2 * (self.variance @ effects2)
+            random_m2 += (share - local) ** 2 * (self.local_variance @ effects2)
         return systematic_m2, random_m2
+
+    def _effects(self, position: int, jacobian: HeightJacobian, offset_m: Offsets) -> Reals:
+        """Return the effects (7, n) of the parameters of a position on heights that it alone sees."""
+        east_m, north_m, up_m = self.baseline_m[position]
+        own_m = offset_m[0] - east_m, offset_m[1] - north_m, offset_m[2] - up_m
+        east, north = jacobian.gradient
+        return height_jacobian(jacobian.params, own_m, east, north, jacobian.knot_position).pose[OWN]
+
+    def design(self, cell_index: Ints, jacobian: HeightJacobian, offset_m: Offsets) -> Reals:
+        """Return the effects (7 k, n) of the parameters of all positions on the heights of cells (n,)."""
+        shares = self.gridder.viewpoint_shares(cell_index.astype(np.int32)) - self.adjusted_share[:, None]
+        return np.concatenate(
+            [share * self._effects(number, jacobian, offset_m) for number, share in enumerate(shares)]
+        )
+
+    def variance_by(self, observations: Iterable[Observations]) -> Floats:
+        """Return the variance (7,) of positions that residuals show: the second moment of their motion.
+
+        Source: equations.md, 6.13.
+        """
+        count = len(self.baseline_m)
+        prior = np.tile(self.variance, count)
+        normal, right = np.diag(1 / prior), np.zeros(len(prior))
+        for design, residual_m, other_m2 in observations:
+            size_m2 = other_m2 + prior @ design**2
+            weighted = design / (other_m2 * (1 + residual_m**2 / (OUTLIER_SIGMAS**2 * size_m2)))
+            normal += weighted @ design.T
+            right += weighted @ residual_m
+        covariance = np.linalg.inv(normal)
+        estimate = covariance @ right
+        moments = covariance + np.outer(estimate, estimate)
+        moments = np.einsum("ipjp->pij", moments.reshape(count, -1, count, len(self.variance)))
+        apart = np.trace(moments, axis1=1, axis2=2) - moments.sum(axis=(1, 2)) / count
+        return np.asarray(apart / (count - 1))
 
     def scaled(self, factor: float) -> PositionErrors:
         """Return the errors with their variances multiplied by a factor."""
-        return replace(self, variance=self.variance * factor)
+        return replace(self, variance=self.variance * factor, local_variance=self.local_variance * factor)
 
     def added_to(self, shared: SharedParameters, viewing: ViewingGeometry) -> SharedParameters:
         """Return shared parameters with these errors, as if all cells had the mean of their variances."""
@@ -156,6 +191,7 @@ def position_errors(
     positions_m = np.array([viewpoint.position_m for viewpoint in scan_geometry.viewpoints])
     return PositionErrors(
         gridder,
+        variance[OWN],
         variance[OWN],
         positions_m - scan_geometry.position_m,
         gridder.viewpoint_shares(adjusted.astype(np.int32)).mean(axis=1),

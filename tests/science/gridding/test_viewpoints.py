@@ -134,7 +134,7 @@ def test_variance_is_that_of_positions_that_each_move_on_their_own(count):
     for local in ("mean", "own"):  # shares of the cells around: those of all, or those of each cell
         if local == "own":
             blocks[:, np.arange(cells) // 20, np.arange(cells) % 20] = shares
-        errors = PositionErrors(gridder, usual**2, baseline_m, adjusted, blocks).scaled(4.0)
+        errors = PositionErrors(gridder, usual**2, usual**2, baseline_m, adjusted, blocks).scaled(4.0)
         cell = np.arange(cells) // 20 * 2000 + np.arange(cells) % 20 * 10  # one in each block
         variances_m2 = errors.height_variances(np.arange(cells), cell, jacobian, tuple(offset_m))
         systematic_m2, random_m2 = variances_m2 if local == "own" else variances_m2[::-1]
@@ -142,6 +142,25 @@ def test_variance_is_that_of_positions_that_each_move_on_their_own(count):
         np.testing.assert_allclose(random_m2, 0.0, atol=1e-15)
     assert expected_m2[0] == 0.0
     assert np.sqrt(expected_m2[1:].min()) > 0.001
+
+
+@pytest.mark.parametrize("count", [2, 4])
+def test_residuals_show_how_much_positions_moved(count):
+    """Whatever they have in common: the adjustment took that. Without residuals the usual motion is left."""
+    random, usual = np.random.default_rng(count), np.array([1e-4, 1e-4, 3e-5, 0.003, 0.003, 0.003, 0.004])
+    motion = random.normal(size=(count, 7)) * usual
+    shares = random.dirichlet(np.full(count, 0.5), 4000).T - 1 / count
+    effects = random.normal(size=(7, 4000)) * ([[300.0]] * 3 + [[1.0]] * 4)
+    design = np.concatenate([share * effects for share in shares])
+    noise_m = random.normal(0, 0.005, 4000)
+    noise_m[::100] += 1.0  # outliers
+    baseline_m = np.zeros((count, 3))
+    errors = PositionErrors(None, usual**2, usual**2, baseline_m, shares[:, 0], shares[:, :1, None])
+    for moved, expected in ((1.0, np.var(motion, axis=0, ddof=1)), (0.0, np.zeros(7))):
+        residual_m = moved * motion.ravel() @ design + noise_m
+        found = errors.variance_by([(design, residual_m, np.full(4000, 0.005**2))])
+        np.testing.assert_allclose(np.sqrt(found / usual**2), np.sqrt(expected / usual**2), atol=0.2)
+    np.testing.assert_allclose(errors.variance_by([]), usual**2)
 
 
 def test_sigma_of_a_cell_is_that_of_the_positions_that_saw_it():
