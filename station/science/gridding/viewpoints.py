@@ -83,10 +83,10 @@ def seen_from_viewpoints(
 class PositionErrors:
     """Errors of the positions of a gridded scan against each other, after an adjustment as one cloud.
 
-    `variance` (7,) is that of tilt, heading, translation and range bias of each position, in blocks of cells,
-    and `local_variance` that between the cells of a block. `baseline_m` (k, 3) is the offset of a position
-    from that of the adjustment, `adjusted_share` (k,) its mean share in the adjusted cells and `local_share`
-    (k, by, bx) that in the cells of a block.
+    `variance` (k, 7) is that of tilt, heading, translation and range bias of each position, in blocks of
+    cells, and `local_variance` that between the cells of a block. `baseline_m` (k, 3) is the offset of a
+    position from that of the adjustment, `adjusted_share` (k,) its mean share in the adjusted cells and
+    `local_share` (k, by, bx) that in the cells of a block.
     """
 
     gridder: Gridder
@@ -115,8 +115,9 @@ class PositionErrors:
         local_shares = self.local_share[:, row // BLOCK_CELLS, column // BLOCK_CELLS]
         for position, (share, local) in enumerate(zip(shares, local_shares, strict=True)):
             effects2 = self._effects(position, jacobian, offset_m) ** 2
-            systematic_m2 += (local - self.adjusted_share[position]) ** 2 * (self.variance @ effects2)
-            random_m2 += (share - local) ** 2 * (self.local_variance @ effects2)
+            apart = local - self.adjusted_share[position]
+            systematic_m2 += apart**2 * (self.variance[position] @ effects2)
+            random_m2 += (share - local) ** 2 * (self.local_variance[position] @ effects2)
         return systematic_m2, random_m2
 
     def _effects(self, position: int, jacobian: HeightJacobian, offset_m: Offsets) -> Reals:
@@ -134,12 +135,11 @@ class PositionErrors:
         )
 
     def variance_by(self, observations: Iterable[Observations]) -> Floats:
-        """Return the variance (7,) of positions that residuals show: the second moment of their motion.
+        """Return the variance (k, 7) of positions that residuals show: the second moment of their motion.
 
         Source: equations.md, 6.13.
         """
-        count = len(self.baseline_m)
-        prior = np.tile(self.variance, count)
+        count, prior = len(self.baseline_m), self.variance.ravel()
         normal, right = np.diag(1 / prior), np.zeros(len(prior))
         for design, residual_m, other_m2 in observations:
             size_m2 = other_m2 + prior @ design**2
@@ -149,9 +149,9 @@ class PositionErrors:
         covariance = np.linalg.inv(normal)
         estimate = covariance @ right
         moments = covariance + np.outer(estimate, estimate)
-        moments = np.einsum("ipjp->pij", moments.reshape(count, -1, count, len(self.variance)))
-        apart = np.trace(moments, axis1=1, axis2=2) - moments.sum(axis=(1, 2)) / count
-        return np.asarray(apart / (count - 1))
+        moments = np.einsum("ipjp->pij", moments.reshape(count, -1, count, self.variance.shape[1]))
+        apart = np.eye(count) - 1 / count  # from the mean of all
+        return np.asarray(np.einsum("ki,pij,kj->kp", apart, moments, apart) * count / (count - 1))
 
     def scaled(self, factor: float) -> PositionErrors:
         """Return the errors with their variances multiplied by a factor."""
@@ -161,6 +161,7 @@ class PositionErrors:
         """Return shared parameters with these errors, as if all cells had the mean of their variances."""
         step = 1 + int(viewing.sector_bounds[-1]) // MAX_SAMPLED_CELLS
         own_m2 = common_m2 = 0.0
+        mean_variance = self.variance.mean(axis=0)
         for first, whole in viewing.sectors():
             cell_index = np.arange(first, first + len(whole), step)
             cell_index = cell_index[self.gridder.count[cell_index] > 0]
@@ -168,9 +169,9 @@ class PositionErrors:
             jacobian = viewing.jacobian(sector)
             offset_m = viewing.offset_m(sector.cell, sector.height_m)
             own_m2 += float(self.height_variances(cell_index, sector.cell, jacobian, offset_m)[0].sum())
-            common_m2 += float((self.variance @ jacobian.pose[OWN] ** 2).sum())
+            common_m2 += float((mean_variance @ jacobian.pose[OWN] ** 2).sum())
         covariance = shared.covariance.copy()
-        covariance[OWN, OWN] += np.diag(self.variance) * (own_m2 / common_m2 if common_m2 else 0.0)
+        covariance[OWN, OWN] += np.diag(mean_variance) * (own_m2 / common_m2 if common_m2 else 0.0)
         return replace(shared, covariance=covariance)
 
 
@@ -191,8 +192,8 @@ def position_errors(
     positions_m = np.array([viewpoint.position_m for viewpoint in scan_geometry.viewpoints])
     return PositionErrors(
         gridder,
-        variance[OWN],
-        variance[OWN],
+        np.tile(variance[OWN], (len(positions_m), 1)),
+        np.tile(variance[OWN], (len(positions_m), 1)),
         positions_m - scan_geometry.position_m,
         gridder.viewpoint_shares(adjusted.astype(np.int32)).mean(axis=1),
         _local_shares(gridder, len(positions_m)),

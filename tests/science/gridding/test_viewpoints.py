@@ -134,7 +134,8 @@ def test_variance_is_that_of_positions_that_each_move_on_their_own(count):
     for local in ("mean", "own"):  # shares of the cells around: those of all, or those of each cell
         if local == "own":
             blocks[:, np.arange(cells) // 20, np.arange(cells) % 20] = shares
-        errors = PositionErrors(gridder, usual**2, usual**2, baseline_m, adjusted, blocks).scaled(4.0)
+        each = np.tile(usual**2, (count, 1))
+        errors = PositionErrors(gridder, each, each, baseline_m, adjusted, blocks).scaled(4.0)
         cell = np.arange(cells) // 20 * 2000 + np.arange(cells) % 20 * 10  # one in each block
         variances_m2 = errors.height_variances(np.arange(cells), cell, jacobian, tuple(offset_m))
         systematic_m2, random_m2 = variances_m2 if local == "own" else variances_m2[::-1]
@@ -155,12 +156,14 @@ def test_residuals_show_how_much_positions_moved(count):
     noise_m = random.normal(0, 0.005, 4000)
     noise_m[::100] += 1.0  # outliers
     baseline_m = np.zeros((count, 3))
-    errors = PositionErrors(None, usual**2, usual**2, baseline_m, shares[:, 0], shares[:, :1, None])
-    for moved, expected in ((1.0, np.var(motion, axis=0, ddof=1)), (0.0, np.zeros(7))):
+    each = np.tile(usual**2, (count, 1))
+    errors = PositionErrors(None, each, each, baseline_m, shares[:, 0], shares[:, :1, None])
+    apart = (motion - motion.mean(axis=0)) ** 2 * count / (count - 1)
+    for moved, expected in ((1.0, apart), (0.0, np.zeros((count, 7)))):
         residual_m = moved * motion.ravel() @ design + noise_m
         found = errors.variance_by([(design, residual_m, np.full(4000, 0.005**2))])
-        np.testing.assert_allclose(np.sqrt(found / usual**2), np.sqrt(expected / usual**2), atol=0.2)
-    np.testing.assert_allclose(errors.variance_by([]), usual**2)
+        np.testing.assert_allclose(np.sqrt(found / usual**2), np.sqrt(expected / usual**2), atol=0.3)
+    np.testing.assert_allclose(errors.variance_by([]), each)
 
 
 def test_sigma_of_a_cell_is_that_of_the_positions_that_saw_it():
