@@ -307,7 +307,10 @@ def test_two_positions_are_adjusted_as_the_one_scan_that_they_are_halves_of(tmp_
 
 
 def test_sigma_contains_the_errors_of_positions_against_each_other(tmp_path):
-    """The same files as tiles of one position, and as three positions that move on their own."""
+    """The same files as tiles of one position, and as three positions.
+
+    They did not move against each other: sigma counts less than the usual motion of 0.008 degree, and not none.
+    """
     sigma_rad = []
     for name in ("tiles", "positions"):
         folder = without_log(tiled(tmp_path / name))
@@ -328,4 +331,4 @@ def test_sigma_contains_the_errors_of_positions_against_each_other(tmp_path):
         sigma_rad.append(np.sqrt(covariance[0, 0]))
     added_rad = np.sqrt(sigma_rad[1] ** 2 - sigma_rad[0] ** 2)
     # Each third is seen by one of three, and by one of three in the two scans of the reference.
-    assert np.degrees(added_rad) == pytest.approx(0.008 * np.sqrt(2 / 3 * (1 + 1 / 2)), rel=0.4)
+    assert 0.2 < np.degrees(added_rad) / (0.008 * np.sqrt(2 / 3 * (1 + 1 / 2))) < 0.8  # equations.md, 6.13
