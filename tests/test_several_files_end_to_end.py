@@ -309,7 +309,7 @@ def test_two_positions_are_adjusted_as_the_one_scan_that_they_are_halves_of(tmp_
 def test_sigma_contains_the_errors_of_positions_against_each_other(tmp_path):
     """The same files as tiles of one position, and as three positions.
 
-    They did not move against each other: sigma counts less than the usual motion of 0.008 degree, and not none.
+    They did not move against each other: sigma counts less than the usual 0.008 degree, and not none.
     """
     sigma_rad = []
     for name in ("tiles", "positions"):
