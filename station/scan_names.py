@@ -11,6 +11,7 @@ import unicodedata
 from datetime import UTC, datetime
 from functools import lru_cache
 from pathlib import PurePath
+from typing import Literal
 from zoneinfo import ZoneInfo
 
 COMPRESSED = ".gz"
@@ -82,11 +83,12 @@ def resolution_s(pattern: str) -> float:
 
 
 @lru_cache(maxsize=1 << 16)
-def start_in_name(name: str, pattern: str) -> datetime | None:
+def start_in_name(name: str, pattern: str, *, fold: Literal[0, 1] = 0) -> datetime | None:
     """Return the start of a scan (UTC) that its name states; None if it does not match the pattern.
 
     The pattern is one of strptime, in which `*` stands for any characters of one name, also of the folders
-    before a `/`. `@` and the name of a time zone may follow; of an hour that occurs twice, the first counts.
+    before a `/`. `@` and the name of a time zone may follow; of an hour that occurs twice, the first counts,
+    with `fold` the second.
     """
     pattern, _, zone = composed(pattern).partition(ZONE_MARK)
     stem = composed(path_stem(name_below(PurePath(name), pattern)))
@@ -100,7 +102,7 @@ def start_in_name(name: str, pattern: str) -> datetime | None:
     except ValueError:
         return None
     if start.tzinfo is None:
-        start = start.replace(tzinfo=ZoneInfo(zone) if zone else UTC)
+        start = start.replace(tzinfo=ZoneInfo(zone) if zone else UTC, fold=fold)
     return start.astimezone(UTC)
 
 

@@ -291,6 +291,7 @@ VARIABLES: tuple[Variable, ...] = (
         "relative_humidity",
     ),
     Variable("point_total", ("time",), "f8", "number of points in the scan", "1"),
+    Variable("position_count", ("time",), "f8", "number of scan positions, if there are several", "1"),
     Variable(
         "discarded_share",
         ("time",),

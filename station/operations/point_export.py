@@ -160,6 +160,9 @@ def _header(site: Site) -> laspy.LasHeader:
     header.add_extra_dims(
         [laspy.ExtraBytesParams(name, kind, text) for name, (kind, text) in EXTRA_BYTES.items()]
     )
+    for field in header.vlrs.get("ExtraBytesVlr")[0].extra_bytes_structs:
+        # laspy would state extremes of one block, or impossible ones, which viewers refuse
+        field.options &= ~(field.MIN_BIT_MASK | field.MAX_BIT_MASK)
     if site.map.crs is not None:
         header.add_crs(CRS.from_user_input(site.map.crs))
     return header

@@ -116,7 +116,7 @@ def _sop_lines(project: Project) -> list[str]:
     lines, starts = [], set()
     for position in project.positions:
         start = f"{position.start_utc:%Y-%m-%dT%H:%M:%SZ}" if position.start_utc else "2000-01-01T00:00:00Z"
-        mark = "# " if start in starts else ""  # two SOPs must not begin together
+        mark = "# " if start in starts and not position.files else ""  # two must not begin together
         starts.add(start)
         lines += [
             f"{mark}[[sop]]{'' if position.start_utc else '   # check: from when it holds'}",
@@ -124,6 +124,7 @@ def _sop_lines(project: Project) -> list[str]:
             f'{mark}file = "{file_stem(position.name)}-SOP.dat"',
         ]
         lines += [f'{mark}scan = "{position.first_scan}"'] if position.first_scan else []
+        lines += [f'files = "{position.files}"'] if position.files else []
         lines += [""]
     return lines
 

@@ -33,25 +33,15 @@ from station.science.geometry.robust_statistics import nmad
 from station.science.gridding.cell_estimates import CellEstimator, estimate_cells
 from station.science.gridding.gridder import Gridder
 from station.science.gridding.reference_cells import CellClass
-from station.science.gridding.significance import supported_variance
 from station.science.gridding.viewing_geometry import ViewingGeometry, compute_viewing_geometry
+from station.science.gridding.viewpoints import PositionErrors
 from station.science.uncertainty import propagation
 from station.science.uncertainty.jacobian import HeightJacobian
 from station.science.uncertainty.parameters import ParameterLayout
-from station.science.uncertainty.variance_factors import (
-    UNIT_FACTORS,
-    Residuals,
-    VarianceFactors,
-    class_with_excess,
-    estimate_variance_factors,
-    mean_sampling_ratio,
-)
+from station.science.uncertainty.variance_factors import UNIT_FACTORS, VarianceFactors, mean_sampling_ratio
 
 MIN_STABLE_CELLS = 20  # fewer cells give no meaningful statistics
 MIN_BRIGHTNESS_SHARE = 0.5  # of the stable cells; less counts as no brightness
-MAX_RESIDUALS = 100_000  # of more cells a sample tells the variance factors
-RESIDUAL_GROUP_M = 40.0  # range extent of cells whose mean is subtracted; in azimuth one knot of the tilt
-MAX_RESIDUAL_GROUPS = 1000  # by range
 MAX_BRIGHTNESS_CELLS = 100_000  # of more stable cells a sample tells the gain and whether there is brightness
 
 
@@ -255,7 +245,7 @@ def stacking_inputs(
     variance_m2.reshape(-1)[cell] = viewing.cells["shot_m2"][:] * (gridder.sums(0, len(cell)).count > 0)
     if adjustment is not None:
         for _, sector in viewing.sectors():
-            correction_m.reshape(-1)[sector.cell] = _correction(adjustment, viewing.jacobian(sector))
+            correction_m.reshape(-1)[sector.cell] = height_correction(adjustment, viewing.jacobian(sector))
     return variance_m2, correction_m
 
 
@@ -275,11 +265,11 @@ def mean_correction(
         replace(adjustment, estimate=np.mean([adjustment.estimate for _, adjustment in adjustments], axis=0)),
     )
     for _, sector in viewing.sectors():
-        correction_m.reshape(-1)[sector.cell] = _correction(mean, viewing.jacobian(sector))
+        correction_m.reshape(-1)[sector.cell] = height_correction(mean, viewing.jacobian(sector))
     return correction_m
 
 
-def _correction(adjustment: tuple[AdjustmentInputs, Adjustment], jacobian: HeightJacobian) -> Reals:
+def height_correction(adjustment: tuple[AdjustmentInputs, Adjustment], jacobian: HeightJacobian) -> Reals:
     """Return the correction to subtract from heights (n,) [m]: effect of estimated minus assumed state."""
     inputs, estimated = adjustment
     return np.asarray(estimated.effect(jacobian) - tilt_effect(jacobian, inputs.assumed_rad))
@@ -291,48 +281,6 @@ def stable_sampling_ratio(viewing: ViewingGeometry) -> float:
     return mean_sampling_ratio(viewing.cells["noise_class"][:].take(cell_index))
 
 
-def variance_factors(
-    gridder: Gridder,
-    scan_geometry: ScanGeometry,
-    viewing: ViewingGeometry,
-    adjustment: tuple[AdjustmentInputs, Adjustment],
-    posterior: SharedParameters,
-) -> VarianceFactors:
-    """Return the variance factors of an adjusted scan, from a sample of its cells."""
-    test = snow_test(gridder, scan_geometry, viewing)
-    step = 1 + int(viewing.sector_bounds[-1]) // MAX_RESIDUALS
-    parts = []
-    for first, whole in viewing.sectors():
-        cell_index = np.arange(first, first + len(whole), step)
-        cell_index = cell_index[gridder.count[cell_index] > 0]
-        if not len(cell_index):
-            continue
-        sector, sums = whole.take(cell_index - first), gridder.take(cell_index.astype(np.int32))
-        jacobian = viewing.jacobian(sector)
-        east_m, north_m, _ = viewing.offset_m(sector.cell, sector.height_m)
-        range_bin = (np.hypot(east_m, north_m) / RESIDUAL_GROUP_M).astype(np.int64)
-        intensity, steep = viewing.intensity(cell_index), sector.in_class(CellClass.STEEP)
-        snow = test.changed(gridder.intensity(cell_index), intensity, steep)
-        residual_m = sums.mean_residual() - sector.mean_residual_m - _correction(adjustment, jacobian)
-        point_m2 = supported_variance(sector.point_variance_m2, sums.standard_deviation(), sums.count)
-        parts.append(
-            Residuals(
-                east_m,
-                north_m,
-                range_bin + jacobian.knot_position.astype(np.int64) * MAX_RESIDUAL_GROUPS,
-                class_with_excess(sector.noise_class, point_m2 > sector.point_variance_m2),
-                sector.in_class(CellClass.STABLE) & ~snow,
-                residual_m.astype(np.float32),
-                point_m2 / sums.count,
-                sector.reference_variance_m2,
-                jacobian.variance(posterior),
-                np.nan_to_num(sums.standard_deviation()) ** 2,
-                sums.count.astype(np.int64) - 1,
-            )
-        )
-    return estimate_variance_factors(Residuals.concatenate(parts)) if parts else UNIT_FACTORS
-
-
 def measure(
     gridder: Gridder,
     scan_geometry: ScanGeometry,
@@ -340,19 +288,22 @@ def measure(
     viewing: ViewingGeometry | None,
     adjustment: tuple[AdjustmentInputs, Adjustment] | None = None,
     factors: VarianceFactors = UNIT_FACTORS,
+    position_errors: PositionErrors | None = None,
 ) -> Measurement:
     """Return surface, change and their uncertainty of a gridded scan; overwrites the gridder's buffers.
 
     `posterior` are the parameters that all points of the scan share: relative to the reference if
     `adjustment` is given, which adjusted the scan to it; None if nothing is known of them. Of the `factors`
-    the posterior already contains the systematic one.
+    the posterior and the errors of several scan positions already contain the systematic one.
     """
     independent = posterior
     if adjustment is None and posterior is not None and viewing is not None:
         posterior = propagation.difference_to_reference(posterior, viewing.reference.shared)
-    correction = None if adjustment is None else partial(_correction, adjustment)
+    correction = None if adjustment is None else partial(height_correction, adjustment)
     test = None if adjustment is None or viewing is None else snow_test(gridder, scan_geometry, viewing)
-    estimator = CellEstimator(scan_geometry, posterior, independent, correction, test, factors.random)
+    estimator = CellEstimator(
+        scan_geometry, posterior, independent, correction, test, factors.random, position_errors
+    )
     return estimate_cells(gridder, viewing, estimator)
 
 

@@ -27,14 +27,13 @@ from station.processing.pipeline import (
     has_brightness,
     holdout_statistics,
     measure,
-    stable_sampling_ratio,
     usual_motion,
-    variance_factors,
 )
 from station.processing.scans.adjusted_scan import grid_and_adjust, is_usable, load_viewing_geometry
 from station.processing.scans.epoch_inputs import load_scan_inputs
 from station.processing.scans.open_scans import open_scan_for
 from station.processing.scans.registration import registration_difference
+from station.processing.scans.scan_errors import scan_errors
 from station.processing.site_files import (
     exclusion_reason,
     file_version,
@@ -53,7 +52,6 @@ from station.science.adjustment import ground_classes
 from station.science.adjustment.joint import Adjustment
 from station.science.analysis import inclination_check, verdict
 from station.science.geometry.terrain import nodes_from_means
-from station.science.uncertainty.variance_factors import UNIT_FACTORS
 
 
 @dataclass(frozen=True)
@@ -231,16 +229,12 @@ def _compute_epoch(
     if adjustment is not None and (inputs.is_given or not is_usable(adjustment[1])):
         adjustment = None
     components = usual_motion(reference, start.timestamp()) if reference else VarianceComponents()
-    shared, factors = inputs.log_only_shared(components), UNIT_FACTORS
-    if adjustment is not None and viewing is not None:
-        shared = adjustment[1].to_shared_parameters(stable_sampling_ratio(viewing), viewing.reference.shared)
-        shared = inputs.with_errors_of_positions(shared, components)
-        if not inputs.geometry.published_budget:
-            factors = variance_factors(gridder, inputs.geometry, viewing, adjustment, shared)
-            shared = shared.scaled(factors.systematic)
-            trim_heap()
+    errors = scan_errors(inputs, gridder, viewing, adjustment, components)
+    stored_parameters = errors.stored_parameters(viewing)
     log_warnings, clock_scalars = _check_log(adjustment, reference)
-    measurement = measure(gridder, inputs.geometry, shared, viewing, adjustment, factors)
+    measurement = measure(
+        gridder, inputs.geometry, errors.shared, viewing, adjustment, errors.factors, errors.positions
+    )
     progress()
     scalars = scalar_variables(measurement, inputs, *point_counts)
     scalars["rejected_echo_share"] = gridder.rejected_echo_share
@@ -248,10 +242,12 @@ def _compute_epoch(
     if adjustment is not None and viewing is not None:
         scalars |= holdout_statistics(measurement, viewing) | {"change_step": adjustment[1].change_size_m}
         scalars |= {
-            "random_variance_factor": factors.median_random(viewing.cells["noise_class"][:]),
-            "systematic_variance_factor": factors.systematic,
+            "random_variance_factor": errors.factors.median_random(viewing.cells["noise_class"][:]),
+            "systematic_variance_factor": errors.factors.systematic,
         }
         scalars |= dict(zip(LEVERAGE_VARIABLES, adjustment[1].leverage_m2, strict=True))
+    if errors.positions is not None:
+        scalars["position_count"] = float(len(errors.positions.baseline_m))
     verdict_name, reason = verdict.assess(
         flag,
         [*inputs.warnings, *log_warnings, *registration_warnings],
@@ -269,7 +265,7 @@ def _compute_epoch(
         end_s=end.timestamp(),
         scan_id=scan_id(scan.name),
         measurement=measurement,
-        shared=shared,
+        shared=stored_parameters,
         redundancy=adjustment[1].redundancy if adjustment else None,
         verdict=verdict_name,
         verdict_reason=reason,

@@ -12,6 +12,7 @@ from station.archive.areas import AreaChange
 from station.archive.derived.computed_rasters import (
     CHANGE,
     RANDOM,
+    SYSTEMATIC,
     TOTAL,
     ReferenceSurfaces,
     is_value,
@@ -20,7 +21,14 @@ from station.archive.epochs import EpochRef
 from station.archive.netcdf_layout import Series
 from station.archive.small_variables import read_number
 from station.quantities import Bools, Floats, Grid, Quality, Reals, SharedParameters
-from station.queries.epoch_cells import EpochCells, EpochReader, bounding_box, read_cells_of, read_window
+from station.queries.epoch_cells import (
+    EpochCells,
+    EpochReader,
+    bounding_box,
+    observed_in_all,
+    read_cells_of,
+    read_window,
+)
 from station.science.adjustment import ground_classes
 from station.science.adjustment.leverage import leverage
 from station.science.analysis.voids import area_weights, void_variance
@@ -287,7 +295,7 @@ class Aggregates(EpochReader):
         grid, (row, column) = self.grid, np.nonzero(common_cells)
         holdout = ground_classes.is_holdout(grid.x_m[column], grid.y_m[row])
         stable_ground = _has_quality(epoch_cells.epoch, common_cells, Quality.STABLE_GROUND)
-        smooth = np.hypot(*jacobian.pose[3:5]) < ground_classes.MAX_MOVING_SLOPE
+        smooth = np.hypot(*jacobian.gradient) < ground_classes.MAX_MOVING_SLOPE
         ground_class = ground_classes.classify(stable_ground, holdout, smooth, np.zeros_like(stable_ground))
         random_m2 = independent_m2 + epoch_cells.reference.random_variance_m2[common_cells]
         return leverage(independent_m2, random_m2, ground_class, (moving, stable))
@@ -355,7 +363,10 @@ class Aggregates(EpochReader):
         window_grid = Grid(*corner_m, grid.cell_m, window_m.shape[1], window_m.shape[0])
         gradient = smooth_gradient(window_m, grid.cell_m)
         rock = _has_quality(epoch_cells.epoch, cells, Quality.STABLE_GROUND | Quality.BARE_GROUND)
-        return cell_jacobian(params, window_grid, position_m, window_m, gradient, cells[rows, columns], rock)
+        jacobian = cell_jacobian(
+            params, window_grid, position_m, window_m, gradient, cells[rows, columns], rock
+        )
+        return _scaled_to_cells(jacobian, epoch_cells, cells) if epoch_cells.has_positions else jacobian
 
 
 LEVERAGE_VARIABLES = ("adjustment_leverage_moving", "adjustment_leverage_stable")
@@ -375,6 +386,20 @@ def _shared_of(
     return difference_to_reference(shared, epoch_cells.reference.shared)
 
 
+def _scaled_to_cells(jacobian: HeightJacobian, epoch_cells: EpochCells, cells: Bools) -> HeightJacobian:
+    """Return the Jacobian that gives selected cells (ny, nx) their stored systematic variances.
+
+    The covariance of an epoch of several positions is that of a mean cell. Source: equations.md, 6.13.
+    """
+    if epoch_cells.shared is None:
+        return jacobian
+    with h5py.File(epoch_cells.epoch.path, "r") as file:
+        systematic_m = read_cells_of(file, SYSTEMATIC, epoch_cells.epoch.index, cells)
+    sigma_m = np.sqrt(np.asarray(jacobian.variance(epoch_cells.shared), np.float64))
+    known = np.isfinite(systematic_m) & (sigma_m > 0)
+    return jacobian.scaled(np.divide(systematic_m, sigma_m, out=np.ones(len(sigma_m)), where=known))
+
+
 def common_error_covariance(epochs: list[EpochCells]) -> Floats | None:
     """Return the error covariance (p, p) between two epochs; None if there is none, or for one epoch."""
     first, second = epochs[0], epochs[-1]
@@ -388,18 +413,6 @@ def common_error_covariance(epochs: list[EpochCells]) -> Floats | None:
     if first.reference.version != second.reference.version:
         return None
     return cross_covariance(first.shared, second.shared)
-
-
-def observed_in_all(epochs: list[EpochCells], cells: Bools) -> Bools:
-    """Return the mask (ny, nx) of the cells with a change and a reference in every epoch."""
-    observed, bounds = np.zeros(cells.shape, np.bool_), bounding_box(cells, 0)
-    observed[bounds][cells[bounds]] = np.logical_and.reduce(
-        [
-            np.isfinite(epoch_cells.change_m) & np.isfinite(epoch_cells.reference.elevation_m[cells])
-            for epoch_cells in epochs
-        ]
-    )
-    return observed
 
 
 def _has_quality(epoch: EpochRef, cells: Bools, flags: Quality) -> Bools:

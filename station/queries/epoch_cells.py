@@ -34,6 +34,7 @@ SCANNER_VARIABLES = (
 MAX_CACHED = 4  # epochs whose parameters are kept: an epoch and those that it is compared with
 PARAMETER_VARIABLES = ("parameter_name", "parameter_unit")
 SHARED_VARIABLES = ("shared_parameter", "shared_parameter_covariance", "shared_parameter_line_tilt_variance")
+POSITIONS = "position_count"
 CHANGE_ERROR_VARIABLES = ("change_errors", "change_pattern")  # in the order of the fields of `ChangeErrors`
 
 
@@ -47,6 +48,7 @@ class EpochCells:
     scanner: tuple[float, ...]  # position [m], east and north component of the rotation axis
     reference: Reference
     adjusted: bool  # to the reference; `shared` is then relative to it
+    has_positions: bool  # several, against each other in error
     epoch: EpochRef
 
 
@@ -101,8 +103,9 @@ class EpochReader:
             )
             scanner = tuple(read_number(file, name, epoch.index) for name in SCANNER_VARIABLES)
             adjusted = read_text(file, "adjustment", epoch.index) == "joint"
+            has_positions = POSITIONS in file and read_number(file, POSITIONS, epoch.index) > 1
             shared = self._read_shared(file, epoch, scanner)
-        return EpochCells(change_m, random_m, shared, scanner, reference, adjusted, epoch)
+        return EpochCells(change_m, random_m, shared, scanner, reference, adjusted, has_positions, epoch)
 
     def _read_shared(
         self, file: h5py.File, epoch: EpochRef, scanner: tuple[float, ...]
@@ -143,6 +146,18 @@ def read_cells_of(file: h5py.File, name: str, index: int, cells: Bools) -> Float
         return np.empty(0)
     bounds = bounding_box(cells, 0)
     return np.asarray(read_window(file, name, index, bounds)[cells[bounds]])
+
+
+def observed_in_all(epochs: list[EpochCells], cells: Bools) -> Bools:
+    """Return the mask (ny, nx) of the cells with a change and a reference in every epoch."""
+    observed, bounds = np.zeros(cells.shape, np.bool_), bounding_box(cells, 0)
+    observed[bounds][cells[bounds]] = np.logical_and.reduce(
+        [
+            np.isfinite(epoch_cells.change_m) & np.isfinite(epoch_cells.reference.elevation_m[cells])
+            for epoch_cells in epochs
+        ]
+    )
+    return observed
 
 
 def read_window(file: h5py.File, name: str, index: int, window: tuple[slice, slice]) -> Floats:

@@ -10,8 +10,8 @@ from station.archive.derived.computed_rasters import CHANGE, RANDOM, TOTAL
 from station.archive.epochs import EpochRef
 from station.errors import StoreError
 from station.quantities import Bools, Floats
-from station.queries.aggregates import Aggregates, common_error_covariance, observed_in_all
-from station.queries.epoch_cells import EpochCells, read_cells_of
+from station.queries.aggregates import Aggregates, common_error_covariance
+from station.queries.epoch_cells import EpochCells, observed_in_all, read_cells_of
 from station.science.analysis.voids import area_weights
 from station.science.analysis.volume import common_contributions, shared_contributions
 from station.science.uncertainty.parameters import parameter_layout

@@ -296,6 +296,9 @@ def scan_start(
     if exact_s > MAX_CLOCK_DIFFERENCE_S and -exact_s < difference_s <= 0:
         return gps_start
     if abs(difference_s) > MAX_CLOCK_DIFFERENCE_S:
+        repeated = start_in_name(name, pattern, fold=1)  # as summer time ends, the same names come again
+        if repeated is not None and abs((repeated - gps_start).total_seconds()) < MAX_CLOCK_DIFFERENCE_S:
+            return repeated
         hours = round(difference_s / 3600)
         is_local = hours and abs(difference_s - hours * 3600) < MAX_CLOCK_DIFFERENCE_S and abs(hours) <= 14
         raise ScanError(

@@ -89,6 +89,8 @@ def test_an_octree_has_the_points_of_the_cloud(processed, tmp_path):
     expected = laspy.read(plain)
     with laspy.CopcReader.open(str(path)) as reader:
         assert reader.header.parse_crs().to_epsg() == 32632
+        (described,) = reader.header.vlrs.get("ExtraBytesVlr")
+        assert [(field.min, field.max) for field in described.extra_bytes_structs] == [(None, None)] * 3
         points = reader.query()
     fields = ("gps_time", "X", "Y", "Z", "intensity", "elevation_change", "quality")
     rows = [np.stack([np.asarray(cloud[name], float) for name in fields]) for cloud in (expected, points)]

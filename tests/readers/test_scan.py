@@ -149,6 +149,14 @@ def test_name_that_contradicts_gps_time_is_rejected(write_scan, name, hint):
         utc_interval(reader, NAMED)
 
 
+@pytest.mark.parametrize("hour", [0, 1])
+def test_gps_time_tells_which_of_two_hours_a_name_means(hour):
+    """On 27 October 2024 it was twice 2:05 in Vienna, an hour before and after the end of summer time."""
+    gps_s = START_STANDARD_S + timedelta(days=25, hours=12 + hour, minutes=5).total_seconds()
+    start = scan.scan_start("241027_020500.laz", f"{NAMED}@Europe/Vienna", (gps_s, gps_s + 60))
+    assert start == datetime(2024, 10, 27, hour, 5, tzinfo=UTC)
+
+
 def test_scan_from_the_future_is_not_ready():
     now_s = START.timestamp()
     reject_future(START, now_s)

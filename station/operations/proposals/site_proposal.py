@@ -24,7 +24,7 @@ from station.readers.formats.riscan import Project, ScanPosition
 from station.readers.scan import ScanHeader, suffixes
 from station.readers.sop import read_matrix
 from station.readers.weather_dialects import recognise_dialect
-from station.scan_names import start_in_name
+from station.scan_names import scan_stem, start_in_name
 from station.scanners import SCANNERS, missing_values
 from station.science.geometry.pose import horizontal_crs
 from station.sections.inputs import ScansSection
@@ -43,10 +43,12 @@ class _Found:
     """What lies in a folder."""
 
     scan: Path | None  # the newest; None if there is none
+    names: list[str]  # of all scans, with their folders
     pattern: str  # of the names, "" if none of the usual ones fits
     epoch: str  # name of epochs, if several scans have the same start; else ""
     has_logs: bool
     sops: list[Path]
+    registration: str  # suffix of matrices beside most of the scans, with their names; "" without
     pop: Path | None
     weather: tuple[Path, str] | None  # and its dialect
     polygons: Path | None
@@ -128,13 +130,19 @@ def _look_into(source: Path) -> _Found:
         for path in files
         if path.suffix.lower() in MATRIX_SUFFIXES and (matrix := _matrix(path)) is not None
     }
+    beside = {path.with_name(scan_stem(path.name)) for path in names.values()}
+    suffix = Counter(path.suffix for path in matrices if path.with_suffix("") in beside).most_common(1)
+    registration = suffix[0][0] if suffix and 2 * suffix[0][1] > len(beside) > 1 else ""
     pops = [path for path, matrix in matrices.items() if np.linalg.norm(matrix[:3, 3]) > GEOCENTRIC_M]
+    sops = [path for path in matrices if path not in pops]
     return _Found(
         scan=None if newest is None else names[newest],
+        names=list(names),
         pattern=pattern,
         epoch=epoch_advice(list(names), pattern)[1] if pattern else "",
         has_logs=any(path.name.endswith(LOG_SUFFIX) for path in files),
-        sops=[path for path in matrices if path not in pops],
+        sops=sops[-1:] if registration else sops,
+        registration=registration,
         pop=pops[-1] if pops else None,
         weather=next(((path, kind) for path in files if (kind := _dialect(path))), None),
         polygons=next((path for path in files if path.suffix.lower() in {".geojson", ".gpkg", ".shp"}), None),
@@ -180,17 +188,29 @@ def _quoted(value: str | Path) -> str:
 
 
 def _project(name: str, found: _Found, header: ScanHeader | None) -> Project:
-    """Return a project of the SOPs, the newest by its name first, as far as its scan reaches."""
+    """Return a project of the SOPs, the newest by its name first unless they are of positions."""
     extent_m = 0.0 if header is None else float(np.abs(_horizontal_m(header)).max())
-    names = [SOP_WORD.sub("", path.stem) or "SOP" for path in reversed(found.sops)] or ["SOP"]
+    patterns = _patterns_of_positions(found)
+    paths = found.sops if patterns else found.sops[::-1]
+    names = [SOP_WORD.sub("", path.stem) or "SOP" for path in paths] or ["SOP"]
     if len({file_stem(sop) for sop in names}) < len(names):
         names = [f"SOP{number}" for number in range(1, len(names) + 1)]
-    matrices = [read_matrix(path) for path in reversed(found.sops)] or [np.eye(4)]
+    matrices = [read_matrix(path) for path in paths] or [np.eye(4)]
     positions = tuple(
-        ScanPosition(sop, matrix, _model_for(extent_m), None, "", None, extent_m)
-        for sop, matrix in zip(names, matrices, strict=True)
+        ScanPosition(sop, matrix, _model_for(extent_m), None, "", None, extent_m, pattern)
+        for sop, matrix, pattern in zip(names, matrices, patterns or [""] * len(names), strict=True)
     )
     return Project(name, read_matrix(found.pop) if found.pop and found.sops else None, positions)
+
+
+def _patterns_of_positions(found: _Found) -> list[str]:
+    """Return the pattern of the scans of each SOP.
+
+    Empty unless an epoch has several files, of which each has the name of one SOP in its own.
+    """
+    stems = [SOP_WORD.sub("", path.stem) for path in found.sops]
+    are_positions = found.epoch and all(sum(stem in name for stem in stems) == 1 for name in found.names)
+    return [f"*{stem}*" for stem in stems] if are_positions else []
 
 
 def _model_for(range_m: float) -> str:
@@ -240,8 +260,14 @@ def _more_lines(found: _Found, header: ScanHeader | None, *, mode: str) -> list[
     from_rxp = found.scan is not None and found.scan.suffix.lower() == ".rxp"
     in_points = from_rxp if header is None else header.has_inclination
     if found.epoch:
+        positions = len(_patterns_of_positions(found))
         note = "# check: files with the same start; scan positions need an [[sop]] each, with files"
-        lines += [f"[epoch]   {note}", f'name = "{found.epoch}"', ""]
+        lines += ["[epoch]" if positions else f"[epoch]   {note}", f'name = "{found.epoch}"']
+        lines += [f"files = {positions}   # check", ""] if positions else [""]
+    if found.registration:
+        suffix = f'suffix = "{found.registration}"'
+        lines += ["[registration]   # check: matrices beside the scans", suffix, 'into = "project"']
+        lines += ["sigma_m = 0.005   # check", "sigma_deg = 0.001   # check", ""]
     if found.has_logs or in_points:
         note = "   # check: without an SOP, the log makes the map level" if mode == "absolute" else ""
         source = (

@@ -46,7 +46,6 @@ from station.science.adjustment import prior
 from station.science.geometry.air import air_correction
 from station.science.geometry.inclination import NO_CYCLIC_ERROR, TiltRecord
 from station.science.uncertainty import parameters
-from station.science.uncertainty.propagation import with_errors_of_positions
 
 MEAN_TILT = "one mean tilt for the whole scan"
 
@@ -92,16 +91,6 @@ class ScanInputs:
             pose=self.pose.rotated(rotation_rad),
             adjustment_inputs=replace(self.adjustment_inputs, assumed_rad=assumed_rad),
         )
-
-    def with_errors_of_positions(
-        self, shared: SharedParameters, components: VarianceComponents
-    ) -> SharedParameters:
-        """Return adjusted parameters with what several positions do not have in common, if there are any."""
-        positions_m = [pose.frame.position_m for pose in self.position_poses if pose.frame is not None]
-        if len(positions_m) < 2:
-            return shared
-        usual_motion = prior.globals_sigma(components, weather_known=True)[:7]
-        return with_errors_of_positions(shared, usual_motion, np.array(positions_m))
 
     def log_only_shared(self, components: VarianceComponents) -> SharedParameters | None:
         """Return the systematic errors of all points without an adjustment, from SOP and log."""

@@ -31,6 +31,7 @@ class ScanPosition:
     first_scan: str  # its name, "" if no scan is left
     start_utc: datetime | None  # of that scan, by its name
     extent_m: float  # of its scans from the scanner, 0 if unknown
+    files: str = ""  # pattern of its scans, if each epoch has scans from several positions
 
 
 @dataclass(frozen=True)

@@ -29,7 +29,7 @@ from station.science.gridding import significance
 from station.science.gridding.gridder import CellSums, Gridder, slope_sampling_variance
 from station.science.gridding.reference_cells import HIGH_INCIDENCE_COS, CellClass
 from station.science.gridding.viewing_geometry import AzimuthSector, ViewingGeometry
-from station.science.gridding.viewpoints import mean_shot_variance
+from station.science.gridding.viewpoints import PositionErrors, mean_shot_variance
 from station.science.uncertainty import budget, parameters, shot_noise
 from station.science.uncertainty.jacobian import HeightJacobian, height_jacobian
 from station.science.uncertainty.variance_factors import class_with_excess
@@ -293,7 +293,7 @@ class CellEstimator:
     `posterior` are the shared parameters of the difference from the reference, `independent` those of the
     scan alone, None if unknown. `correction` returns what to subtract from heights [m], and `snow_test` tells
     which stable ground is under snow; both are None without an adjustment. `variance_factors` (512,) are
-    those of the random variance by noise class.
+    those of the random variance by noise class, `position_errors` those of several scan positions.
     """
 
     scan_geometry: ScanGeometry
@@ -302,6 +302,7 @@ class CellEstimator:
     correction: Callable[[HeightJacobian], Reals] | None
     snow_test: SnowTest | None
     variance_factors: Floats32
+    position_errors: PositionErrors | None = None
 
     def in_reference(
         self, cell_index: Ints, sector: AzimuthSector, sums: CellSums, viewing: ViewingGeometry
@@ -314,10 +315,18 @@ class CellEstimator:
         excess = point_m2 > sector.point_variance_m2
         point_m2 = point_m2 * self.variance_factors.take(class_with_excess(sector.noise_class, excess))
         random_m2 = point_m2 / count + sector.reference_variance_m2
-        shared_m2, correction_m, terms = np.zeros_like(count), np.zeros_like(count), dict[str, Floats]()
+        shared_m2: Reals = np.zeros_like(count)
+        correction_m: Reals = np.zeros_like(count)
+        terms: dict[str, Floats] = {}
         if viewing.params is not None:
             jacobian = viewing.jacobian(sector)
             shared_m2, correction_m = self._systematic(jacobian)
+            if self.position_errors is not None:
+                offset_m = viewing.offset_m(sector.cell, sector.height_m)
+                systematic_m2, own_m2 = self.position_errors.height_variances(
+                    cell_index, sector.cell, jacobian, offset_m
+                )
+                shared_m2, random_m2 = shared_m2 + systematic_m2, random_m2 + own_m2
             if self.scan_geometry.store_terms:
                 observation = viewing.observation(sector)
                 excess_m2 = np.maximum(point_m2 - sector.point_variance_m2, 0.0) / count
@@ -376,8 +385,14 @@ class CellEstimator:
         east, north = (
             slope.astype(np.float32) for slope in (observation.east_gradient, observation.north_gradient)
         )
-        jacobian = height_jacobian(params, (east_m, north_m, up_m), east, north)
+        offset_m = east_m, north_m, up_m
+        jacobian = height_jacobian(params, offset_m, east, north)
         shared_m2, correction_m = self._systematic(jacobian)
+        if self.position_errors is not None:
+            systematic_m2, own_m2 = self.position_errors.height_variances(
+                outside.cell_index, outside.cell, jacobian, offset_m
+            )
+            shared_m2, random_m2 = np.add(shared_m2, systematic_m2), np.add(random_m2, own_m2)
         terms = self._terms(jacobian, observation, count, sampling_m2) if scan_geometry.store_terms else {}
         sigma_m = self._sigma(random_m2 + shared_m2)
         return _CellEstimates(height_m - correction_m, no_change_m, sigma_m, np.sqrt(random_m2), flags, terms)

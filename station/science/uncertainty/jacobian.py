@@ -11,7 +11,7 @@ Source: equations.md, 6.1 and 6.2.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import pairwise
 from typing import NamedTuple
@@ -62,6 +62,11 @@ class HeightJacobian:
     def __len__(self) -> int:
         """Return the number of cells."""
         return len(self.sight_tilt)
+
+    @property
+    def gradient(self) -> Reals:
+        """Gradient of the ground eastward and northward (2, n) [1]."""
+        return np.asarray(self.pose[3:5] / -self.pose[5])
 
     @cached_property
     def line(self) -> Ints:
@@ -141,6 +146,16 @@ class HeightJacobian:
             for column in (self.sight_tilt, self.refraction, self.cross_tilt, self.knot_position)
         )
         return HeightJacobian(self.params, self.pose[:, selection], *columns)
+
+    def scaled(self, factor: Reals) -> HeightJacobian:
+        """Return the Jacobian of heights times a factor (n,)."""
+        return replace(
+            self,
+            pose=self.pose * factor,
+            sight_tilt=self.sight_tilt * factor,
+            refraction=self.refraction * factor,
+            cross_tilt=self.cross_tilt * factor,
+        )
 
     def variance(self, shared: SharedParameters) -> Reals:
         """Return the systematic variance of cell heights (n,) [m²]: diag(J C Jᵀ) plus line-tilt variance.

@@ -71,23 +71,6 @@ def with_pose_uncertainty(shared: SharedParameters, sigma_rad: float, sigma_m: f
     return replace(shared, covariance=covariance)
 
 
-def with_errors_of_positions(
-    shared: SharedParameters, usual_motion: Floats, positions_m: Floats
-) -> SharedParameters:
-    """Return adjusted parameters of scans from positions (k, 3) [m], with the errors of these to each other.
-
-    The adjustment estimates what they have in common. `usual_motion` (7,) is one sigma of each: tilt,
-    heading, translation and range bias. Source: equations.md, 6.13.
-    """
-    errors = slice(0, [name for name, _ in GLOBAL].index("range_bias") + 1)
-    variance = (1 - 1 / len(positions_m)) * usual_motion**2
-    baseline_m = np.linalg.norm(positions_m[:, None] - positions_m, axis=2).max()
-    variance[3:6] += variance[:2].max() * baseline_m**2
-    covariance = shared.covariance.copy()
-    covariance[errors, errors] += np.diag(variance)
-    return replace(shared, covariance=covariance)
-
-
 def align_to(params: ParameterLayout, shared: SharedParameters) -> SharedParameters:
     """Return shared parameters reordered to a parameter layout; parameters they lack get zero variance."""
     if shared.names == params.names:

@@ -174,6 +174,20 @@ def test_scans_in_folders_and_of_several_files_are_found(source, tmp_path):
     assert site.scans.name == "%Y-%m-%d/*"
     assert site.epoch.name == "%Y-%m-%d"
     assert [scan.name for scan in inbox_scans(site)] == ["2025-07-15"]
+    for number in (2, 1):
+        np.savetxt(source / f"ScanPos{number:03d}-SOP.dat", np.eye(4))
+    site = read_site(propose_site(source, tmp_path / "positions")[0])
+    assert [sop.files for sop in site.sop] == ["*ScanPos001*", "*ScanPos002*"]
+    assert site.epoch.files == 2
+
+
+def test_matrices_beside_scans_are_registrations(source, tmp_path):
+    for path in source.glob("*.laz"):
+        np.savetxt(path.with_suffix(".dat"), np.eye(4))
+    site = read_site(propose_site(source, tmp_path / "site")[0])
+    assert (site.registration.suffix, len(site.sop)) == (".dat", 1)
+    (scan, *_) = inbox_scans(site)
+    assert [path.suffix for path in scan.matrices] == [".dat"]
 
 
 @pytest.mark.integration

@@ -1,21 +1,25 @@
-"""Random sigma of scans from two positions, whose instruments differ, against simulated shots."""
+"""Sigma of scans from several positions: of their shots, and of their motion, against simulations."""
 
 from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from science.uncertainty import test_propagation as plane
 
 from station.processing.pipeline import (
     Pose,
+    add_blocks,
     grid_scan,
     measure,
     new_gridder,
     reference_viewing_geometry,
     stacking_inputs,
 )
-from station.quantities import Grid, Reference, ScanGeometry, Scanner, Shots, Viewpoint
-from station.science.gridding.viewpoints import seen_from_viewpoints
+from station.quantities import Grid, Reference, ScanGeometry, Scanner, SharedParameters, Shots, Viewpoint
+from station.science.gridding.viewpoints import PositionErrors, position_errors, seen_from_viewpoints
+from station.science.uncertainty import parameters
+from station.science.uncertainty.jacobian import height_jacobian
 
 GRID = Grid(west_m=0.0, north_m=80.0, cell_m=1.0, nx=90, ny=80)
 GRADIENT = 0.02, -0.03
@@ -105,3 +109,96 @@ def test_variance_of_a_cell_is_that_of_its_shots():
         expected_m2 += weight * ((viewpoint.scanner.range_sigma_m * along) ** 2 + across_m2)
     assert seen[39, 40] == pytest.approx(expected_m2, rel=1e-4)
     assert np.count_nonzero(seen) == 2
+
+
+@pytest.mark.parametrize("count", [2, 4])
+def test_variance_is_that_of_positions_that_each_move_on_their_own(count):
+    """Less what an adjustment finds of the motion; each motion moves points about its own position."""
+    cells, random = 40, np.random.default_rng(count)
+    usual = np.array([1e-4, 1e-4, 3e-5, 0.003, 0.003, 0.003, 0.004])
+    baseline_m = np.vstack([np.zeros(3), random.uniform(-200.0, 200.0, (count - 1, 3))])
+    offset_m = np.array(plane.cells(cells))
+    shares = random.dirichlet(np.full(count, 0.5), cells).T
+    shares[:, 0], adjusted = 1 / count, np.full(count, 1 / count)
+    expected_m2 = np.zeros(cells)
+    for position in range(count):
+        seen_m = offset_m - baseline_m[position][:, None]
+        for (name, _), sigma in zip(parameters.GLOBAL, usual, strict=False):
+            error_m = plane.height_error(seen_m, plane.moved(name, sigma, seen_m))
+            expected_m2 += ((shares[position] - adjusted[position]) * error_m) ** 2
+    params = parameters.parameter_layout(plane.GRID, (0.0, 0.0, 0.0))
+    slope = np.full(cells, plane.EAST), np.full(cells, plane.NORTH)
+    jacobian = height_jacobian(params, tuple(offset_m), *slope)
+    gridder = SimpleNamespace(viewpoint_shares=lambda cell_index: shares[:, cell_index], grid=plane.GRID)
+    blocks = np.repeat(adjusted, 15 * 20).reshape(count, 15, 20)
+    for local in ("mean", "own"):  # shares of the cells around: those of all, or those of each cell
+        if local == "own":
+            blocks[:, np.arange(cells) // 20, np.arange(cells) % 20] = shares
+        each = np.tile(usual**2, (count, 1))
+        errors = PositionErrors(gridder, each, each, baseline_m, adjusted, blocks).scaled(4.0)
+        cell = np.arange(cells) // 20 * 2000 + np.arange(cells) % 20 * 10  # one in each block
+        variances_m2 = errors.height_variances(np.arange(cells), cell, jacobian, tuple(offset_m))
+        systematic_m2, random_m2 = variances_m2 if local == "own" else variances_m2[::-1]
+        np.testing.assert_allclose(systematic_m2, 4.0 * expected_m2, rtol=2e-3, atol=1e-15)
+        np.testing.assert_allclose(random_m2, 0.0, atol=1e-15)
+    assert expected_m2[0] == 0.0
+    assert np.sqrt(expected_m2[1:].min()) > 0.001
+
+
+@pytest.mark.parametrize("count", [2, 4])
+def test_residuals_show_how_much_positions_moved(count):
+    """Whatever they have in common: the adjustment took that. Without residuals the usual motion is left."""
+    random, usual = np.random.default_rng(count), np.array([1e-4, 1e-4, 3e-5, 0.003, 0.003, 0.003, 0.004])
+    motion = random.normal(size=(count, 7)) * usual
+    shares = random.dirichlet(np.full(count, 0.5), 4000).T - 1 / count
+    effects = random.normal(size=(7, 4000)) * ([[300.0]] * 3 + [[1.0]] * 4)
+    design = np.concatenate([share * effects for share in shares])
+    noise_m = random.normal(0, 0.005, 4000)
+    noise_m[::100] += 1.0  # outliers
+    baseline_m = np.zeros((count, 3))
+    each = np.tile(usual**2, (count, 1))
+    errors = PositionErrors(None, each, each, baseline_m, shares[:, 0], shares[:, :1, None])
+    apart = (motion - motion.mean(axis=0)) ** 2 * count / (count - 1)
+    for moved, expected in ((1.0, apart), (0.0, np.zeros((count, 7)))):
+        residual_m = moved * motion.ravel() @ design + noise_m
+        found = errors.variance_by([(design, residual_m, np.full(4000, 0.005**2))])
+        np.testing.assert_allclose(np.sqrt(found / usual**2), np.sqrt(expected / usual**2), atol=0.3)
+    np.testing.assert_allclose(errors.variance_by([]), each)
+
+
+def test_sigma_of_a_cell_is_that_of_the_positions_that_saw_it():
+    """Ground that one of two saw has half the variance of their motion, and ground that both saw has none.
+
+    Where every second cell is of the one, the error is random. The epoch has the mean of the systematic part.
+    """
+    geometry = ScanGeometry(PRECISE.scanner, GRID, PRECISE.position_m, viewpoints=(PRECISE, PRECISE))
+    viewing = reference_viewing_geometry(truth(), geometry, np.ones(GRID.shape, bool))
+    gridder = new_gridder(geometry, viewing)
+    x_m, y_m = (axis.ravel() for axis in np.meshgrid(GRID.x_m, GRID.y_m))
+    centre_m = np.stack([x_m, y_m, ground(x_m, y_m)])
+    mixed, second = (x_m > 30) & (x_m < 60), (x_m > 60) | ((x_m < 60) & (x_m > 30) & (y_m % 2 > 1))
+    for number, chosen in enumerate((~second | (mixed & (y_m > 40)), second | (mixed & (y_m > 40)))):
+        shots = Shots(np.repeat(centre_m[:, chosen], 50, axis=1), None, None, number)
+        add_blocks(gridder, [shots], Pose(None, None), lambda: None)
+    gridder.finish()
+    variance, names = np.zeros(10), [name for name, _ in parameters.GLOBAL]
+    up = names.index("translation_up")
+    variance[up] = 0.2**2
+    assert position_errors(gridder, replace(geometry, viewpoints=()), viewing, variance) is None
+    errors = position_errors(gridder, geometry, viewing, variance)
+    empty = np.zeros(len(viewing.params.names))
+    known = SharedParameters(viewing.params.names, viewing.params.units, empty, np.diag(empty), empty)
+    stored = errors.added_to(known, viewing).covariance
+    assert stored[up, up] == pytest.approx(0.2**2 / 3, rel=1e-6)
+    measured = measure(gridder, geometry, known, viewing, position_errors=errors)
+    total_m, systematic_m = measured.to_rasters("uncertainty_m", "systematic_uncertainty_m")
+    random_m = np.sqrt(total_m**2 - systematic_m**2)
+    for zone, rows, systematic, random in (
+        ("first", np.s_[:], 0.1414, 0.0),
+        ("second", np.s_[:], 0.1414, 0.0),
+        ("both", np.s_[:40], 0.0, 0.0),
+        ("both", np.s_[40:], 0.0, 0.1414),
+    ):
+        first, end = ZONES[zone]
+        np.testing.assert_allclose(systematic_m[rows, first:end], systematic, rtol=0.02, atol=1e-6)
+        np.testing.assert_allclose(random_m[rows, first:end], random, rtol=0.02, atol=0.01)

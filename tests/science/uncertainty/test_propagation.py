@@ -219,37 +219,3 @@ def test_stated_uncertainty_of_the_pose_replaces_its_covariance():
         assert np.count_nonzero(stated.covariance[row]) == np.count_nonzero(stated.covariance[:, row]) == 1
     rest = slice(names.index("range_bias"), None)
     np.testing.assert_array_equal(stated.covariance[rest, rest], shared.covariance[rest, rest])
-
-
-@pytest.mark.parametrize("count", [2, 4])
-def test_errors_of_positions_against_each_other_by_simulation(count):
-    """Positions that move on their own, less the mean that an adjustment finds: sigma of cells is right."""
-    rng = np.random.default_rng(count)
-    usual = np.array([1e-4, 1e-4, 3e-5, 0.003, 0.003, 0.003, 0.004])
-    positions_m = rng.uniform(-5.0, 5.0, (count, 3))
-    params = parameters.parameter_layout(GRID, (0.0, 0.0, 0.0))
-    empty = np.zeros(len(params.names))
-    known = SharedParameters(params.names, params.units, empty, np.diag(empty), empty)
-    stated = propagation.with_errors_of_positions(known, usual, positions_m)
-    names = [name for name, _ in parameters.GLOBAL][:7]
-    offset_m = np.array(cells(40))
-    variance_m2 = np.zeros(40)
-    for _ in range(400):
-        motion = rng.normal(size=(count, 7)) * usual
-        deviation = motion[0] - motion.mean(axis=0)  # of the position that sees these cells
-        seen_m = offset_m - positions_m[0][:, None]
-        error_m = sum(
-            height_error(seen_m, moved(name, error, seen_m))
-            for name, error in zip(names, deviation, strict=True)
-        )
-        variance_m2 += error_m**2 / 400
-    jacobian = height_jacobian(params, tuple(offset_m), np.full(40, EAST), np.full(40, NORTH))
-    sigma_m = np.array(
-        [
-            math.sqrt(propagation.aggregate_variance(weights, np.zeros(40), jacobian, stated))
-            for weights in np.eye(40)
-        ]
-    )
-    ratio = np.sqrt(variance_m2) / sigma_m
-    assert 0.93 < np.sqrt(np.mean(ratio**2)) < 1.07
-    assert 0.8 < ratio.min() < ratio.max() < 1.2
