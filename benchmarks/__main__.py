@@ -129,7 +129,9 @@ def _programs(run: Run, data: Data, epoch: Row) -> list[Row]:
     baseline, service = median_cost(decoding), median_cost([Cost(**cost) for cost in result["costs"]])
     _log("page")
     history, hours = (3, 2) if run.quick else (49, 24)
-    _, page = run.station_job("page", site=data.service_site, history=history, hours=hours)
+    scan = data.scans[0]
+    _, page = run.station_job("page", site=data.service_site, scan=scan, history=history, hours=hours)
+    _, kept = run.station_job("page_year", site=data.service_site, days=1 if run.quick else 365)
     tasks = [
         run.station_job("grid_task", site=data.site, scan=scan, earlier_scan=data.reference_scan)[1]
         for scan in data.scans
@@ -141,7 +143,8 @@ def _programs(run: Run, data: Data, epoch: Row) -> list[Row]:
         Row("station, on the grid", *_station_cost(run, "gridding", data), note="epoch, adjustment"),
         epoch,
         Row("station, running service", service, baseline, limits),
-        Row("station, page alone, mean of a day", Cost(page["page_s"]), baseline, {"cpu": 0.3}),
+        Row("station, page alone, mean of a day", Cost(page["page_s"]), Cost(page["decode_s"]), {"cpu": 0.3}),
+        Row("its folder after a year", Cost(0.0, disk_gb=kept["disk_gb"]), limits={"disk_gb": 1.5}),
         Row("its functions, a million points at once", *million, note="epoch, adjustment"),
         *(_peer(run, peer, {task["scan"]: GridTask(**task) for task in tasks}) for peer in PEERS),
     ]

@@ -22,14 +22,22 @@ MEMORY_REST_S = 5.0
 SERVICE_PROCESSES = 3  # of an idle service: itself, multiprocessing's resource tracker, its fork server
 ONE_THREAD = {"OPENBLAS_NUM_THREADS": "1"}  # a BLAS thread that spins while it waits would count as work
 PACKAGES = ("numpy", "scipy", "laspy", "lazrs", "netCDF4", "datashader", "numba", "py4dgeo")
-COLUMNS = {"cpu_s": "CPU-s", "cpu": "ratio", "wall_s": "wall-s", "wall": "ratio ", "peak_gb": "peak GB"}
-DECIMALS = {"cpu_s": 2, "cpu": 2, "wall_s": 1, "wall": 2, "peak_gb": 2}
+COLUMNS = {
+    "cpu_s": "CPU-s",
+    "cpu": "ratio",
+    "wall_s": "wall-s",
+    "wall": "ratio ",
+    "peak_gb": "peak GB",
+    "disk_gb": "disk GB",
+}
+DECIMALS = {"cpu_s": 2, "cpu": 2, "wall_s": 1, "wall": 2, "peak_gb": 2, "disk_gb": 2}
 LIMITS = {
     "cpu": "CPU × {:g}",
     "wall": "wall × {:g}",
     "cpu_s": "{:g} CPU-s",
     "wall_s": "{:g} s",
     "peak_gb": "{:.2f} GB",
+    "disk_gb": "{:g} GB on disk",
 }
 
 
@@ -41,6 +49,7 @@ class Cost:
     wall_s: float = 0.0
     peak_gb: float = 0.0  # of the largest process
     startup_s: float = 0.0
+    disk_gb: float = 0.0  # of what it wrote
 
 
 class FailedError(Exception):

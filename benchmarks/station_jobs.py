@@ -22,7 +22,7 @@ import laspy
 import numpy as np
 
 from benchmarks.large import large_station
-from benchmarks.page_cost import page
+from benchmarks.page_cost import page, page_year
 from benchmarks.process_cost import SERVICE_PROCESSES, cpu_of, end_startup, family, peak_of, run_job
 from station.archive import geometry_cache
 from station.config import Site, read_site
@@ -237,6 +237,6 @@ if __name__ == "__main__":
         importlib.import_module(module)
     jobs: tuple[Callable[..., dict[str, Any]], ...] = (
         make, grid_task, gridding, large_blocks, epoch, reference, unadjusted, service_site, service, page,
-        year,
+        page_year, year,
     )  # fmt: skip
     run_job({job.__name__: job for job in jobs})

@@ -3,6 +3,7 @@ import re
 import resource
 import subprocess
 import sys
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +14,7 @@ from benchmarks.accuracy_measures import RECORD, SCALES, summarise
 from benchmarks.accuracy_rows import ROWS
 from benchmarks.accuracy_table import BEGIN, END, missed, write_markdown
 from benchmarks.levels import measure
+from benchmarks.page_cost import kept_hours
 from benchmarks.peers import GridTask, Peer, peer_cost
 from benchmarks.process_cost import Cost, FailedError, Row, cost_of, job_cost, median_cost
 
@@ -66,6 +68,26 @@ def test_row_has_ratios_to_its_base_and_names_exceeded_limits():
     assert Row("not installed", None, limits={"cpu": 2.0}).exceeded == []
 
 
+def test_a_year_of_hourly_scans_leaves_hours_days_and_months():
+    kept = kept_hours(datetime(2025, 7, 15, 3, tzinfo=UTC), 365)
+    assert kept[-72:] == [kept[-1] - timedelta(hours=back) for back in range(71, -1, -1)]  # three days
+    assert [start.day for start in kept[:11]] == [
+        31,
+        31,
+        30,
+        31,
+        30,
+        31,
+        31,
+        28,
+        31,
+        30,
+        15,
+    ]  # then days
+    assert kept[11:-72] == [datetime(2026, 5, 16, 23, tzinfo=UTC) + timedelta(days=day) for day in range(58)]
+    assert kept[-1] == datetime(2026, 7, 15, 23, tzinfo=UTC)
+
+
 def test_peers_without_their_program_are_not_installed():
     assert not Peer("x", "X", "no-such-program", "", is_command=True).is_installed
     assert not Peer("x", "X", "no_such_module", "").is_installed
@@ -94,7 +116,8 @@ def test_quick_benchmark_prints_all_rows_with_correct_ratios(quick):
     base_s = float(rows["laspy + lazrs, one thread"][0])
     cpu_s, ratio = map(float, rows["station, running service"][:2])
     assert (cpu_s - 0.005) / (base_s + 0.005) - 0.005 <= ratio <= (cpu_s + 0.005) / (base_s - 0.005) + 0.005
-    assert float(rows["station, page alone, mean of a day"][0]) > 0
+    assert all(float(cell) > 0 for cell in rows["station, page alone, mean of a day"][:2])
+    assert rows["its folder after a year"][5]  # GB on the disk
     for title in ("station, on the grid", "station, epoch written"):  # beside their own decodes, not printed
         assert all(float(cell) > 0 for cell in rows[title][:2])
     for title in ("scipy binned_statistic_2d", "datashader", "PDAL", "CloudCompare", "py4dgeo M3C2"):

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import math
+import os
+import shutil
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
@@ -14,10 +16,13 @@ import jinja2
 import numpy as np
 
 from station._version import __version__
+from station.archive.areas import FILE_NAME as AREAS
+from station.archive.derived.event_table import FILE_NAME as EVENTS
 from station.archive.derived.event_table import read_events
 from station.archive.derived.product_files import ProductSeries, read_products
 from station.archive.netcdf_layout import Series
 from station.archive.series.index import SeriesIndex
+from station.errors import StoreError
 from station.products.epoch_table import AreaSeries, EpochTable, read_epoch_table
 from station.products.gallery import (
     Gallery,
@@ -43,7 +48,7 @@ from station.products.web.page_health import (
     timeline,
 )
 from station.products.web.page_products import product_curves, product_values
-from station.products.web.page_text import PAGE_TEXT, format_number, format_utc, script_text
+from station.products.web.page_text import PAGE_TEXT, VIEWER_TEXT, format_number, format_utc, script_text
 from station.quantities import Floats
 from station.science.geometry.robust_statistics import NORMAL_95
 
@@ -115,6 +120,8 @@ def write_page(
         context = replace(context, faults=[*context.faults, *gallery.levels.faults])
     for name, parts in STATIC.items():
         replace_if_changed(folder / name, b"".join((ASSETS / part).read_bytes() for part in parts))
+    for name in (AREAS, EVENTS):
+        _offer(series.folder / name, folder / name)
     data = {
         "written_s": context.written_s,
         "expected_every_s": context.expected_every_s,
@@ -153,6 +160,26 @@ def write_page(
         folder / "index.html",
         _render(series, folder, context, table, areas, gallery, len(all_areas), products).encode(),
     )
+
+
+def _offer(source: Path, path: Path) -> None:
+    """Offer a file of the store for download: as a hard link, for files of the store are only ever replaced.
+
+    Where the file system has no hard links it is copied. Raises StoreError if that fails.
+    """
+    tmp_path = path.with_name(f".{path.name}.part")
+    try:
+        if not source.is_file():
+            path.unlink(missing_ok=True)
+        elif not (path.is_file() and path.samefile(source)):
+            tmp_path.unlink(missing_ok=True)
+            try:
+                os.link(source, tmp_path)
+            except OSError:
+                shutil.copyfile(source, tmp_path)
+            tmp_path.replace(path)
+    except OSError as error:
+        raise StoreError(f"{path}: cannot be written: {error}") from error
 
 
 def _write_script(path: Path, name: str, value: object) -> None:
@@ -306,6 +333,7 @@ def _render(
         areas=[newest_value(area) for area in areas],
         products=product_values(products, text),
         t=text,
+        viewer=VIEWER_TEXT[context.language],
         language=context.language,
         calibration=summary_of_sigma(table, by_range),
         by_range=by_range,

@@ -116,9 +116,21 @@ class Page:
         scheme = {"name": "prefers-color-scheme", "value": "dark" if dark else "light"}
         self.call("Emulation.setEmulatedMedia", features=[scheme])
 
-    def screenshot(self, *, whole=False):
-        """Return a screenshot as PNG."""
-        return base64.b64decode(self.call("Page.captureScreenshot", captureBeyondViewport=whole)["data"])
+    def tap(self, x, y):
+        """Press and release the mouse at a place of the window [px]."""
+        for kind in ("mousePressed", "mouseReleased"):
+            self.call("Input.dispatchMouseEvent", type=kind, x=x, y=y, button="left", clickCount=1)
+
+    def screenshot(self, selector=None):
+        """Return a screenshot of the window, or of an element in sight, as PNG."""
+        clip = {}
+        if selector is not None:
+            box = self.run(
+                f"(() => {{ const b = document.querySelector('{selector}').getBoundingClientRect();"
+                " return { x: b.left + scrollX, y: b.top + scrollY, width: b.width, height: b.height }; })()"
+            )
+            clip = {"clip": {**box, "scale": 1}}
+        return base64.b64decode(self.call("Page.captureScreenshot", **clip)["data"])
 
     def errors(self):
         """Errors and warnings of the console, the page and the network."""

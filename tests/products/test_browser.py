@@ -6,7 +6,9 @@ import re
 import shutil
 import subprocess
 import sys
+from datetime import UTC, datetime
 from pathlib import Path
+from urllib.parse import unquote
 
 import numpy as np
 import pytest
@@ -130,6 +132,13 @@ def test_page_works_escapes_names_and_makes_no_foreign_request(tab, address):
     assert rows == tab.run("STATION.area_time_s.length")
     newest = tab.run("document.querySelector('#area-curves tbody tr').textContent").replace("−", "-")
     assert f"{tab.run('STATION.areas[0].mean_m.at(-1)'):.3f}" in newest
+    link = tab.run("document.querySelector('#area-curves details a[download]').href")
+    head, *lines = unquote(link.partition(",")[2]).splitlines()
+    assert head == "start_utc,value,± 95 %"
+    start, mean, half = lines[-1].split(",")
+    assert start == f"{datetime.fromtimestamp(tab.run('STATION.area_time_s.at(-1)'), UTC):%FT%T}.000Z"
+    assert float(mean) == pytest.approx(tab.run("STATION.areas[0].mean_m.at(-1)"), abs=0.0006)
+    assert float(half) == pytest.approx(1.96 * tab.run("STATION.areas[0].sigma_m.at(-1)"), rel=0.01)
 
     # hostile names are escaped everywhere
     assert tab.run("document.querySelector('h1').textContent") == EVIL

@@ -85,6 +85,11 @@ def test_the_page_lists_events(tmp_path):
     page = (tmp_path / "page" / "index.html").read_text(encoding="utf-8")
     assert page.index("snowfall") < page.index("paired")  # the newest first
     assert "± 196" in page
+    assert (tmp_path / "page" / "events.geojson").read_bytes() == (tmp_path / "events.geojson").read_bytes()
+    write_page(series, tmp_path / "page", replace(context, language="de"), 400, None, lambda: None)
+    page = (tmp_path / "page" / "index.html").read_text(encoding="utf-8")
+    assert page.index("Schneefall") < page.index("Paar")
+    assert "<td>aktiv</td>" in page
 
 
 def test_an_active_event_raises_an_alarm_and_a_closed_one_if_it_is_new(write_site):

@@ -113,6 +113,25 @@ def test_page_in_german(write, context):
     assert page_data(folder)["text"]["js_late"] == "Verspätet"
 
 
+@pytest.mark.parametrize("has_links", [True, False])
+def test_page_offers_the_areas_as_stored(write, series, monkeypatch, has_links):
+    if not has_links:
+        monkeypatch.setattr(os, "link", lambda *_: (_ for _ in ()).throw(OSError("no hard links here")))
+    stored, folder = series.folder / "areas.nc", write()
+    html = Elements((folder / "index.html").read_text())
+    offered = [attributes["href"] for _, attributes in html.elements if "download" in attributes]
+    assert offered == ["areas.nc"]
+    assert (folder / "areas.nc").read_bytes() == stored.read_bytes()
+    newer = stored.with_name("newer")
+    newer.write_bytes(b"of the next scan")
+    newer.replace(stored)  # as the store does it
+    page._offer(stored, folder / "areas.nc")
+    assert (folder / "areas.nc").read_bytes() == b"of the next scan"
+    stored.unlink()
+    page._offer(stored, folder / "areas.nc")
+    assert not list(folder.glob("*areas.nc*"))
+
+
 def test_unusable_epochs_are_gaps_in_the_curves(write, series, small):
     unusable = replace(small.make_epoch(6), verdict="unusable", verdict_reason="fallen over")
     epochs.write_epoch(series, unusable)

@@ -84,6 +84,7 @@
       drawing.border(context, now, layers.border_px(now), controls.timeOf(layers.before()), controls.timeOf(data.maps[shown]));
     }
     drawScale(now);
+    return layers.isPicture(now) ? image.complete : layers.isComplete();
   });
 
   function drawScale(now) {

@@ -4,7 +4,7 @@ function stationLayers(data, shownIndex, redraw) {
   const scales = Object.fromEntries(Object.entries(data.scales).map(([name, scale]) => [name, stationValues.scaleOf(scale)]));
   const state = { layer: "change", since: -1, contours: false, swipe: null };  // since: index of a map, -1 the reference
   const painted = new Map(), KEPT = 240, DETAIL = 0.75;  // values per pixel from which a finer level is used
-  let every_m = 0;
+  let every_m = 0, awaited = 0;
 
   const shown = () => data.maps[shownIndex()], source = () => stationValues.LAYERS[state.layer].source;
   const before = () => state.since < 0 ? null : data.maps[state.since];
@@ -31,7 +31,8 @@ function stationLayers(data, shownIndex, redraw) {
       return canvas;
     }
     painted.set(key, null);
-    create().then((canvas) => { painted.set(key, canvas); if (canvas) redraw(); }, () => painted.delete(key));
+    awaited++;
+    create().catch(() => null).then((canvas) => { painted.set(key, canvas); awaited--; redraw(); });
     if (painted.size > KEPT) painted.delete(painted.keys().next().value);
     return null;
   }
@@ -154,5 +155,5 @@ function stationLayers(data, shownIndex, redraw) {
 
   const levelTime = (map) => data.level_times[map.level];
 
-  return { state, draw, at, pairs, isPicture, isComparable, isSwiped, border_px, levelTime, scales, before, every_m: () => every_m };
+  return { state, draw, at, pairs, isPicture, isComparable, isSwiped, border_px, levelTime, scales, before, every_m: () => every_m, isComplete: () => !awaited };
 }

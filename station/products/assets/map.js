@@ -1,4 +1,5 @@
 // A map to pan and zoom: a canvas with pictures of the ground, and drawings on them in map coordinates.
+// `redraw` draws all that is there, and returns true if nothing is missing: until then the canvas is busy.
 function stationMap(canvas, extent, redraw) {
   const context = canvas.getContext("2d");
   const view = { east: 0, north: 0, scale: 1 };  // map coordinates of the middle; metres per pixel of the page
@@ -12,11 +13,12 @@ function stationMap(canvas, extent, redraw) {
 
   function draw() {
     if (frame) return;
+    canvas.setAttribute("aria-busy", "true");
     frame = requestAnimationFrame(() => {
       frame = 0;
       const ratio = devicePixelRatio || 1;
       context.setTransform(ratio, 0, 0, ratio, 0, 0);
-      redraw(context, now());
+      canvas.setAttribute("aria-busy", String(!redraw(context, now())));
     });
   }
 

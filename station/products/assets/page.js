@@ -130,8 +130,18 @@
         }
       }
       for (const header of element.querySelectorAll("th")) header.scope = header.closest("thead") ? "col" : "row";
+      fold.append(make("a", { textContent: text.js_csv, download: "curve.csv", href: csvOf(time_s, lines) }));
     });
     return fold;
+  }
+
+  // The values of a curve as a file, oldest first; those that are missing are empty.
+  function csvOf(time_s, lines) {
+    const columns = lines.flatMap((line) => [
+      [line.label || text.js_value, line.values, line.digits], ...(line.half ? [["± 95 %", line.half, line.digits + 1]] : [])]);
+    const rows = time_s.map((s, i) => [new Date(s * 1000).toISOString(),
+      ...columns.map(([, values, digits]) => values[i] == null ? "" : values[i].toFixed(digits))]);
+    return `data:text/csv;charset=utf-8,${encodeURIComponent([["start_utc", ...columns.map(([name]) => name)], ...rows, ""].join("\n"))}`;
   }
 
   function curve(parent, heading, time_s, lines, band) {

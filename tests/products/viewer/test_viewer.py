@@ -1,14 +1,21 @@
-"""The map of the page in Chromium: what it says of a place is what the store says."""
+"""The map of the page in Chromium and Firefox: what it says of a place is what the store says."""
 
 import importlib.util
+import io
 import re
 import shutil
+import threading
+from contextlib import ExitStack
 from dataclasses import replace
+from functools import partial
+from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 
 import numpy as np
 import pytest
+from PIL import Image
 
+import station
 from station.archive.areas import update_areas
 from station.archive.derived import level_files
 from station.archive.netcdf_layout import Series
@@ -25,17 +32,29 @@ LEVEL_SIGMA_M = 0.006, 0.008  # random and systematic
 REFERENCE_M = 0.014  # random sigma of its cells
 
 
+def browser(name, executables, profile):
+    """A page of a browser; skipped if none of its executables is installed."""
+    executable = next(filter(None, map(shutil.which, executables)), None)
+    if executable is None:
+        pytest.skip(f"map not tested in {executables[0]}: apt-get install {executables[0]}")
+    spec = importlib.util.spec_from_file_location(name, Path(__file__).parents[1] / f"{name}.py")
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module.Page(executable, profile)
+
+
 @pytest.fixture(scope="module")
 def tab(tmp_path_factory):
-    chromium = shutil.which("chromium") or shutil.which("chromium-browser")
-    if chromium is None:
-        pytest.skip("chromium is not installed: map not tested in a browser (apt-get install chromium)")
-    spec = importlib.util.spec_from_file_location("browser", Path(__file__).parents[1] / "browser.py")
-    browser = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(browser)
-    tab = browser.Page(chromium, tmp_path_factory.mktemp("browser"))
+    tab = browser("browser", ["chromium", "chromium-browser"], tmp_path_factory.mktemp("browser"))
     yield tab
     tab.close()
+
+
+@pytest.fixture(scope="module")
+def firefox(tmp_path_factory):
+    window = browser("firefox", ["firefox-esr", "firefox"], tmp_path_factory.mktemp("firefox") / "profile")
+    yield window
+    window.close()
 
 
 @pytest.fixture(scope="module")
@@ -78,13 +97,13 @@ def level_at(column):
 @pytest.fixture(scope="module")
 def addresses(series, tmp_path_factory):
     """The page, in English and in German."""
-    folder = tmp_path_factory.mktemp("pages")
-    for language in ("en", "de"):
+    folders = {"en": series.folder / "page", "de": tmp_path_factory.mktemp("pages") / "de"}
+    for language, folder in folders.items():
+        if language == "de":
+            shutil.copytree(folders["en"], folder)  # the same maps
         context = page.PageContext("x", "", 1.0, 3600.0, [], [], [], {}, language=language)
-        page.write_page(series, folder / language, context, 600, None, lambda: None)
-        if language == "en":
-            shutil.copytree(folder / "en", folder / "de")  # the same maps
-    return {language: (folder / language / "index.html").as_uri() for language in ("en", "de")}
+        page.write_page(series, folder, context, 600, None, lambda: None)
+    return {language: (folder / "index.html").as_uri() for language, folder in folders.items()}
 
 
 @pytest.fixture
@@ -247,3 +266,79 @@ def test_layers_contours_and_play(tab, address):
     tab.await_(f"Number(document.getElementById('slider').value) === {last}")
     tab.await_("[...document.querySelectorAll('button')].some((b) => b.textContent === 'Play')")
     assert tab.errors() == []
+
+
+@pytest.fixture(scope="module")
+def everywhere(series, addresses):
+    """Addresses of the page: in its folder, on a plain web server, and on that of `station serve`."""
+
+    class Handler(SimpleHTTPRequestHandler):
+        def log_message(self, *_):
+            pass
+
+    with ExitStack() as stack:
+        view = station.view(series.folder)
+        stack.callback(view.close)
+        handler = partial(Handler, directory=series.folder / "page")
+        server = stack.enter_context(ThreadingHTTPServer(("127.0.0.1", 0), handler))
+        threading.Thread(target=server.serve_forever, daemon=True).start()
+        stack.callback(server.shutdown)
+        static = f"http://127.0.0.1:{server.server_port}/index.html"
+        yield {"folder": addresses["en"], "static server": static, "station serve": view.address}
+
+
+@pytest.mark.parametrize("place", ["folder", "static server", "station serve"])
+@pytest.mark.parametrize("name", ["tab", "firefox"])
+def test_each_browser_shows_the_values_of_the_store_and_their_colours(
+    request, everywhere, series, small, name, place
+):
+    window = request.getfixturevalue(name)
+    window.set_size(1200, 1000)
+    window.open("about:blank")
+    window.open(f"{everywhere[place]}#layer=significance")
+    window.await_("document.querySelector('#map-canvas[aria-busy=false]')?.id")
+    window.run("document.getElementById('map').scrollIntoView()")
+    picture = np.asarray(Image.open(io.BytesIO(window.screenshot("#map-canvas"))).convert("RGB")).astype(int)
+    left, top, width, height = window.run(
+        "(() => { const c = document.getElementById('map-canvas'), b = c.getBoundingClientRect();"
+        " return [b.left, b.top, c.clientWidth, c.clientHeight]; })()"
+    )
+    grid = series.grid
+    known = np.isfinite(Aggregates(series).reference().elevation_m)  # from the first row and column on
+    rows, columns = (np.count_nonzero(known.any(axis)) for axis in (1, 0))
+    scale = max(columns / width, rows / height)  # cells a pixel of the whole map
+
+    def pixel(row, column):
+        """Column and row of the middle of a cell in the picture, inside its border."""
+        return [
+            round(1 + size / 2 + (k + 0.5 - count / 2) / scale)
+            for k, size, count in ((column, width, columns), (row, height, rows))
+        ]
+
+    def colours(part):
+        """Colours (n, 3) of a part of the grid, without its border."""
+        (left, top), (right, bottom) = pixel(*(k.start for k in part)), pixel(*(k.stop - 1 for k in part))
+        return picture[top:bottom, left:right].reshape(-1, 3)
+
+    for part, is_higher in ((small.RISE, True), (small.FALL, False)):
+        red, _, blue = np.median(colours(part), axis=0)
+        assert (blue - red > 60) if is_higher else (red - blue > 60)
+    unobserved = colours(small.UNOBSERVED)
+    assert np.ptp(unobserved.mean(axis=1)) > 40  # hatched
+    assert np.ptp(unobserved, axis=1).max() < 30  # without the colour of any change
+
+    column, row = PLACE
+    x, y = pixel(row, column)
+    window.tap(left + x, top + y)
+    values = window.await_("document.querySelector('#asked-values dd')?.textContent")
+    asked = window.run("document.querySelector('#asked h3').textContent").replace("\u202f", "")
+    east_m, north_m = (int(number) for number in re.search(r"at (\d+) E, (\d+) N", asked).groups())
+    assert (east_m, north_m) == pytest.approx((grid.x_m[column], grid.y_m[row]), abs=1.5)
+    change, half = (float(n) for n in re.findall(r"[-\d.]+", values.replace("−", "-"))[:2])
+    index, mask = SeriesIndex(series), np.zeros(grid.shape, bool)
+    mask[row, column] = True
+    aggregates = Aggregates(series)
+    stored_m = float(aggregates.read_cells(index[-1], mask).change_m[0])
+    assert change == pytest.approx(stored_m, abs=0.0011)
+    assert half == pytest.approx(1.96 * aggregates.variance(mask, index[-1]) ** 0.5, rel=0.03, abs=0.0006)
+    assert window.await_("document.querySelectorAll('#asked-curves canvas').length") >= 1
