@@ -6,7 +6,7 @@ import fcntl
 import os
 import shutil
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from datetime import UTC, datetime, timedelta
 from itertools import groupby
 from pathlib import Path
@@ -178,6 +178,8 @@ def _copy_epochs(file: Any, source: EpochSource, progress: Callable[[], None]) -
 def delete_expired(series: Series, now: datetime) -> list[Path]:
     """Delete files not in use for the grace period, and temporary files of killed processes; return them.
 
+    What cannot be deleted now is tried again the next time.
+
     A file is in use while `series.nc` refers to it, will refer to it, or has the only copy of an epoch; all
     are while `series.nc` is damaged.
     """
@@ -200,5 +202,6 @@ def delete_expired(series: Series, now: datetime) -> list[Path]:
         if path.is_dir():  # of the cache of the viewing geometry
             shutil.rmtree(path, ignore_errors=True)
         else:
-            path.unlink()
-    return expired
+            with suppress(OSError):
+                path.unlink()
+    return [path for path in expired if not path.exists()]
