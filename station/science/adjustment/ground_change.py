@@ -17,7 +17,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy import sparse
 
-from station.quantities import Bools, Floats, Reals
+from station.quantities import Bools, Floats, Ints, Reals
 from station.science.adjustment.normal_equations import ScaledCholesky
 from station.science.adjustment.patches import RANGE_BIN_M, Patches
 from station.science.uncertainty import common_mode
@@ -29,6 +29,7 @@ CHANGE_STEPS_M = tuple(float(step) for step in np.geomspace(0.5 / 2**11, 0.5, 12
 TREND_SIZES_M = tuple(float(size) for size in np.geomspace(0.0005, 2.0, 8))
 TRENDS = 6
 KINDS = 2  # of moving ground: ice and snow, bare ground
+STABLE = KINDS  # kind of all other ground
 KIND_SPACING = 10_000  # of the azimuth knots of two kinds, so that they are not correlated
 MIN_SHARE = 1e-6  # of a kind of ground in a patch; less is rounding
 TREND_RATIO = 0.6  # of a trend's size to that of the mean: melt or settling from zero to twice the mean
@@ -103,11 +104,11 @@ START_MODEL = ChangeModel(0, len(CHANGE_STEPS_M) // 2, len(TREND_SIZES_M) // 2)
 class GroundChange:
     """Unknown change of patches (n,): trends, knots, depths of thin snow, heave, in this order.
 
-    Snow depths are free if `surface_rises`.
+    Snow depths are free if `surface_rises`. A patch of moving ground is of the kind that has most of it.
     """
 
     design: sparse.csr_array  # (n, k)
-    moving: Bools  # (n,)
+    kind: Ints  # (n,) from 0, STABLE if not moving
     knot_precisions: list[Floats]  # (knots, knots) for a unit step, one per correlation
     knot_log_determinants: list[float]  # of their inverses
     trend_columns: int
@@ -116,6 +117,11 @@ class GroundChange:
     heave_columns: int
     heave_m: float
     surface_rises: bool = True
+
+    @property
+    def moving(self) -> Bools:
+        """Whether patches are moving ground (n,)."""
+        return np.asarray(self.kind != STABLE)
 
     def precision_at(self, model: ChangeModel) -> tuple[Floats, float]:
         """Return the precision (k, k) of a model, and log |precision⁻¹|."""
@@ -171,7 +177,7 @@ def ground_change(patches: Patches, moving: Bools) -> GroundChange:
     heave_design = _heave(patches, ~moving)
     return GroundChange(
         sparse.hstack([trend_design, knot_design, snow_design, heave_design], format="csr"),
-        moving,
+        np.where(moving, np.argmax(shares, axis=0), STABLE),
         precisions,
         log_determinants,
         trend_design.shape[1],

@@ -13,8 +13,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from station.quantities import Bools, Floats, Reals, SharedParameters
-from station.science.adjustment.ground_change import ground_change
+from station.quantities import Bools, Floats, Ints, Reals, SharedParameters
+from station.science.adjustment.ground_change import STABLE, ground_change
 from station.science.adjustment.leverage import fit_leverage
 from station.science.adjustment.normal_equations import (
     LineInclination,
@@ -148,7 +148,7 @@ def adjust_scan(
         residual_m = misclosure_m - equations.effect(
             solution.estimate, reduced.back_substitute(solution.estimate)
         )
-        excess_m2 = _residual_variance(patches, residual_m, moving)
+        excess_m2 = _residual_variance(patches, residual_m, change.kind)
         if iteration >= WARMUP_ITERATIONS:
             ratio = residual_m / np.sqrt(patches.variance_m2 + excess_m2) / TUKEY
             robust_weight = np.where(np.abs(ratio) < 1, (1 - ratio**2) ** 2, 0.0)
@@ -221,13 +221,15 @@ def _state_and_log(
     return np.asarray(state), np.asarray(predicted_rad)
 
 
-def _residual_variance(patches: Patches, residual_m: Floats, moving: Bools) -> Floats:
-    """Return the residual variance (n,) of patches beyond their cells' random errors [m²].
+def _residual_variance(patches: Patches, residual_m: Floats, kind: Ints) -> Floats:
+    """Return the residual variance (n,) of patches beyond their cells' random errors [m²], by kind of ground.
 
-    Change that is not smooth shifts several patches together; they count as a single observation.
+    Change that is not smooth shifts several patches together; they count as a single observation. It is that
+    of one kind: where ice melts, rock beside it does not show by how much ice differs from a trend.
     """
     excess_m2 = np.empty(len(patches))
-    for selected, max_m in ((moving, MAX_MOVING_EXCESS_M), (~moving, EXCESS_BOUNDS_M[1])):
+    for index in range(STABLE + 1):
+        selected, max_m = kind == index, EXCESS_BOUNDS_M[1] if index == STABLE else MAX_MOVING_EXCESS_M
         if selected.any():
             single_m2 = _excess_variance(residual_m[selected], patches.variance_m2[selected], max_m)
             sigma_m = np.sqrt(patches.variance_m2[selected] + single_m2)

@@ -487,6 +487,30 @@ def test_sigma_matches_the_errors_during_snowfall_with_little_stable_ground(stab
     assert 0.8 < np.sqrt(np.mean(z**2)) < 1.25
 
 
+@pytest.mark.integration
+def test_uneven_melt_beside_bare_ground_at_rest_does_not_tilt_the_scanner():
+    """Melt of 0.15 m that varies by a third from patch to patch; half of the moving ground is bare."""
+    stable, bare = random_sites(50, 40, sector_deg=(0, 10)), random_sites(51, 900, sector_deg=(0, 25))
+    z = []
+    for seed in range(12):
+        rng, (_, root) = np.random.default_rng(seed), dense_prior(PARAMS)
+        state = root @ rng.normal(size=len(root))
+        ice = replace(random_sites(seed + 60, 800, sector_deg=(15, 40), steep=0.3), stable=False)
+        melt_m = 0.15 * (1 + rng.normal(0, 1 / 3, 800))
+        observed_m = [
+            sites.matrix() @ state + rng.normal(0, 0.01, len(sites.line)) for sites in (stable, bare, ice)
+        ]
+        patches = concatenate(
+            stable.patches(observed_m[0]),
+            bare.patches(observed_m[1], ground_class=GroundClass.MOVING),
+            ice.patches(observed_m[2] - melt_m, ground_class=GroundClass.MOVING),
+        )
+        adjustment = adjust_scan(patches, NO_TILT, knot_prior(PARAMS), None)
+        error_m = ice.matrix() @ state - adjustment.effect(ice.jacobian())
+        z.append(error_m / height_sigma(adjustment, ice))
+    assert 0.8 < np.sqrt(np.mean(np.square(z))) < 1.25
+
+
 def test_an_unchanged_glacier_improves_the_adjustment():
     stable = random_sites(44, 60, sector_deg=(0, 10))
     with_glacier, without_glacier = (simulate(45, stable, moving=moving) for moving in (1000, 0))
