@@ -281,6 +281,35 @@ def test_products_are_calibrated(calm):
         assert abs(float(budget[name].mean())) < 0.1 * positive_m3  # the sum of positive cells is no gain
 
 
+@pytest.mark.slow
+def test_products_of_melt_are_calibrated(tmp_path):
+    """Melt, mass balance and height of places on the ice, of exactly known density, on two stations."""
+    z = defaultdict(list)
+    for seed in (1, 2):
+        melting = {"reference_scans": REFERENCE, "melt_m_per_h": 0.01}
+        simulate(tmp_path / f"{seed}", replace(named("melt", hours=6, seed=seed), **melting))
+        processed = ProcessedStation(tmp_path / f"{seed}")
+        melts = (processed.true_change[-1] < -0.005) & np.isfinite(processed.error()).all(axis=0)
+        places = {}
+        for top, left in np.ndindex(*(size // BOX for size in melts.shape)):
+            cells = np.zeros(melts.shape, bool)
+            cells[BOX * top :, BOX * left :][:3, :3] = True
+            if melts[cells].all():
+                places[f"{top} {left}"] = cells
+        places = dict(list(places.items())[:: len(places) // 20])
+        assert len(places) >= 20
+        true_m = np.array([[m[cells].mean() for cells in places.values()] for m in processed.true_change])
+        for kind, density, true in (
+            ("melt", {"density_kg_m3": 900.0}, -0.9 * true_m),
+            ("surface_mass_balance", {"density_kg_m3": 400.0}, 0.4 * true_m),
+        ):
+            product = product_of(processed, places, kind=kind, **density)
+            z[kind] += [(product[kind].values - true) / product[f"{kind}_uncertainty"].values]
+        point = product_of(processed, places, kind="point", at=(0.0, 0.0))
+        z["point"] += [(point.elevation_change.values - true_m) / point.elevation_change_uncertainty.values]
+    assert all(0.8 < rms(np.hstack(values)) < 1.25 for values in z.values())
+
+
 @pytest.fixture(scope="module")
 def snowfall(tmp_path_factory):
     folder = tmp_path_factory.mktemp("snowfall") / "station"
