@@ -44,7 +44,6 @@ from station.science.time_series.events import (
     before_level,
     detect_regions,
     event_thresholds,
-    scan_scatter,
     surrounding_weights,
 )
 
@@ -228,7 +227,7 @@ class EventQueries:
             [self._levels(scan) for scan in before],
             (self._levels(first), self._levels(second)),
             (systematic_m2[0], systematic_m2[1]),
-            scan_scatter(np.stack([self._levels(scan).change_m for scan in history])),
+            np.stack([self._levels(scan).change_m for scan in history]),
             newest.rock > 0.5,
             event_thresholds(int(np.count_nonzero(known)), self._scans_per_year),
             LEAST_BEFORE,
