@@ -7,7 +7,7 @@ sizes. Source: equations.md, 6.11.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -176,8 +176,8 @@ def _contrast(base: BlockLevels, levels: BlockLevels, systematic_m2: Floats, roc
 def surroundings(values: Floats, rock: Bools, excluded: Bools | None = None) -> Floats:
     """Return the median of what surrounds each block (by, bx): bare ground of bare ground, others of others.
 
-    It is the median over tiles of their medians, interpolated between tiles, NaN where none is observed. A tile
-    in which few blocks are of that ground may be all edge: it counts only if there is no other.
+    It is the median over tiles of their medians, interpolated between tiles, NaN where none is observed. A
+    tile in which few blocks are of that ground may be all edge: it counts only if there is no other.
     """
     result = np.full(values.shape, np.nan)
     for ground in (rock, ~rock):
