@@ -101,7 +101,9 @@ def station_objects(series: Series) -> list[tuple[int, Bools]]:
         history_m = np.stack([level.change_m for level in history])
         shared_m2 = series.systematic_m2, series.systematic_m2
         pair = levels[hour - 1], levels[hour]
-        return detect_regions(history[-BEFORE:], pair, shared_m2, history_m, series.rock, thresholds)
+        return detect_regions(
+            history[-BEFORE:], pair, shared_m2, shared_m2, history_m, series.rock, thresholds
+        )
 
     detected = ((hour, regions(hour)) for hour in range(LEAST_HISTORY + 1, len(levels)))
     tracks: list[Track] = track_events(detected)

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 import shapely
-from scipy import ndimage, sparse
+from scipy import ndimage
 
 from station.archive.derived.event_table import (
     KEY_LENGTH,
@@ -28,12 +28,16 @@ from station.archive.epochs import EpochRef
 from station.archive.netcdf_layout import Series
 from station.archive.series.index import SeriesIndex, references_and_usable
 from station.errors import StoreError
-from station.quantities import Bools, Floats, Grid, Ints, SharedParameters
-from station.queries.aggregates import common_error_covariance
+from station.quantities import Bools, Floats, Grid, Ints
 from station.queries.block_sums import epoch_sums
 from station.queries.blocks import BlockQueries, Blocks
 from station.queries.epoch_cells import EpochCells, EpochReader
-from station.science.analysis.calibration import SparseJacobian
+from station.queries.event_errors import (
+    SystematicErrors,
+    difference_of,
+    sampling_variance,
+    shared_variance,
+)
 from station.science.analysis.voids import area_weights, void_variance
 from station.science.geometry.robust_statistics import nmad
 from station.science.time_series.event_tracks import Track, pair_tracks, track_events
@@ -218,15 +222,16 @@ class EventQueries:
         *history, first, second = window
         before = history[-BEFORE:]
         newest = self._with_jacobian(second)
-        systematic_m2 = [
-            self._systematic_variance(newest, self._shared(scan), self._shared(before[-1]))
-            for scan in (first, second)
+        errors = SystematicErrors(newest)
+        differences = [
+            difference_of(self._shared(scan), self._shared(before[-1])) for scan in (first, second)
         ]
         known = self._queries.reference_blocks(self._version(second))["known"] > 0
         regions = detect_regions(
             [self._levels(scan) for scan in before],
             (self._levels(first), self._levels(second)),
-            (systematic_m2[0], systematic_m2[1]),
+            [errors.of_blocks(difference) for difference in differences],
+            [errors.against_surroundings(difference) for difference in differences],
             np.stack([self._levels(scan).change_m for scan in history]),
             newest.rock > 0.5,
             event_thresholds(int(np.count_nonzero(known)), self._scans_per_year),
@@ -246,19 +251,6 @@ class EventQueries:
 
     def _with_jacobian(self, scan: int) -> Blocks:
         return self._queries.read(self._epoch(scan))
-
-    @staticmethod
-    def _systematic_variance(geometry: Blocks, scan: EpochCells, before: EpochCells) -> Floats:
-        """Return the systematic variance of the difference of two scans (by, bx), with one Jacobian."""
-        variance_m2 = np.zeros(geometry.count.shape)
-        difference = _difference(scan, before)
-        if (
-            geometry.jacobian is not None
-            and difference is not None
-            and difference.names == geometry.parameters
-        ):
-            variance_m2[geometry.observed] = geometry.jacobian.variance(difference)
-        return variance_m2
 
     def _events(self, tracks: list[Track]) -> Iterator[tuple[Event, shapely.Geometry]]:
         volumes = []
@@ -361,8 +353,8 @@ class EventQueries:
         weights = area_m2 * (filled - around)
         volume_m3 = float(np.sum(weights[known] * change_m[known]))
         variance = float(np.sum(weights[known] ** 2 * random_m2[known]))
-        variance += self._shared_variance(newest, self._shared(before[-1]), weights)
-        variance += _sampling_variance(newest.count, self._queries.cells, weights, change_m)
+        variance += shared_variance(newest, self._shared(before[-1]), weights)
+        variance += sampling_variance(newest.count, self._queries.cells, weights, change_m)
         variance += area_m2**2 * void_variance(
             members, distance, np.where(known, change_m, np.nan), random_m2
         )
@@ -372,15 +364,6 @@ class EventQueries:
             count = int(np.count_nonzero(members))
             variance += area_m2**2 * patchy_m2 * min(1.0, PATCH_BLOCKS / count)
         return [round(volume_m3, 4), round(float(np.sqrt(variance)), 4)]
-
-    @staticmethod
-    def _shared_variance(newest: Blocks, before: EpochCells, weights: Floats) -> float:
-        difference = _difference(newest.cells, before)
-        if newest.jacobian is None or difference is None:
-            return 0.0
-        row = sparse.csr_array(weights[newest.observed][None, :])
-        sums = SparseJacobian(newest.jacobian).sums(row)
-        return float(sums.variance(np.zeros(row.shape[1]), difference)[0])
 
 
 def _mean_level(first: BlockLevels, second: BlockLevels) -> BlockLevels:
@@ -408,31 +391,3 @@ def _members(
     opposite_m = -track.sign * (change_m - level_m)
     edge = ndimage.binary_dilation(core, NEIGHBOURS, EDGE_BLOCKS) & known
     return np.asarray(core | (edge & (opposite_m < EDGE_SIGMAS * np.sqrt(random_m2))))
-
-
-def _sampling_variance(count: Floats, cells: int, weights: Floats, change_m: Floats) -> float:
-    """Return the variance of the weighted sum because the observed cells are a sample of their block.
-
-    The scatter within a block is that of it and its neighbours, as on a steady slope of the change.
-    """
-    inside = weights > 0
-    filled = np.where(np.isfinite(change_m), change_m, 0.0)
-    number = np.maximum(ndimage.uniform_filter(np.isfinite(change_m).astype(np.float64), 3), 1 / 9)
-    mean_m = ndimage.uniform_filter(filled, 3) / number
-    scatter_m2 = np.maximum(ndimage.uniform_filter(filled**2, 3) / number - mean_m**2, 0.0)
-    unseen = 1 - count / cells**2 if cells > 1 else np.ones_like(count)
-    sample_m2 = scatter_m2 * np.clip(unseen, 0.0, 1.0) / np.maximum(count, 1)
-    return float(np.sum((weights**2 * sample_m2)[inside]))
-
-
-def _difference(scan: EpochCells, before: EpochCells) -> SharedParameters | None:
-    """Return the shared parameters of the difference of two scans: both errors, less what is common."""
-    first, second = scan.shared, before.shared
-    if first is None or second is None or first.names != second.names:
-        return first if first is None or second is None else first + first
-    common = common_error_covariance([scan, before])
-    covariance = first.covariance + second.covariance
-    if common is not None:
-        covariance = covariance - common - common.T
-    line_m2 = first.line_tilt_variance + second.line_tilt_variance
-    return replace(first, covariance=covariance, line_tilt_variance=line_m2)

@@ -7,7 +7,7 @@ sizes. Source: equations.md, 6.11.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -67,7 +67,8 @@ class _Contrast:
     change_m: Floats
     excess_m: Floats
     random_m2: Floats
-    systematic_m2: Floats
+    systematic_m2: Floats  # of the change
+    contrast_m2: Floats  # of the excess: what errors of the scan do otherwise here than around
     patchy_m2: Floats  # by which the change differs from block to block, beyond the errors
 
 
@@ -140,8 +141,9 @@ def window_scatter(differences_m: Floats, size: int) -> Floats:
 
 def detect_regions(
     before: list[BlockLevels],
-    after: tuple[BlockLevels, BlockLevels],
-    systematic_m2: tuple[Floats, Floats],
+    after: Sequence[BlockLevels],
+    systematic_m2: Sequence[Floats],
+    contrast_m2: Sequence[Floats],
     history_m: Floats,
     rock: Bools,
     thresholds: Thresholds,
@@ -150,27 +152,30 @@ def detect_regions(
     """Return the regions that two scans show to have changed since the scans before, the largest first.
 
     `systematic_m2` (by, bx) is the variance of the systematic errors in the difference of each of the two
-    scans and those before, `history_m` (n, by, bx) are all earlier scans, `rock` marks blocks of bare ground.
+    scans and those before, `contrast_m2` that of a block less its surroundings. `history_m` (n, by, bx) are
+    all earlier scans, `rock` marks blocks of bare ground.
     Both scans must show the change with the same sign, beyond the thresholds.
     """
     base = before_level(before, least_before)
     first, second = (
-        _contrast(base, levels, shared_m2, rock)
-        for levels, shared_m2 in zip(after, systematic_m2, strict=True)
+        _contrast(base, levels, shared_m2, excess_m2, rock)
+        for levels, shared_m2, excess_m2 in zip(after, systematic_m2, contrast_m2, strict=True)
     )
     regions = list(_widespread_regions(first, second, thresholds.widespread))
     regions += _local_regions((first, second), history_m, rock, thresholds.local)
     return sorted(regions, key=lambda region: (-int(region.blocks.sum()), -region.sign))
 
 
-def _contrast(base: BlockLevels, levels: BlockLevels, systematic_m2: Floats, rock: Bools) -> _Contrast:
+def _contrast(
+    base: BlockLevels, levels: BlockLevels, systematic_m2: Floats, contrast_m2: Floats, rock: Bools
+) -> _Contrast:
     change_m = levels.change_m - base.change_m
     random_m2 = levels.random_m2 + base.random_m2
     excess_m = change_m - surroundings(change_m, rock)
     spread_m = surroundings(np.abs(excess_m), rock) / MEDIAN_ABSOLUTE_NORMAL
     usual_m2 = surroundings(np.where(np.isfinite(change_m), random_m2, np.nan), rock)
     patchy_m2 = np.nan_to_num(np.maximum(spread_m**2 - usual_m2, 0.0))  # as melt and drifts of snow differ
-    return _Contrast(change_m, excess_m, random_m2, np.nan_to_num(systematic_m2), patchy_m2)
+    return _Contrast(change_m, excess_m, random_m2, systematic_m2, contrast_m2, patchy_m2)
 
 
 def surroundings(values: Floats, rock: Bools, excluded: Bools | None = None) -> Floats:
@@ -259,9 +264,8 @@ def _local_regions(
 def _may_have_changed(contrasts: tuple[_Contrast, _Contrast], size: int, sigmas: float) -> bool:
     """Return True if windows exceed the threshold by their stated errors: few scans show any."""
     means, variances = zip(*(_window_means(contrast, size) for contrast in contrasts), strict=True)
-    mean_m = _confirmed(*means)
-    deep = np.abs(mean_m) > MIN_DEPTH_M
-    return bool((deep & (np.abs(mean_m) > sigmas * np.sqrt(np.fmin(*variances)))).any())
+    mean_m = np.abs(_confirmed(*means))
+    return bool(((mean_m > MIN_DEPTH_M) & (mean_m > sigmas * np.sqrt(np.fmin(*variances)))).any())
 
 
 def _scores_of_both(
@@ -270,7 +274,7 @@ def _scores_of_both(
     """Return mean excess [m] and z of windows that both scans confirm, else 0.
 
     The variance is that of the errors, or what the window scattered before, if that is more. If windows
-    around it have a larger z than normal errors, this one has too.
+    around it have a larger z than normal errors, so has this one.
     """
     scatter_m2 = SCATTER_VARIANCE * window_scatter(differences_m, size)
     height, width = scatter_m2.shape
@@ -296,11 +300,11 @@ def _window_means(contrast: _Contrast, size: int) -> tuple[Floats, Floats]:
     observed = np.isfinite(contrast.excess_m) & (contrast.random_m2 > 0)
     count = _window_sums(observed, size)
     count[count < MIN_OBSERVED * size**2] = np.nan
-    mean_m, random_m2, systematic_m2 = (
+    mean_m, random_m2, contrast_m2 = (
         _window_sums(np.where(observed, values, 0.0), size) / count
-        for values in (contrast.excess_m, contrast.random_m2, contrast.systematic_m2)
+        for values in (contrast.excess_m, contrast.random_m2, contrast.contrast_m2)
     )
-    return mean_m, random_m2 / count + systematic_m2
+    return mean_m, random_m2 / count + contrast_m2
 
 
 def _tail_factor(absolute_z: Floats) -> float:

@@ -56,7 +56,13 @@ class Valley:
         shared_m2 = self.systematic_m2
         history_m = np.stack([scan.change_m for scan in scans[:-2]])
         return detect_regions(
-            scans[-8:-2], (scans[-2], scans[-1]), (shared_m2, shared_m2), history_m, ROCK, THRESHOLDS
+            scans[-8:-2],
+            (scans[-2], scans[-1]),
+            (shared_m2,) * 2,
+            (shared_m2,) * 2,
+            history_m,
+            ROCK,
+            THRESHOLDS,
         )
 
 

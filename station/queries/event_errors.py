@@ -1,0 +1,120 @@
+"""Errors of blocks in the difference of two scans, alone and against what surrounds them.
+
+Source: equations.md, 6.11.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cached_property
+from typing import TypeGuard
+
+import numpy as np
+from scipy import ndimage, sparse
+
+from station.quantities import Bools, Floats, Ints, Reals, SharedParameters
+from station.queries.aggregates import common_error_covariance
+from station.queries.blocks import Blocks
+from station.queries.epoch_cells import EpochCells
+from station.science.analysis.calibration import SparseJacobian, group_means
+from station.science.time_series.events import SURROUNDING_TILES, TILE
+
+
+class SystematicErrors:
+    """Systematic errors of the blocks of a scan, by the shared parameters of a difference of scans.
+
+    They are zero without a Jacobian, and for parameters that are not those of the scan.
+    """
+
+    def __init__(self, geometry: Blocks) -> None:
+        self._geometry = geometry
+
+    def of_blocks(self, difference: SharedParameters | None) -> Floats:
+        """Return the variance of each block (by, bx) [m²]."""
+        jacobian = self._geometry.jacobian
+        if jacobian is None or not self._are_of_scan(difference):
+            return np.zeros(self._geometry.count.shape)
+        return self._placed(jacobian.variance(difference))
+
+    def against_surroundings(self, difference: SharedParameters | None) -> Floats:
+        """Return the variance of each block (by, bx) less the mean of what surrounds it [m²].
+
+        With j the Jacobian of the block, g that of its surroundings: (j - g) C (j - g)ᵀ. The line tilts of
+        the surroundings average out.
+        """
+        jacobian = self._geometry.jacobian
+        if jacobian is None or not self._are_of_scan(difference):
+            return np.zeros(self._geometry.count.shape)
+        around, group = self._surroundings
+        weighted = around @ difference.covariance
+        design = sparse.coo_array(self._design)
+        entries = design.data * weighted[group[design.row], design.col]
+        common_m2 = np.bincount(design.row, entries, len(group))
+        around_m2 = np.sum(weighted * around, axis=1)[group]
+        line_m2 = jacobian.variance(replace(difference, covariance=0 * difference.covariance))
+        own_m2 = jacobian.variance(difference)
+        return self._placed(np.maximum(own_m2 - 2 * common_m2 + around_m2, line_m2))
+
+    def _are_of_scan(self, difference: SharedParameters | None) -> TypeGuard[SharedParameters]:
+        return difference is not None and difference.names == self._geometry.parameters
+
+    def _placed(self, values: Reals) -> Floats:
+        placed = np.zeros(self._geometry.count.shape)
+        placed[self._geometry.observed] = values
+        return placed
+
+    @cached_property
+    def _design(self) -> sparse.csr_array:
+        assert self._geometry.jacobian is not None  # noqa: S101 - its callers return before
+        return self._geometry.jacobian.to_sparse()
+
+    @cached_property
+    def _surroundings(self) -> tuple[Floats, Ints]:
+        """Mean Jacobian (g, p) of the surroundings of each tile and ground, and that of each block (n,)."""
+        observed = self._geometry.observed
+        row, column = (index // TILE for index in np.nonzero(observed))
+        rock: Bools = self._geometry.rock[observed] > 0.5
+        tiles, group = np.unique(np.stack([rock, row, column]), axis=1, return_inverse=True)
+        apart = np.abs(tiles[1:, :, None] - tiles[1:, None, :]).max(axis=0)
+        near = (apart <= SURROUNDING_TILES // 2) & (tiles[0][:, None] == tiles[0])
+        shares = sparse.csr_array(near / near.sum(axis=1, keepdims=True))
+        means = (group_means(np.ravel(group)) @ self._design).toarray()
+        return np.asarray(shares @ means), np.ravel(group)
+
+
+def shared_variance(newest: Blocks, before: EpochCells, weights: Floats) -> float:
+    """Return the systematic variance of a weighted sum (by, bx) in the difference of two scans."""
+    difference = difference_of(newest.cells, before)
+    if newest.jacobian is None or difference is None:
+        return 0.0
+    row = sparse.csr_array(weights[newest.observed][None, :])
+    sums = SparseJacobian(newest.jacobian).sums(row)
+    return float(sums.variance(np.zeros(row.shape[1]), difference)[0])
+
+
+def sampling_variance(count: Floats, cells: int, weights: Floats, change_m: Floats) -> float:
+    """Return the variance of the weighted sum because the observed cells are a sample of their block.
+
+    The scatter within a block is that of it and its neighbours, as on a steady slope of the change.
+    """
+    inside = weights > 0
+    filled = np.where(np.isfinite(change_m), change_m, 0.0)
+    number = np.maximum(ndimage.uniform_filter(np.isfinite(change_m).astype(np.float64), 3), 1 / 9)
+    mean_m = ndimage.uniform_filter(filled, 3) / number
+    scatter_m2 = np.maximum(ndimage.uniform_filter(filled**2, 3) / number - mean_m**2, 0.0)
+    unseen = 1 - count / cells**2 if cells > 1 else np.ones_like(count)
+    sample_m2 = scatter_m2 * np.clip(unseen, 0.0, 1.0) / np.maximum(count, 1)
+    return float(np.sum((weights**2 * sample_m2)[inside]))
+
+
+def difference_of(scan: EpochCells, before: EpochCells) -> SharedParameters | None:
+    """Return the shared parameters of the difference of two scans: both errors, less what is common."""
+    first, second = scan.shared, before.shared
+    if first is None or second is None or first.names != second.names:
+        return first if first is None or second is None else first + first
+    common = common_error_covariance([scan, before])
+    covariance = first.covariance + second.covariance
+    if common is not None:
+        covariance = covariance - common - common.T
+    line_m2 = first.line_tilt_variance + second.line_tilt_variance
+    return replace(first, covariance=covariance, line_tilt_variance=line_m2)
