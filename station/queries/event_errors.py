@@ -17,7 +17,10 @@ from station.queries.aggregates import common_error_covariance
 from station.queries.blocks import Blocks
 from station.queries.epoch_cells import EpochCells
 from station.science.analysis.calibration import SparseJacobian, group_means
+from station.science.geometry.robust_statistics import MEDIAN_ABSOLUTE_NORMAL
 from station.science.time_series.events import SURROUNDING_TILES, TILE
+
+LEAST_SQUARES = 30  # around a region, in any position, for their scatter
 
 
 class SystematicErrors:
@@ -90,6 +93,44 @@ def shared_variance(newest: Blocks, before: EpochCells, weights: Floats) -> floa
     row = sparse.csr_array(weights[newest.observed][None, :])
     sums = SparseJacobian(newest.jacobian).sums(row)
     return float(sums.variance(np.zeros(row.shape[1]), difference)[0])
+
+
+def like_regions_variance(members: Bools, usable: Bools, change_m: Floats, random_m2: Floats) -> float:
+    """Return the variance of the mean of a region (by, bx) less its surroundings, beyond random errors [m²].
+
+    It is what squares of its area around it scatter against their own surroundings: melt and drifts of snow
+    differ from place to place. Without room for them, that of single blocks.
+    """
+    size, reach = round(np.sqrt(np.count_nonzero(members))), SURROUNDING_TILES // 2 * TILE
+    window = tuple(
+        slice(max(int(index[0]) - reach, 0), int(index[-1]) + reach + 1)
+        for index in (np.flatnonzero(members.any(axis=axis)) for axis in (1, 0))
+    )
+    seen = (usable & ~ndimage.binary_dilation(members, iterations=2))[window]
+    change_m, random_m2 = (np.where(seen, values[window], 0.0) for values in (change_m, random_m2))
+
+    def sums(values: Floats | Bools, width: int) -> Floats:
+        means = ndimage.uniform_filter(values.astype(np.float64), width, mode="constant")
+        return np.asarray(means * width**2)
+
+    fields = seen, change_m, random_m2
+    inside, change_inside, random_inside = (sums(values, size) for values in fields)
+    around, change_around, random_around = (
+        sums(values, size + 2 * TILE) - sums(values, size + 2) for values in fields
+    )
+    chosen = seen & (inside > size**2 / 2) & (around > size**2 / 2)
+    inside, around = np.maximum(inside, 1), np.maximum(around, 1)
+    if np.count_nonzero(chosen) < LEAST_SQUARES:
+        excess_m, expected_m2 = (change_m - np.median(change_m[seen]))[seen], random_m2[seen]
+    else:
+        excess_m = (change_inside[chosen] / inside[chosen]) - change_around[chosen] / around[chosen]
+        expected_m2 = (
+            random_inside[chosen] / inside[chosen] ** 2 + random_around[chosen] / around[chosen] ** 2
+        )
+    if not len(excess_m):
+        return 0.0
+    scatter_m = float(np.median(np.abs(excess_m))) / MEDIAN_ABSOLUTE_NORMAL
+    return max(scatter_m**2 - float(np.median(expected_m2)), 0.0)
 
 
 def sampling_variance(count: Floats, cells: int, weights: Floats, change_m: Floats) -> float:

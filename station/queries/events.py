@@ -35,14 +35,13 @@ from station.queries.epoch_cells import EpochCells, EpochReader
 from station.queries.event_errors import (
     SystematicErrors,
     difference_of,
+    like_regions_variance,
     sampling_variance,
     shared_variance,
 )
 from station.science.analysis.voids import area_weights, void_variance
-from station.science.geometry.robust_statistics import nmad
 from station.science.time_series.event_tracks import Track, pair_tracks, track_events
 from station.science.time_series.events import (
-    PATCH_BLOCKS,
     BlockLevels,
     Region,
     before_level,
@@ -359,10 +358,9 @@ class EventQueries:
             members, distance, np.where(known, change_m, np.nan), random_m2
         )
         variance += (RETAINED_SIGMA * volume_m3) ** 2
-        if np.count_nonzero(around) > PATCH_BLOCKS:
-            patchy_m2 = max(nmad(change_m[around > 0]) ** 2 - float(np.median(random_m2[around > 0])), 0.0)
-            count = int(np.count_nonzero(members))
-            variance += area_m2**2 * patchy_m2 * min(1.0, PATCH_BLOCKS / count)
+        if around.any():
+            usable = known & ground & ~others
+            variance += area_m2**2 * like_regions_variance(members, usable, change_m, random_m2)
         return [round(volume_m3, 4), round(float(np.sqrt(variance)), 4)]
 
 

@@ -1,4 +1,4 @@
-"""Systematic errors of blocks less what surrounds them, against dense algebra."""
+"""Errors of blocks less what surrounds them: systematic ones against dense algebra, patches by simulation."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy import ndimage
 from support.epochs import random_epoch
 from support.shared_parameters import SCANNER, random_shared
 
@@ -16,7 +17,8 @@ from station.archive.series.index import list_epochs
 from station.archive.series.virtual import build_series
 from station.quantities import Grid, Quality, Reference
 from station.queries.blocks import BlockQueries
-from station.queries.event_errors import SystematicErrors
+from station.queries.event_errors import SystematicErrors, like_regions_variance
+from station.science.time_series.events import surrounding_weights
 
 GRID = Grid(west_m=632_000.0, north_m=5_186_000.0, cell_m=10.0, nx=57, ny=93)
 SHARED = random_shared(1, GRID)
@@ -70,3 +72,22 @@ def test_a_block_keeps_the_tilt_of_its_own_line(blocks):
     assert np.array_equal(errors.against_surroundings(lines), errors.of_blocks(lines))
     assert errors.of_blocks(lines)[blocks.observed].min() > 0
     assert not errors.against_surroundings(None).any()
+
+
+@pytest.mark.parametrize("patch_blocks", [0.5, 3, 8])
+def test_patches_of_any_size_are_in_the_variance_of_a_region(patch_blocks):
+    """The change of the region less its surroundings, over its sigma, in many draws of patchy snow."""
+    members = np.zeros((90, 90), bool)
+    members[40:47, 40:47] = True
+    usable = np.ones_like(members)
+    usable[:, 80:] = False
+    weights = surrounding_weights(members, usable)
+    z = []
+    for seed in range(200):
+        rng = np.random.default_rng(seed)
+        patches = ndimage.gaussian_filter(rng.normal(size=members.shape), patch_blocks, mode="wrap")
+        change_m = 0.03 * patches / patches.std() + 0.02 * rng.normal(size=members.shape)
+        random_m2 = np.full(members.shape, 0.02**2)
+        variance_m2 = like_regions_variance(members, usable, change_m + 0.5, random_m2)
+        z.append(np.sum(weights * change_m) / np.sqrt(variance_m2 + np.sum(weights**2 * random_m2)))
+    assert 0.8 < np.sqrt(np.mean(np.square(z))) < 1.25
