@@ -28,18 +28,13 @@ from station.archive.epochs import EpochRef
 from station.archive.netcdf_layout import Series
 from station.archive.series.index import SeriesIndex, references_and_usable
 from station.errors import StoreError
-from station.quantities import Bools, Floats, Grid, Ints
+from station.quantities import Bools, Floats, Grid, Ints, SharedParameters
+from station.queries.aggregates import common_error_covariance
 from station.queries.block_sums import epoch_sums
 from station.queries.blocks import BlockQueries, Blocks
 from station.queries.epoch_cells import EpochCells, EpochReader
-from station.queries.event_errors import (
-    SystematicErrors,
-    difference_of,
-    like_regions_variance,
-    sampling_variance,
-    shared_variance,
-)
 from station.science.analysis.voids import area_weights, void_variance
+from station.science.time_series import event_errors
 from station.science.time_series.event_tracks import Track, pair_tracks, track_events
 from station.science.time_series.events import (
     BlockLevels,
@@ -220,11 +215,9 @@ class EventQueries:
         """Return the regions that the two newest scans of a window show: encoded blocks, and the rest."""
         *history, first, second = window
         before = history[-BEFORE:]
-        newest = self._with_jacobian(second)
-        errors = SystematicErrors(newest)
-        differences = [
-            difference_of(self._shared(scan), self._shared(before[-1])) for scan in (first, second)
-        ]
+        newest = self._queries.read(self._epoch(second))
+        errors = _systematic_errors(newest)
+        differences = [_difference(self._shared(scan), self._shared(before[-1])) for scan in (first, second)]
         known = self._queries.reference_blocks(self._version(second))["known"] > 0
         regions = detect_regions(
             [self._levels(scan) for scan in before],
@@ -247,9 +240,6 @@ class EventQueries:
             ]
             for region in regions
         ]
-
-    def _with_jacobian(self, scan: int) -> Blocks:
-        return self._queries.read(self._epoch(scan))
 
     def _events(self, tracks: list[Track]) -> Iterator[tuple[Event, shapely.Geometry]]:
         volumes = []
@@ -330,7 +320,7 @@ class EventQueries:
         A widespread event counts in full, another one less what its surroundings did. Blocks within it that
         were not observed are interpolated.
         """
-        newest = self._with_jacobian(after[-1])
+        newest = self._queries.read(self._epoch(after[-1]))
         base = before_level([self._levels(scan) for scan in before], LEAST_BEFORE)
         level = _mean_level(self._levels(after[0]), self._levels(after[1]))
         change_m, random_m2 = level.change_m - base.change_m, level.random_m2 + base.random_m2
@@ -340,7 +330,8 @@ class EventQueries:
             return [0.0, 0.0]
         rock = newest.rock > 0.5
         ground = rock if rock[core].mean() > 0.5 else ~rock
-        members = _members(track, core, known, known & ground & ~others, change_m, random_m2)
+        usable = known & ground & ~others
+        members = _members(track, core, known, usable, change_m, random_m2)
         surface = self._queries.reference_blocks(self._version(after[-1]))["known"] > 0
         if not track.widespread:
             members |= ndimage.binary_closing(core, NEIGHBOURS, EDGE_BLOCKS) & ~known & surface
@@ -348,19 +339,19 @@ class EventQueries:
         area_m2 = np.count_nonzero(members) * self.grid.cell_m**2
         around = np.zeros_like(filled)
         if not track.widespread:
-            around = np.maximum(-surrounding_weights(members, known & ground & ~others), 0.0)
+            around = np.maximum(-surrounding_weights(members, usable), 0.0)
         weights = area_m2 * (filled - around)
         volume_m3 = float(np.sum(weights[known] * change_m[known]))
         variance = float(np.sum(weights[known] ** 2 * random_m2[known]))
-        variance += shared_variance(newest, self._shared(before[-1]), weights)
-        variance += sampling_variance(newest.count, self._queries.cells, weights, change_m)
+        difference = _difference(newest.cells, self._shared(before[-1]))
+        variance += _systematic_errors(newest).of_sum(weights, difference)
+        variance += event_errors.sampling_variance(newest.count, self._queries.cells, weights, change_m)
         variance += area_m2**2 * void_variance(
             members, distance, np.where(known, change_m, np.nan), random_m2
         )
         variance += (RETAINED_SIGMA * volume_m3) ** 2
         if around.any():
-            usable = known & ground & ~others
-            variance += area_m2**2 * like_regions_variance(members, usable, change_m, random_m2)
+            variance += area_m2**2 * event_errors.like_regions_variance(members, usable, change_m, random_m2)
         return [round(volume_m3, 4), round(float(np.sqrt(variance)), 4)]
 
 
@@ -389,3 +380,20 @@ def _members(
     opposite_m = -track.sign * (change_m - level_m)
     edge = ndimage.binary_dilation(core, NEIGHBOURS, EDGE_BLOCKS) & known
     return np.asarray(core | (edge & (opposite_m < EDGE_SIGMAS * np.sqrt(random_m2))))
+
+
+def _systematic_errors(blocks: Blocks) -> event_errors.SystematicErrors:
+    return event_errors.SystematicErrors(blocks.jacobian, blocks.observed, blocks.rock > 0.5)
+
+
+def _difference(scan: EpochCells, before: EpochCells) -> SharedParameters | None:
+    """Return the shared parameters of the difference of two scans: both errors, less what is common."""
+    first, second = scan.shared, before.shared
+    if first is None or second is None or first.names != second.names:
+        return first if first is None or second is None else first + first
+    common = common_error_covariance([scan, before])
+    covariance = first.covariance + second.covariance
+    if common is not None:
+        covariance = covariance - common - common.T
+    line_m2 = first.line_tilt_variance + second.line_tilt_variance
+    return replace(first, covariance=covariance, line_tilt_variance=line_m2)

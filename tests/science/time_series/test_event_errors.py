@@ -17,7 +17,7 @@ from station.archive.series.index import list_epochs
 from station.archive.series.virtual import build_series
 from station.quantities import Grid, Quality, Reference
 from station.queries.blocks import BlockQueries
-from station.queries.event_errors import SystematicErrors, like_regions_variance
+from station.science.time_series.event_errors import SystematicErrors, like_regions_variance
 from station.science.time_series.events import surrounding_weights
 
 GRID = Grid(west_m=632_000.0, north_m=5_186_000.0, cell_m=10.0, nx=57, ny=93)
@@ -50,6 +50,10 @@ def blocks(tmp_path_factory):
     return BlockQueries(series).read(list_epochs(series)[0])
 
 
+def errors_of(blocks):
+    return SystematicErrors(blocks.jacobian, blocks.observed, ROCK & blocks.observed)
+
+
 def test_a_block_less_its_surroundings_has_the_variance_of_dense_algebra(blocks):
     jacobian, shared = blocks.jacobian, blocks.shared
     dense = np.stack([jacobian.effect(unit) for unit in np.eye(len(shared.names))], axis=1)
@@ -57,7 +61,7 @@ def test_a_block_less_its_surroundings_has_the_variance_of_dense_algebra(blocks)
     tile = np.stack([row, column], axis=1) // TILE
     rock = ROCK[column]
     no_lines = replace(shared, line_tilt_variance=0 * shared.line_tilt_variance)
-    actual_m2 = SystematicErrors(blocks).against_surroundings(no_lines)[blocks.observed]
+    actual_m2 = errors_of(blocks).against_surroundings(no_lines)[blocks.observed]
     for block in range(0, len(row), 97):
         near = (np.abs(tile - tile[block]).max(axis=1) <= REACH) & (rock == rock[block])
         tiles = np.unique(tile[near], axis=0)
@@ -68,7 +72,7 @@ def test_a_block_less_its_surroundings_has_the_variance_of_dense_algebra(blocks)
 
 def test_a_block_keeps_the_tilt_of_its_own_line(blocks):
     lines = replace(blocks.shared, covariance=0 * blocks.shared.covariance)
-    errors = SystematicErrors(blocks)
+    errors = errors_of(blocks)
     assert np.array_equal(errors.against_surroundings(lines), errors.of_blocks(lines))
     assert errors.of_blocks(lines)[blocks.observed].min() > 0
     assert not errors.against_surroundings(None).any()

@@ -1,4 +1,4 @@
-"""Errors of blocks in the difference of two scans, alone and against what surrounds them.
+"""Errors of blocks and of events: systematic ones, alone and against what surrounds them, and patches.
 
 Source: equations.md, 6.11.
 """
@@ -13,31 +13,29 @@ import numpy as np
 from scipy import ndimage, sparse
 
 from station.quantities import Bools, Floats, Ints, Reals, SharedParameters
-from station.queries.aggregates import common_error_covariance
-from station.queries.blocks import Blocks
-from station.queries.epoch_cells import EpochCells
 from station.science.analysis.calibration import SparseJacobian, group_means
 from station.science.geometry.robust_statistics import MEDIAN_ABSOLUTE_NORMAL
 from station.science.time_series.events import SURROUNDING_TILES, TILE
+from station.science.uncertainty.jacobian import HeightJacobian
 
 LEAST_SQUARES = 30  # around a region, in any position, for their scatter
 
 
 class SystematicErrors:
-    """Systematic errors of the blocks of a scan, by the shared parameters of a difference of scans.
+    """Systematic errors of blocks (by, bx), by the shared parameters of a difference of scans.
 
-    They are zero without a Jacobian, and for parameters that are not those of the scan.
+    `jacobian` is of the observed blocks, `rock` marks those of bare ground. The errors are zero without a
+    Jacobian, and for parameters that are not its own.
     """
 
-    def __init__(self, geometry: Blocks) -> None:
-        self._geometry = geometry
+    def __init__(self, jacobian: HeightJacobian | None, observed: Bools, rock: Bools) -> None:
+        self._jacobian, self._observed, self._rock = jacobian, observed, rock
 
     def of_blocks(self, difference: SharedParameters | None) -> Floats:
         """Return the variance of each block (by, bx) [m²]."""
-        jacobian = self._geometry.jacobian
-        if jacobian is None or not self._are_of_scan(difference):
-            return np.zeros(self._geometry.count.shape)
-        return self._placed(jacobian.variance(difference))
+        if self._jacobian is None or not self._are_known(difference):
+            return np.zeros(self._observed.shape)
+        return self._placed(self._jacobian.variance(difference))
 
     def against_surroundings(self, difference: SharedParameters | None) -> Floats:
         """Return the variance of each block (by, bx) less the mean of what surrounds it [m²].
@@ -45,54 +43,53 @@ class SystematicErrors:
         With j the Jacobian of the block, g that of its surroundings: (j - g) C (j - g)ᵀ. The line tilts of
         the surroundings average out.
         """
-        jacobian = self._geometry.jacobian
-        if jacobian is None or not self._are_of_scan(difference):
-            return np.zeros(self._geometry.count.shape)
-        around, group = self._surroundings
+        if self._jacobian is None or not self._are_known(difference):
+            return np.zeros(self._observed.shape)
+        design, around, group = self._surroundings
         weighted = around @ difference.covariance
-        design = sparse.coo_array(self._design)
         entries = design.data * weighted[group[design.row], design.col]
         common_m2 = np.bincount(design.row, entries, len(group))
         around_m2 = np.sum(weighted * around, axis=1)[group]
-        line_m2 = jacobian.variance(replace(difference, covariance=0 * difference.covariance))
-        own_m2 = jacobian.variance(difference)
+        line_m2 = self._jacobian.variance(replace(difference, covariance=0 * difference.covariance))
+        own_m2 = self._jacobian.variance(difference)
         return self._placed(np.maximum(own_m2 - 2 * common_m2 + around_m2, line_m2))
 
-    def _are_of_scan(self, difference: SharedParameters | None) -> TypeGuard[SharedParameters]:
-        return difference is not None and difference.names == self._geometry.parameters
+    def of_sum(self, weights: Floats, difference: SharedParameters | None) -> float:
+        """Return the variance of a weighted sum (by, bx) [m²]."""
+        if self._jacobian is None or not self._are_known(difference):
+            return 0.0
+        row = sparse.csr_array(weights[self._observed][None, :])
+        return float(SparseJacobian(self._jacobian).sums(row).variance(np.zeros(row.shape[1]), difference)[0])
+
+    def _are_known(self, difference: SharedParameters | None) -> TypeGuard[SharedParameters]:
+        return (
+            difference is not None
+            and self._jacobian is not None
+            and difference.names == self._jacobian.params.names
+        )
 
     def _placed(self, values: Reals) -> Floats:
-        placed = np.zeros(self._geometry.count.shape)
-        placed[self._geometry.observed] = values
+        placed = np.zeros(self._observed.shape)
+        placed[self._observed] = values
         return placed
 
     @cached_property
-    def _design(self) -> sparse.csr_array:
-        assert self._geometry.jacobian is not None  # noqa: S101 - its callers return before
-        return self._geometry.jacobian.to_sparse()
+    def _surroundings(self) -> tuple[sparse.coo_array, Floats, Ints]:
+        """Jacobian (n, p), its mean (g, p) over the surroundings of each tile and ground, and which is whose.
 
-    @cached_property
-    def _surroundings(self) -> tuple[Floats, Ints]:
-        """Mean Jacobian (g, p) of the surroundings of each tile and ground, and that of each block (n,)."""
-        observed = self._geometry.observed
-        row, column = (index // TILE for index in np.nonzero(observed))
-        rock: Bools = self._geometry.rock[observed] > 0.5
-        tiles, group = np.unique(np.stack([rock, row, column]), axis=1, return_inverse=True)
+        The last (n,) has the row of the second for each block.
+        """
+        assert self._jacobian is not None  # noqa: S101 - its caller returns before
+        design = self._jacobian.to_sparse()
+        row, column = (index // TILE for index in np.nonzero(self._observed))
+        tiles, group = np.unique(
+            np.stack([self._rock[self._observed], row, column]), axis=1, return_inverse=True
+        )
+        group = np.ravel(group)
         apart = np.abs(tiles[1:, :, None] - tiles[1:, None, :]).max(axis=0)
         near = (apart <= SURROUNDING_TILES // 2) & (tiles[0][:, None] == tiles[0])
         shares = sparse.csr_array(near / near.sum(axis=1, keepdims=True))
-        means = (group_means(np.ravel(group)) @ self._design).toarray()
-        return np.asarray(shares @ means), np.ravel(group)
-
-
-def shared_variance(newest: Blocks, before: EpochCells, weights: Floats) -> float:
-    """Return the systematic variance of a weighted sum (by, bx) in the difference of two scans."""
-    difference = difference_of(newest.cells, before)
-    if newest.jacobian is None or difference is None:
-        return 0.0
-    row = sparse.csr_array(weights[newest.observed][None, :])
-    sums = SparseJacobian(newest.jacobian).sums(row)
-    return float(sums.variance(np.zeros(row.shape[1]), difference)[0])
+        return sparse.coo_array(design), np.asarray(shares @ (group_means(group) @ design).toarray()), group
 
 
 def like_regions_variance(members: Bools, usable: Bools, change_m: Floats, random_m2: Floats) -> float:
@@ -146,16 +143,3 @@ def sampling_variance(count: Floats, cells: int, weights: Floats, change_m: Floa
     unseen = 1 - count / cells**2 if cells > 1 else np.ones_like(count)
     sample_m2 = scatter_m2 * np.clip(unseen, 0.0, 1.0) / np.maximum(count, 1)
     return float(np.sum((weights**2 * sample_m2)[inside]))
-
-
-def difference_of(scan: EpochCells, before: EpochCells) -> SharedParameters | None:
-    """Return the shared parameters of the difference of two scans: both errors, less what is common."""
-    first, second = scan.shared, before.shared
-    if first is None or second is None or first.names != second.names:
-        return first if first is None or second is None else first + first
-    common = common_error_covariance([scan, before])
-    covariance = first.covariance + second.covariance
-    if common is not None:
-        covariance = covariance - common - common.T
-    line_m2 = first.line_tilt_variance + second.line_tilt_variance
-    return replace(first, covariance=covariance, line_tilt_variance=line_m2)
