@@ -95,3 +95,10 @@ def test_patches_of_any_size_are_in_the_variance_of_a_region(patch_blocks):
         variance_m2 = like_regions_variance(members, usable, change_m + 0.5, random_m2)
         z.append(np.sum(weights * change_m) / np.sqrt(variance_m2 + np.sum(weights**2 * random_m2)))
     assert 0.8 < np.sqrt(np.mean(np.square(z))) < 1.25
+
+
+def test_a_scan_that_saw_nothing_has_no_errors(blocks):
+    nothing = np.zeros_like(blocks.observed)
+    errors = SystematicErrors(blocks.jacobian.take(slice(0)), nothing, nothing)
+    assert not errors.against_surroundings(blocks.shared).any()
+    assert not errors.of_blocks(blocks.shared).any()
