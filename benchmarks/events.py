@@ -28,7 +28,6 @@ from station.science.time_series.events import (
     Region,
     detect_regions,
     event_thresholds,
-    scan_scatter,
 )
 
 AREAS_M2 = (200, 500, 1000, 3000)
@@ -99,10 +98,12 @@ def station_objects(series: Series) -> list[tuple[int, Bools]]:
 
     def regions(hour: int) -> list[Region]:
         history = levels[max(hour - HISTORY - 1, 0) : hour - 1]
-        scatter_m2 = scan_scatter(np.stack([level.change_m for level in history]))
+        history_m = np.stack([level.change_m for level in history])
         shared_m2 = series.systematic_m2, series.systematic_m2
         pair = levels[hour - 1], levels[hour]
-        return detect_regions(history[-BEFORE:], pair, shared_m2, scatter_m2, series.rock, thresholds)
+        return detect_regions(
+            history[-BEFORE:], pair, shared_m2, shared_m2, history_m, series.rock, thresholds
+        )
 
     detected = ((hour, regions(hour)) for hour in range(LEAST_HISTORY + 1, len(levels)))
     tracks: list[Track] = track_events(detected)

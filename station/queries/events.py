@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 import shapely
-from scipy import ndimage, sparse
+from scipy import ndimage
 
 from station.archive.derived.event_table import (
     KEY_LENGTH,
@@ -33,18 +33,15 @@ from station.queries.aggregates import common_error_covariance
 from station.queries.block_sums import epoch_sums
 from station.queries.blocks import BlockQueries, Blocks
 from station.queries.epoch_cells import EpochCells, EpochReader
-from station.science.analysis.calibration import SparseJacobian
 from station.science.analysis.voids import area_weights, void_variance
-from station.science.geometry.robust_statistics import nmad
+from station.science.time_series import event_errors
 from station.science.time_series.event_tracks import Track, pair_tracks, track_events
 from station.science.time_series.events import (
-    PATCH_BLOCKS,
     BlockLevels,
     Region,
     before_level,
     detect_regions,
     event_thresholds,
-    scan_scatter,
     surrounding_weights,
 )
 
@@ -218,17 +215,16 @@ class EventQueries:
         """Return the regions that the two newest scans of a window show: encoded blocks, and the rest."""
         *history, first, second = window
         before = history[-BEFORE:]
-        newest = self._with_jacobian(second)
-        systematic_m2 = [
-            self._systematic_variance(newest, self._shared(scan), self._shared(before[-1]))
-            for scan in (first, second)
-        ]
+        newest = self._queries.read(self._epoch(second))
+        errors = _systematic_errors(newest)
+        differences = [_difference(self._shared(scan), self._shared(before[-1])) for scan in (first, second)]
         known = self._queries.reference_blocks(self._version(second))["known"] > 0
         regions = detect_regions(
             [self._levels(scan) for scan in before],
             (self._levels(first), self._levels(second)),
-            (systematic_m2[0], systematic_m2[1]),
-            scan_scatter(np.stack([self._levels(scan).change_m for scan in history])),
+            [errors.of_blocks(difference) for difference in differences],
+            [errors.against_surroundings(difference) for difference in differences],
+            np.stack([self._levels(scan).change_m for scan in history]),
             newest.rock > 0.5,
             event_thresholds(int(np.count_nonzero(known)), self._scans_per_year),
             LEAST_BEFORE,
@@ -244,22 +240,6 @@ class EventQueries:
             ]
             for region in regions
         ]
-
-    def _with_jacobian(self, scan: int) -> Blocks:
-        return self._queries.read(self._epoch(scan))
-
-    @staticmethod
-    def _systematic_variance(geometry: Blocks, scan: EpochCells, before: EpochCells) -> Floats:
-        """Return the systematic variance of the difference of two scans (by, bx), with one Jacobian."""
-        variance_m2 = np.zeros(geometry.count.shape)
-        difference = _difference(scan, before)
-        if (
-            geometry.jacobian is not None
-            and difference is not None
-            and difference.names == geometry.parameters
-        ):
-            variance_m2[geometry.observed] = geometry.jacobian.variance(difference)
-        return variance_m2
 
     def _events(self, tracks: list[Track]) -> Iterator[tuple[Event, shapely.Geometry]]:
         volumes = []
@@ -340,7 +320,7 @@ class EventQueries:
         A widespread event counts in full, another one less what its surroundings did. Blocks within it that
         were not observed are interpolated.
         """
-        newest = self._with_jacobian(after[-1])
+        newest = self._queries.read(self._epoch(after[-1]))
         base = before_level([self._levels(scan) for scan in before], LEAST_BEFORE)
         level = _mean_level(self._levels(after[0]), self._levels(after[1]))
         change_m, random_m2 = level.change_m - base.change_m, level.random_m2 + base.random_m2
@@ -350,7 +330,8 @@ class EventQueries:
             return [0.0, 0.0]
         rock = newest.rock > 0.5
         ground = rock if rock[core].mean() > 0.5 else ~rock
-        members = _members(track, core, known, known & ground & ~others, change_m, random_m2)
+        usable = known & ground & ~others
+        members = _members(track, core, known, usable, change_m, random_m2)
         surface = self._queries.reference_blocks(self._version(after[-1]))["known"] > 0
         if not track.widespread:
             members |= ndimage.binary_closing(core, NEIGHBOURS, EDGE_BLOCKS) & ~known & surface
@@ -358,30 +339,20 @@ class EventQueries:
         area_m2 = np.count_nonzero(members) * self.grid.cell_m**2
         around = np.zeros_like(filled)
         if not track.widespread:
-            around = np.maximum(-surrounding_weights(members, known & ground & ~others), 0.0)
+            around = np.maximum(-surrounding_weights(members, usable), 0.0)
         weights = area_m2 * (filled - around)
         volume_m3 = float(np.sum(weights[known] * change_m[known]))
         variance = float(np.sum(weights[known] ** 2 * random_m2[known]))
-        variance += self._shared_variance(newest, self._shared(before[-1]), weights)
-        variance += _sampling_variance(newest.count, self._queries.cells, weights, change_m)
+        difference = _difference(newest.cells, self._shared(before[-1]))
+        variance += _systematic_errors(newest).of_sum(weights, difference)
+        variance += event_errors.sampling_variance(newest.count, self._queries.cells, weights, change_m)
         variance += area_m2**2 * void_variance(
             members, distance, np.where(known, change_m, np.nan), random_m2
         )
         variance += (RETAINED_SIGMA * volume_m3) ** 2
-        if np.count_nonzero(around) > PATCH_BLOCKS:
-            patchy_m2 = max(nmad(change_m[around > 0]) ** 2 - float(np.median(random_m2[around > 0])), 0.0)
-            count = int(np.count_nonzero(members))
-            variance += area_m2**2 * patchy_m2 * min(1.0, PATCH_BLOCKS / count)
+        if around.any():
+            variance += area_m2**2 * event_errors.like_regions_variance(members, usable, change_m, random_m2)
         return [round(volume_m3, 4), round(float(np.sqrt(variance)), 4)]
-
-    @staticmethod
-    def _shared_variance(newest: Blocks, before: EpochCells, weights: Floats) -> float:
-        difference = _difference(newest.cells, before)
-        if newest.jacobian is None or difference is None:
-            return 0.0
-        row = sparse.csr_array(weights[newest.observed][None, :])
-        sums = SparseJacobian(newest.jacobian).sums(row)
-        return float(sums.variance(np.zeros(row.shape[1]), difference)[0])
 
 
 def _mean_level(first: BlockLevels, second: BlockLevels) -> BlockLevels:
@@ -411,19 +382,8 @@ def _members(
     return np.asarray(core | (edge & (opposite_m < EDGE_SIGMAS * np.sqrt(random_m2))))
 
 
-def _sampling_variance(count: Floats, cells: int, weights: Floats, change_m: Floats) -> float:
-    """Return the variance of the weighted sum because the observed cells are a sample of their block.
-
-    The scatter within a block is that of it and its neighbours, as on a steady slope of the change.
-    """
-    inside = weights > 0
-    filled = np.where(np.isfinite(change_m), change_m, 0.0)
-    number = np.maximum(ndimage.uniform_filter(np.isfinite(change_m).astype(np.float64), 3), 1 / 9)
-    mean_m = ndimage.uniform_filter(filled, 3) / number
-    scatter_m2 = np.maximum(ndimage.uniform_filter(filled**2, 3) / number - mean_m**2, 0.0)
-    unseen = 1 - count / cells**2 if cells > 1 else np.ones_like(count)
-    sample_m2 = scatter_m2 * np.clip(unseen, 0.0, 1.0) / np.maximum(count, 1)
-    return float(np.sum((weights**2 * sample_m2)[inside]))
+def _systematic_errors(blocks: Blocks) -> event_errors.SystematicErrors:
+    return event_errors.SystematicErrors(blocks.jacobian, blocks.observed, blocks.rock > 0.5)
 
 
 def _difference(scan: EpochCells, before: EpochCells) -> SharedParameters | None:

@@ -32,7 +32,7 @@ ERRORS = (
     "range_bias_m", "range_noise_m", "beam_divergence_mrad", "echo_loss", "airborne_share", "airborne_clouds",
     "log_noise_deg", "log_bias_deg", "log_cyclic_deg", "log_cyclic_change", "log_clock_s", "log_fault",
     "melt_m_per_h", "snowfall_m", "avalanche_m", "settling_m_per_h", "winter_m", "summer_melt_m",
-    "heave_m", "creep_m", "bar_growth_m",
+    "heave_m", "creep_m", "bar_growth_m", "deposits",
 )  # fmt: skip
 
 
@@ -57,6 +57,17 @@ class Mark:
     def zone(self) -> int:
         """Zone of UTM."""
         return self.epsg % 100
+
+
+@dataclass(frozen=True)
+class Deposit:
+    """Debris that comes to rest within an hour of the series: a disc of even depth."""
+
+    hour: float
+    east_m: float  # of the mark
+    north_m: float
+    area_m2: float = 500.0
+    depth_m: float = 0.3
 
 
 @dataclass(frozen=True)
@@ -162,6 +173,7 @@ class Scenario:
     # surface change
     melt_m_per_h: float = 0.0  # of ice at the end of the tongue; zero 450 m (times size) higher
     melt_from_hour: float = 0.0
+    melt_by_day: bool = False  # all of it between 6 and 18 h, as the sun rises and sinks
     snowfall_m: float = 0.0  # in total, during snow_hours
     snow_hours: tuple[float, float] = (4.0, 12.0)
     avalanche_m: float = 0.0  # height of the deposit
@@ -177,6 +189,7 @@ class Scenario:
     creep_m: float = 0.0  # displacement of part of the rock over the whole series
     tide_m: float = 0.0  # amplitude of the tide at a beach
     bar_growth_m: float = 0.0  # height of the bar that grows on a beach over the whole series
+    deposits: tuple[Deposit, ...] = ()  # anywhere, also on stable ground
 
     # known stable ground: rock all round, or only a far ridge and a hut that snow never covers
     stable_ground: Literal["good", "poor"] = "good"

@@ -7,7 +7,7 @@ sizes. Source: equations.md, 6.11.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -19,6 +19,7 @@ from station.science.geometry.robust_statistics import MEDIAN_ABSOLUTE_NORMAL
 
 WINDOWS = (2, 3, 5, 8, 13)  # edge of the windows [blocks]
 TILE = 10  # blocks along the edge of a tile, over which surroundings are averaged
+LEAST_IN_TILE = 25  # blocks of the same ground
 SURROUNDING_TILES = 7  # along the edge of the surroundings of a tile
 MIN_OBSERVED = 0.5  # share of the blocks of a window
 MIN_DEPTH_M = 0.05  # less is no event, however significant
@@ -31,9 +32,9 @@ MIN_BLOCKS = 2  # of an event: a single block may be an edge that was hit otherw
 TAIL_QUANTILE, TAIL_SIGMAS = 0.99, 2.576  # two-sided, of a normal distribution
 OUTLIER_SIGMAS = 6.0  # beyond, a window has changed, and is no sample of the errors
 MEDIAN_VARIANCE = np.pi / 2  # of a median, over that of the mean
+SCATTER_VARIANCE = 1.3  # of a scan less the median of six, over that of a scan
 SCATTER_QUANTILE, SCATTER_SIGMAS = 0.9, 1.645  # of absolute values, two-sided
-EDGE_RATIO = 3.0  # of the observed scatter over the random variance, beyond which a block is at an edge
-EDGE_VARIANCE = 1.3  # of a scan less the median of several, over that of a scan
+TINY = 1e-9
 GAP_BLOCKS = 2  # parts of an event that are no farther apart
 
 
@@ -66,9 +67,9 @@ class _Contrast:
     change_m: Floats
     excess_m: Floats
     random_m2: Floats
-    systematic_m2: Floats
+    systematic_m2: Floats  # of the change
+    contrast_m2: Floats  # of the excess: what errors of the scan do otherwise here than around
     patchy_m2: Floats  # by which the change differs from block to block, beyond the errors
-    edge_m2: Floats  # by which scans of the block scatter, where that is far more than its random errors
 
 
 @dataclass(frozen=True)
@@ -107,27 +108,43 @@ def before_level(before: list[BlockLevels], least: int) -> BlockLevels:
     )
 
 
-def scan_scatter(history_m: Floats) -> Floats:
-    """Return the variance (by, bx) of the change of a block in one scan, as consecutive scans differ [m²].
+def scan_differences(history_m: Floats) -> Floats:
+    """Return how consecutive scans (n, by, bx) differ (n - 1, by, bx) [m], less what surrounds a block."""
+    differences_m = np.diff(history_m, axis=0)
+    observed = np.isfinite(differences_m)
+    extent = 1, TILE * SURROUNDING_TILES, TILE * SURROUNDING_TILES
+    around_m, share = (
+        ndimage.uniform_filter(np.where(observed, values, 0.0), extent) for values in (differences_m, 1.0)
+    )
+    return differences_m - around_m / np.maximum(share, TINY)
 
-    `history_m` (n, by, bx) are scans in order of time. The tenth largest of a hundred differences is used:
-    one event does not raise it, but a block at an edge does, which beams hit in some scans only. Its
-    neighbours are on the same edge, so that a block has the largest variance of those around it.
+
+def window_scatter(differences_m: Floats, size: int) -> Floats:
+    """Return the variance of the means of windows in one scan [m²], as consecutive scans differ.
+
+    The shape is (by - size + 1, bx - size + 1). The tenth largest of a hundred differences is used: one event
+    does not raise it, but an edge does, which beams hit in some scans only. Its neighbours are on the same
+    edge, so that a window has the largest variance of those around it.
     """
-    differences_m = np.abs(np.diff(history_m, axis=0))
-    ordered = np.sort(differences_m, axis=0)  # NaN last
-    count = np.isfinite(differences_m).sum(axis=0)
-    rank = np.maximum(np.ceil(SCATTER_QUANTILE * count).astype(np.int64) - 1, 0)
-    typical_m = np.take_along_axis(ordered, rank[None], 0)[0]
-    scatter_m2 = np.where(count > 0, typical_m, 0.0) ** 2 / (2 * SCATTER_SIGMAS**2)
-    return np.asarray(ndimage.maximum_filter(np.nan_to_num(scatter_m2), 3))
+    means_m = []
+    for difference_m in differences_m:
+        observed = np.isfinite(difference_m)
+        count = _window_sums(observed, size)
+        count[count < MIN_OBSERVED * size**2] = np.nan
+        means_m.append(np.abs(_window_sums(np.where(observed, difference_m, 0.0), size)) / count)
+    ordered = np.sort(means_m, axis=0)  # NaN last
+    pairs = np.isfinite(ordered).sum(axis=0)
+    rank = np.maximum(np.ceil(SCATTER_QUANTILE * pairs).astype(np.int64) - 1, 0)
+    typical_m = np.nan_to_num(np.take_along_axis(ordered, rank[None], 0)[0])
+    return np.asarray(ndimage.maximum_filter(typical_m**2 / (2 * SCATTER_SIGMAS**2), 3))
 
 
 def detect_regions(
     before: list[BlockLevels],
-    after: tuple[BlockLevels, BlockLevels],
-    systematic_m2: tuple[Floats, Floats],
-    scatter_m2: Floats,
+    after: Sequence[BlockLevels],
+    systematic_m2: Sequence[Floats],
+    contrast_m2: Sequence[Floats],
+    history_m: Floats,
     rock: Bools,
     thresholds: Thresholds,
     least_before: int = 3,
@@ -135,42 +152,46 @@ def detect_regions(
     """Return the regions that two scans show to have changed since the scans before, the largest first.
 
     `systematic_m2` (by, bx) is the variance of the systematic errors in the difference of each of the two
-    scans and those before, `scatter_m2` (by, bx) that of `scan_scatter`, `rock` marks blocks of bare ground.
+    scans and those before, `contrast_m2` that of a block less its surroundings. `history_m` (n, by, bx) are
+    all earlier scans, `rock` marks blocks of bare ground.
     Both scans must show the change with the same sign, beyond the thresholds.
     """
     base = before_level(before, least_before)
     first, second = (
-        _contrast(base, levels, shared_m2, scatter_m2, rock)
-        for levels, shared_m2 in zip(after, systematic_m2, strict=True)
+        _contrast(base, levels, shared_m2, excess_m2, rock)
+        for levels, shared_m2, excess_m2 in zip(after, systematic_m2, contrast_m2, strict=True)
     )
     regions = list(_widespread_regions(first, second, thresholds.widespread))
-    regions += _local_regions(first, second, thresholds.local)
+    regions += _local_regions((first, second), history_m, rock, thresholds.local)
     return sorted(regions, key=lambda region: (-int(region.blocks.sum()), -region.sign))
 
 
 def _contrast(
-    base: BlockLevels, levels: BlockLevels, systematic_m2: Floats, scatter_m2: Floats, rock: Bools
+    base: BlockLevels, levels: BlockLevels, systematic_m2: Floats, contrast_m2: Floats, rock: Bools
 ) -> _Contrast:
     change_m = levels.change_m - base.change_m
     random_m2 = levels.random_m2 + base.random_m2
     excess_m = change_m - surroundings(change_m, rock)
     spread_m = surroundings(np.abs(excess_m), rock) / MEDIAN_ABSOLUTE_NORMAL
     usual_m2 = surroundings(np.where(np.isfinite(change_m), random_m2, np.nan), rock)
-    # Melt and drifts of snow differ from block to block, edges from scan to scan, and their neighbours alike.
-    patchy_m2 = np.nan_to_num(np.maximum(spread_m**2 - usual_m2, 0.0))
-    edge_m2 = np.where(scatter_m2 > EDGE_RATIO * levels.random_m2, EDGE_VARIANCE * scatter_m2, 0.0)
-    return _Contrast(change_m, excess_m, random_m2, np.nan_to_num(systematic_m2), patchy_m2, edge_m2)
+    patchy_m2 = np.nan_to_num(np.maximum(spread_m**2 - usual_m2, 0.0))  # as melt and drifts of snow differ
+    return _Contrast(change_m, excess_m, random_m2, systematic_m2, contrast_m2, patchy_m2)
 
 
 def surroundings(values: Floats, rock: Bools, excluded: Bools | None = None) -> Floats:
     """Return the median of what surrounds each block (by, bx): bare ground of bare ground, others of others.
 
-    It is the median over tiles of their medians, interpolated between tiles, NaN where none is observed.
+    It is the median over tiles of their medians, interpolated between tiles, NaN where none is observed. A
+    tile in which few blocks are of that ground may be all edge: it counts only if there is no other.
     """
     result = np.full(values.shape, np.nan)
     for ground in (rock, ~rock):
         used = ground if excluded is None else ground & ~excluded
-        tiles = _nanmedian(_tiles(np.where(used, values, np.nan)), 2)
+        blocks = _tiles(np.where(used, values, np.nan))
+        tiles = _nanmedian(blocks, 2)
+        full = np.isfinite(blocks).sum(axis=2) >= LEAST_IN_TILE
+        if full.any():
+            tiles[~full] = np.nan
         margin = SURROUNDING_TILES // 2
         padded = np.pad(tiles, margin, constant_values=np.nan)
         shape = SURROUNDING_TILES, SURROUNDING_TILES
@@ -208,21 +229,24 @@ def _nanmedian(values: Floats, axis: int) -> Floats:
     return np.asarray(np.squeeze((lower + upper) / 2, axis))
 
 
-def _local_regions(first: _Contrast, second: _Contrast, sigmas: float) -> Iterator[Region]:
-    score, depth_m = np.zeros(first.change_m.shape), np.zeros(first.change_m.shape)
-    for size in WINDOWS:
-        if size > min(score.shape):
-            break
-        means, z = zip(*(_window_scores(contrast, size) for contrast in (first, second)), strict=True)
-        mean_m, window_z = _confirmed(*means), _confirmed(*z)
+def _local_regions(
+    contrasts: tuple[_Contrast, _Contrast], history_m: Floats, rock: Bools, sigmas: float
+) -> Iterator[Region]:
+    shape = rock.shape
+    sizes = [size for size in WINDOWS if size <= min(shape) and _may_have_changed(contrasts, size, sigmas)]
+    if not sizes:
+        return
+    differences_m = scan_differences(history_m)
+    score, depth_m = np.zeros(shape), np.zeros(shape)
+    for size in sizes:
+        mean_m, window_z = _scores_of_both(contrasts, size, differences_m, rock)
         hit = (np.abs(window_z) > sigmas) & (np.abs(mean_m) > MIN_DEPTH_M)
         for row, column in np.argwhere(hit).tolist():  # few
             window = slice(row, row + size), slice(column, column + size)
             higher = np.abs(score[window]) < abs(window_z[row, column])
             score[window][higher] = window_z[row, column]
             depth_m[window][higher] = mean_m[row, column]
-    block_z = _confirmed(*(_window_scores(contrast, 1)[1] for contrast in (first, second)))
-    excess_m = _confirmed(first.excess_m, second.excess_m)
+    excess_m, block_z = _scores_of_both(contrasts, 1, differences_m, rock)
     for sign in (1, -1):
         inside = sign * score > 0
         member = inside & (sign * excess_m > sign * depth_m / 2)
@@ -237,31 +261,59 @@ def _local_regions(first: _Contrast, second: _Contrast, sigmas: float) -> Iterat
                 )
 
 
-def _window_scores(contrast: _Contrast, size: int) -> tuple[Floats, Floats]:
-    """Return mean excess [m] and z of all windows (by - size + 1, bx - size + 1); 0 if hardly observed."""
+def _may_have_changed(contrasts: tuple[_Contrast, _Contrast], size: int, sigmas: float) -> bool:
+    """Return True if windows exceed the threshold by their stated errors: few scans show any."""
+    means, variances = zip(*(_window_means(contrast, size) for contrast in contrasts), strict=True)
+    mean_m = np.abs(_confirmed(*means))
+    return bool(((mean_m > MIN_DEPTH_M) & (mean_m > sigmas * np.sqrt(np.fmin(*variances)))).any())
+
+
+def _scores_of_both(
+    contrasts: tuple[_Contrast, _Contrast], size: int, differences_m: Floats, rock: Bools
+) -> tuple[Floats, Floats]:
+    """Return mean excess [m] and z of windows that both scans confirm, else 0.
+
+    The variance is that of the errors, or what the window scattered before, if that is more. If windows
+    around it have a larger z than normal errors, so has this one.
+    """
+    scatter_m2 = SCATTER_VARIANCE * window_scatter(differences_m, size)
+    height, width = scatter_m2.shape
+    middle = size // 2
+    ground = rock[middle : middle + height, middle : middle + width]
+    means, scores = [], []
+    for contrast in contrasts:
+        mean_m, variance_m2 = _window_means(contrast, size)
+        z = mean_m / np.sqrt(np.maximum(variance_m2, scatter_m2))
+        z /= np.fmax(surroundings(np.abs(z), ground) / MEDIAN_ABSOLUTE_NORMAL, 1.0)
+        for kind in (ground, ~ground):
+            z[kind] /= _tail_factor(np.abs(z[kind]))
+        means.append(mean_m)
+        scores.append(z)
+    return _confirmed(*means), _confirmed(*scores)
+
+
+def _window_means(contrast: _Contrast, size: int) -> tuple[Floats, Floats]:
+    """Return mean excess [m] and its variance of all windows (by - size + 1, bx - size + 1).
+
+    They are NaN where a window is hardly observed.
+    """
     observed = np.isfinite(contrast.excess_m) & (contrast.random_m2 > 0)
-    correlated_m2 = contrast.systematic_m2 + np.maximum(contrast.patchy_m2, contrast.edge_m2)
-    count = np.maximum(_window_sums(observed, size), 1)
-    mean_m, random_m2, systematic_m2 = (
+    count = _window_sums(observed, size)
+    count[count < MIN_OBSERVED * size**2] = np.nan
+    mean_m, random_m2, contrast_m2 = (
         _window_sums(np.where(observed, values, 0.0), size) / count
-        for values in (contrast.excess_m, contrast.random_m2, correlated_m2)
+        for values in (contrast.excess_m, contrast.random_m2, contrast.contrast_m2)
     )
-    usable = _window_sums(observed, size) >= MIN_OBSERVED * size**2
-    with np.errstate(divide="ignore", invalid="ignore"):
-        z = np.where(usable, mean_m / np.sqrt(random_m2 / count + systematic_m2), 0.0)
-    return np.where(usable, mean_m, 0.0), z / _tail_factor(np.abs(z[usable]))
+    return mean_m, random_m2 / count + contrast_m2
 
 
 def _tail_factor(absolute_z: Floats) -> float:
-    """Return by how much z is larger than of normal errors, at least 1: in the middle, and in the tail.
+    """Return by how much the tail of z is larger than of normal errors, at least 1.
 
-    What is an outlier by the middle is left out of the tail: it may be an event.
+    Outliers are left out: they may be events.
     """
-    if not len(absolute_z):
-        return 1.0
-    middle = max(1.0, float(np.median(absolute_z)) / MEDIAN_ABSOLUTE_NORMAL)
-    tail = float(np.quantile(absolute_z[absolute_z < OUTLIER_SIGMAS * middle], TAIL_QUANTILE)) / TAIL_SIGMAS
-    return max(middle, tail)
+    errors = absolute_z[absolute_z < OUTLIER_SIGMAS]
+    return max(float(np.quantile(errors, TAIL_QUANTILE)) / TAIL_SIGMAS, 1.0) if len(errors) else 1.0
 
 
 def _window_sums(values: Floats | Bools, size: int) -> Floats:

@@ -14,7 +14,7 @@ from scipy.ndimage import gaussian_filter
 
 from station.quantities import Floats
 from station.simulation.randomness import rng_for
-from station.simulation.scenario import Scenario
+from station.simulation.scenario import Deposit, Scenario
 from station.simulation.world.beach import bar
 from station.simulation.world.places import roof
 from station.simulation.world.terrain import NodeField, Valley, bumps
@@ -32,7 +32,8 @@ CREEP_SLOPE_M = 50.0  # smoothing of the ground for its direction, times size
 CREEP_DIP_DEG = 15.0  # more than the slope's, as in the upper part of a slide
 SNOW = ("snowfall", "winter")
 BREATHING = ("heave", "creep")
-ON_STABLE_GROUND = (*SNOW, *BREATHING)  # changes that a person who draws stable ground does not know of
+ON_STABLE_GROUND = (*SNOW, *BREATHING, "deposit")  # that one who draws stable ground does not know of
+DISC_SAMPLES = 8  # in each direction around a node
 SLAB_SHARE = 0.5  # height of the released slab over that of the deposit
 
 
@@ -61,7 +62,8 @@ def surface_changes(scenario: Scenario, valley: Valley) -> tuple[SurfaceChange, 
         )
         if size
     )
-    return (*single, *heave(scenario, valley)) if scenario.heave_m else single
+    deposits = tuple(_debris(deposit, valley) for deposit in scenario.deposits)
+    return (*single, *deposits, *(heave(scenario, valley) if scenario.heave_m else ()))
 
 
 def ground_at(valley: Valley, changes: tuple[SurfaceChange, ...], hours: float) -> NodeField:
@@ -96,9 +98,18 @@ def _melt_pattern(valley: Valley) -> NodeField:
 
 def _melt(scenario: Scenario, valley: Valley) -> SurfaceChange:
     def amount(hours: float) -> float:
-        return scenario.melt_m_per_h * max(0.0, hours - scenario.melt_from_hour)
+        elapsed_h = _melting_h(scenario, hours) - _melting_h(scenario, scenario.melt_from_hour)
+        return scenario.melt_m_per_h * max(0.0, elapsed_h)
 
     return SurfaceChange("melt", _melt_pattern(valley), amount)
+
+
+def _melting_h(scenario: Scenario, hours: float) -> float:
+    """Return the hours of mean melt in the hours since the start, or since the midnight before it."""
+    if not scenario.melt_by_day:
+        return hours
+    day, hour = divmod(scenario.start.hour + scenario.start.minute / 60 + hours, 24)
+    return float(24 * day + 12 * (1 - np.cos(np.pi * np.clip((hour - 6) / 12, 0, 1))))
 
 
 def _settling(scenario: Scenario, valley: Valley) -> SurfaceChange:
@@ -240,6 +251,25 @@ def _deposit(valley: Valley, outline: tuple[float, float, float, float], size_fa
     east_m, north_m = _places_m(valley)
     inward = np.clip(2 * (1 - np.hypot((east_m - east) / half_x, (north_m - north) / half_y)), 0, 1)
     return np.asarray(inward**2 * (3 - 2 * inward))
+
+
+def _debris(deposit: Deposit, valley: Valley) -> SurfaceChange:
+    """Return a disc of even depth; a node at its edge has the covered share of what is around it."""
+    east_m, north_m = _places_m(valley)
+    within_m = (np.arange(DISC_SAMPLES) + 0.5) / DISC_SAMPLES - 0.5
+    shift_m = valley.ground.step_m * within_m
+    radius_m = np.sqrt(deposit.area_m2 / np.pi)
+    covered = sum(
+        np.hypot(east_m + x - deposit.east_m, north_m + y - deposit.north_m) < radius_m
+        for x in shift_m
+        for y in shift_m
+    )
+    share = np.asarray(covered) / DISC_SAMPLES**2
+
+    def amount(hours: float) -> float:
+        return deposit.depth_m if hours >= deposit.hour else 0.0
+
+    return SurfaceChange("deposit", valley.ground.with_nodes(share), amount)
 
 
 def _places_m(valley: Valley) -> tuple[Floats, Floats]:

@@ -13,9 +13,10 @@ from station.science.time_series.events import (
     distance_blocks,
     event_thresholds,
     overlaps,
-    scan_scatter,
+    scan_differences,
     surrounding_weights,
     surroundings,
+    window_scatter,
 )
 
 SHAPE = 60, 80
@@ -53,9 +54,15 @@ class Valley:
 
     def regions(self, scans):
         shared_m2 = self.systematic_m2
-        scatter_m2 = scan_scatter(np.stack([scan.change_m for scan in scans[:-2]]))
+        history_m = np.stack([scan.change_m for scan in scans[:-2]])
         return detect_regions(
-            scans[-8:-2], (scans[-2], scans[-1]), (shared_m2, shared_m2), scatter_m2, ROCK, THRESHOLDS
+            scans[-8:-2],
+            (scans[-2], scans[-1]),
+            (shared_m2,) * 2,
+            (shared_m2,) * 2,
+            history_m,
+            ROCK,
+            THRESHOLDS,
         )
 
 
@@ -139,15 +146,18 @@ def test_a_level_has_the_variance_of_a_median():
     assert np.isnan(before_level(levels[:2], 3).change_m).all()
 
 
-def test_scatter_is_that_of_consecutive_scans_whatever_the_trend():
+def test_scatter_of_windows_is_that_of_consecutive_scans_whatever_the_trend():
     rng = np.random.default_rng(0)
     hour = np.arange(24)[:, None, None]
     noise = 0.02 * rng.normal(size=(24, 40, 50))
-    step = np.where(hour >= 12, 1.0, 0.0) * (np.indices((40, 50))[0] < 10)
-    scatter_m = np.sqrt(scan_scatter(noise - 0.001 * hour + step))
-    assert np.median(scatter_m) == pytest.approx(0.027, abs=0.003)  # the largest of nine neighbours
+    step = np.where(hour >= 12, 1.0, 0.0) * (np.indices((40, 50))[0] < 3)
+    for size in (1, 2, 5):
+        scatter_m2 = window_scatter(scan_differences(noise - 0.1 * hour + step), size)
+        expected_m = 0.02 / size
+        assert scatter_m2.shape == (41 - size, 51 - size)
+        assert expected_m < np.median(np.sqrt(scatter_m2)) < 1.45 * expected_m  # the largest of nine
     edge = np.where(rng.random((24, 40, 50)) < 0.3, 0.6, 0.0)
-    assert np.sqrt(scan_scatter(noise + edge)).min() > 0.2
+    assert np.sqrt(window_scatter(scan_differences(noise + edge), 1)).min() > 0.2
 
 
 def test_blocks_at_an_edge_raise_no_event():
@@ -161,6 +171,32 @@ def test_blocks_at_an_edge_raise_no_event():
         scans.append(valley.scan(shifted))
     for last in range(12, 27):
         assert valley.regions(scans[:last]) == []
+
+
+def test_scatter_beyond_sigma_averages_out_over_an_event_and_is_none_itself():
+    """Rough rock, hit otherwise in each scan: blocks scatter by 0.1 m, three times their sigma and more."""
+    found = seen = 0
+    for seed in range(6):
+        valley = Valley(seed)
+        row, column = valley.rng.uniform(8, SHAPE[0] - 8), valley.rng.uniform(24, SHAPE[1] - 8)
+        deposit = disc(row, column, 3000, 0.4)
+        if deposit[~valley.unseen].sum() < 0.6 * deposit.sum():
+            continue
+        scans = [
+            valley.scan(0.1 * valley.rng.normal(size=SHAPE) + (number >= 24) * deposit)
+            for number in range(26)
+        ]
+        assert valley.regions(scans[:24]) == []
+        regions = valley.regions(scans)
+        seen += 1
+        found += len(regions) == 1 and overlaps(regions[0].blocks, deposit > 0.1)
+    assert found == seen >= 4
+
+
+def test_surroundings_do_not_follow_the_few_blocks_of_a_tile_that_is_mostly_other_ground():
+    values = np.where(COLUMN % 10 < 2, 0.6, 0.0)
+    around = surroundings(values, (COLUMN < 10) | (COLUMN == 10))
+    assert np.abs(around[COLUMN <= 10]).max() == 0
 
 
 def test_surroundings_are_those_of_the_same_ground():

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from station.simulation.instrument.motion import pose_offset, tilt_axes
+from station.simulation.scenario import Deposit
 from station.simulation.station import Scenario, Station, small
 from station.simulation.world.change import surface_changes
 from station.simulation.world.terrain import NodeField, Valley
@@ -36,6 +37,29 @@ def test_ice_settles_in_proportion_to_its_distance():
     change_m = station.surface.change_m(station.changes, 3.0)
     assert np.abs(change_m[station.surface.ice < 1e-4]).max() == 0
     assert -0.018 < change_m.min() < -0.012  # the far end of the ice, at 4 km of the valley's full size
+
+
+def test_a_deposit_has_its_volume_from_its_hour_on_and_lies_on_ground_known_to_be_stable():
+    deposit = Deposit(2.5, east_m=61.3, north_m=-47.2, area_m2=5000.0, depth_m=0.3)
+    (debris,) = surface_changes(replace(Scenario().without_errors(), deposits=(deposit,)), slope_valley(0.1))
+    assert [debris.amount(hour) for hour in (2.4, 2.5, 9.0)] == [0, 0.3, 0.3]
+    assert debris.pattern.node.sum() * 20.0**2 == pytest.approx(5000.0, rel=0.02)
+    assert debris.pattern.at(np.array([61.3]), np.array([-47.2]))[0] == pytest.approx(1.0, abs=0.01)
+    quiet = replace(small(hours=4), melt_m_per_h=0.0, avalanche_m=0.0, terrain_step_m=4.0, cell_m=10.0)
+    stable = Station(quiet).stable
+    assert Station(replace(quiet, deposits=(deposit,))).stable == stable
+
+
+def test_melt_by_day_follows_the_sun_and_is_as_much_in_a_day():
+    scenario = replace(Scenario().without_errors(), melt_m_per_h=0.01, melt_from_hour=8.0)
+    steady, daily = (
+        surface_changes(replace(scenario, melt_by_day=by_day), slope_valley(0.1, ice=1.0))[0].amount
+        for by_day in (False, True)
+    )
+    assert daily(32.0) == pytest.approx(steady(32.0)) == pytest.approx(0.24)
+    assert daily(18.0) == daily(30.0)  # not by night
+    noon = daily(12.5) - daily(11.5)
+    assert noon == pytest.approx(np.pi * 0.01, rel=0.01)  # a sine over half of the day
 
 
 def test_months_bring_snow_with_drifts_or_take_ice_and_move_the_scanner():
