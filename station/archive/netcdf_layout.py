@@ -14,7 +14,9 @@ import numpy as np
 from pyproj import CRS
 
 from station.archive import discovery
+from station.archive.plane_attributes import ALONG_NORMAL, axis_attributes, plane_attributes
 from station.archive.schema import CHANGE_LENGTH, FILL, TEXT_LENGTH, Variable
+from station.grid_plane import GridPlane
 from station.quantities import Grid, Scanner
 
 CHUNK = 128  # rows and columns of a chunk
@@ -74,6 +76,9 @@ class Series:
     metadata: tuple[tuple[str, str], ...] = ()  # global attributes that the site file gives
     scanner: Scanner | None = None
     cf_uncertainty: bool = False  # write the attributes of CF's draft on uncertainty
+    plane_crs: str | None = (
+        None  # map of the origin of the grid's plane, if it lies on one: then `crs` is None
+    )
 
     @property
     def vertical_crs(self) -> str | None:
@@ -136,7 +141,7 @@ def write_global_attrs(
     name = series.name or series.station_id
     extent = dict(discovery.extent(series.grid, series.crs))
     heights_m = heights_m or discovery.read_heights(series.folder / "reference.nc")
-    if np.isfinite(heights_m).all():
+    if np.isfinite(heights_m).all() and series.grid.plane.is_map:
         extent |= {"geospatial_vertical_min": heights_m[0], "geospatial_vertical_max": heights_m[1]}
     file.setncatts(
         {
@@ -149,6 +154,7 @@ def write_global_attrs(
             **extent,
             **({"geospatial_bounds_vertical_crs": series.vertical_crs} if series.vertical_crs else {}),
             **_scanner_attributes(series.scanner),
+            **plane_attributes(series.grid.plane, series.plane_crs),
         }
     )
     _write_extent(file, extent)
@@ -187,13 +193,7 @@ def _create_axis(file: netCDF4.Dataset, series: Series, axis: str, coordinate: n
     half_m = series.grid.cell_m / 2
     variable = file.createVariable(axis, "f8", (axis,))
     variable.setncatts(
-        {
-            "standard_name": f"projection_{axis}_coordinate",
-            "long_name": {"x": "easting", "y": "northing"}[axis],
-            "units": "m",
-            "axis": axis.upper(),
-            "bounds": f"{axis}_bnds",
-        }
+        axis_attributes(axis, series.grid.plane) | {"axis": axis.upper(), "bounds": f"{axis}_bnds"}
     )
     variable[:] = coordinate
     bounds = file.createVariable(f"{axis}_bnds", "f8", (axis, "bnds"))
@@ -327,7 +327,15 @@ def attributes(spec: Variable, series: Series) -> dict[str, Any]:
         attrs["units_metadata"] = "temperature: on_scale"
     if spec.dtype == "S1":
         attrs["_Encoding"] = ENCODING
-    return attrs
+    return _along_normal(attrs, spec, series.grid.plane)
+
+
+def _along_normal(attrs: dict[str, Any], spec: Variable, plane: GridPlane) -> dict[str, Any]:
+    """Return the attributes of a variable on a plane: there, heights are distances along its normal."""
+    if plane.is_map or spec.units != "m" or not (spec.is_raster or spec.standard_name):
+        return attrs
+    comment = f"{spec.comment}; {ALONG_NORMAL}" if spec.comment else ALONG_NORMAL
+    return {key: value for key, value in attrs.items() if key != "standard_name"} | {"comment": comment}
 
 
 def _uncertainty_attributes(spec: Variable) -> dict[str, Any]:
