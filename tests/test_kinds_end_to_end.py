@@ -25,16 +25,17 @@ SCENARIOS = {
     ),
     "beach": replace(beach(hours=4), lines=150, shots_per_line=150, **SMALL),
     "rockfall": replace(
-        rockfall(hours=6), lines=220, shots_per_line=160, cell_m=2.0, terrain_step_m=1.0, reference_scans=3
+        rockfall(hours=6), lines=220, shots_per_line=200, cell_m=2.0, terrain_step_m=1.0, reference_scans=3
     ),
 }
 
 # Limits of z of cells and areas. On calm sand sigma is too large (accuracy.md, known limits): a change that
-# all stable ground shares cannot be excluded, and cells at the edge of stone count for the noise of all.
+# all stable ground shares cannot be excluded, and cells at the edge of stone count for the noise of all. So it
+# is for areas of a rock face: rock may heave by 2 mm, and the simulated one does not.
 LIMITS = {
     "low-cost-snow": ((0.8, 1.25), (0.3, 1.6)),
     "beach": ((0.4, 1.25), (0.2, 1.6)),
-    "rockfall": ((0.8, 1.25), (0.3, 1.6)),
+    "rockfall": ((0.8, 1.25), (0.15, 1.6)),
 }
 
 
@@ -92,23 +93,25 @@ def test_areas_are_as_far_from_the_truth_as_sigma_says(run):
 
 @pytest.mark.parametrize("run", ["rockfall"], indirect=True)
 def test_what_fell_from_a_rock_face_is_as_far_from_the_truth_as_sigma_says(run):
-    """Gain and loss of all areas together, after the fall, against the volumes of the simulated blocks."""
+    """Loss, gain and net change of each area before and after the fall, against the simulated blocks."""
     site, truth, _ = run
-    budget = station.product(site.path, "rockfall")
-    cell_m2 = site.grid.cell_m**2
-    true_m = truth["change"].to_numpy() - truth["change"].to_numpy()[: site.reference.scans].mean(axis=0)
+    budget, first = station.product(site.path, "rockfall"), site.reference.scans
+    true_m = truth["change"].to_numpy()
+    true_m = true_m - true_m[:first].mean(axis=0)
     z = []
     for name, cells in area_cells(site, None).items():
         of_area = budget.sel(place=name)
-        for number in range(site.reference.scans, truth.sizes["time"]):
-            for quantity, true_m3 in (
-                ("net_change", true_m[number][cells].sum() * cell_m2),
-                ("erosion", np.minimum(true_m[number][cells], 0).sum() * cell_m2),
-                ("deposition", np.maximum(true_m[number][cells], 0).sum() * cell_m2),
-            ):
-                sigma_m3 = float(of_area[f"{quantity}_uncertainty"][number])
-                z.append((float(of_area[quantity][number]) - true_m3) / sigma_m3)
-    assert true_m[-1].min() < -0.5
+        for quantity, clipped_m in (
+            ("net_change", true_m),
+            ("erosion", np.minimum(true_m, 0)),
+            ("deposition", np.maximum(true_m, 0)),
+        ):
+            true_m3 = clipped_m[:, cells].sum(axis=1) * site.grid.cell_m**2
+            error_m3 = (of_area[quantity].to_numpy() - true_m3)[first:]
+            sigma_m3 = of_area[f"{quantity}_uncertainty"].to_numpy()[first:]
+            assert np.all(error_m3[sigma_m3 == 0] == 0)  # all of a scar is loss
+            z += (error_m3 / np.where(sigma_m3 > 0, sigma_m3, 1)).tolist()
+    assert budget["erosion"].sel(place="scar").to_numpy()[-1] == pytest.approx(-36.2, abs=3.0)
     assert 0.3 < np.sqrt(np.mean(np.square(z))) < 1.6
 
 

@@ -21,8 +21,8 @@ ALONG_NORMAL = "heights are distances from the plane of the grid along its norma
 _COMMENT = (
     "the grid lies on a plane through origin (easting, northing, height of the map), whose outer side faces"
     " the azimuth facing, clockwise from grid north, and that dips by dip (90: vertical). With A = facing and"
-    " D = dip, the axes in east, north, up are x (-cos A, sin A, 0), y (-cos D sin A, -cos D cos A, sin D), and"
-    " along the normal (sin D sin A, sin D cos A, cos D)"
+    " D = dip, the axes in east, north, up are x (-cos A, sin A, 0), y (-cos D sin A, -cos D cos A, sin D),"
+    " and along the normal (sin D sin A, sin D cos A, cos D)"
 )
 
 
