@@ -30,8 +30,8 @@ SCENARIOS = {
 }
 
 # Limits of z of cells and areas. On calm sand sigma is too large (accuracy.md, known limits): a change that
-# all stable ground shares cannot be excluded, and cells at the edge of stone count for the noise of all. So it
-# is for areas of a rock face: rock may heave by 2 mm, and the simulated one does not.
+# all stable ground shares cannot be excluded, and cells at the edge of stone count for the noise of all.
+# Likewise for areas of a rock face: rock may heave by 2 mm, and the simulated one does not.
 LIMITS = {
     "low-cost-snow": ((0.8, 1.25), (0.3, 1.6)),
     "beach": ((0.4, 1.25), (0.2, 1.6)),
