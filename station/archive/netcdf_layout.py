@@ -14,7 +14,6 @@ import numpy as np
 from pyproj import CRS
 
 from station.archive import discovery
-from station.archive.plane_attributes import ALONG_NORMAL, axis_attributes, plane_attributes
 from station.archive.schema import CHANGE_LENGTH, FILL, TEXT_LENGTH, Variable
 from station.grid_plane import GridPlane
 from station.quantities import Grid, Scanner
@@ -53,6 +52,7 @@ EXTENTS = {  # variables: axis in the names of ACDD's attributes, attributes of 
         },
     ),
 }
+ALONG_NORMAL = "heights are distances from the plane of the grid along its normal, positive outward"
 TIME_ATTRS = {
     "standard_name": "time",
     "units": "seconds since 1970-01-01 00:00:00",
@@ -154,7 +154,7 @@ def write_global_attrs(
             **extent,
             **({"geospatial_bounds_vertical_crs": series.vertical_crs} if series.vertical_crs else {}),
             **_scanner_attributes(series.scanner),
-            **plane_attributes(series.grid.plane, series.plane_crs),
+            **discovery.plane_attributes(series.grid.plane, series.plane_crs),
         }
     )
     _write_extent(file, extent)
@@ -199,6 +199,15 @@ def _create_axis(file: netCDF4.Dataset, series: Series, axis: str, coordinate: n
     bounds = file.createVariable(f"{axis}_bnds", "f8", (axis, "bnds"))
     half_step_m = half_m if axis == "x" else -half_m  # rows run from north to south
     bounds[:] = np.stack([coordinate - half_step_m, coordinate + half_step_m], axis=-1)
+
+
+def axis_attributes(axis: str, plane: GridPlane, what: str = "") -> dict[str, str]:
+    """Return name and unit of coordinates along x or y of a grid, of `what` if it is not the cells."""
+    if not plane.is_map:
+        direction = {"x": "along", "y": "up"}[axis]
+        return {"long_name": f"distance {direction} the plane from its origin{what}", "units": "m"}
+    name = {"x": "easting", "y": "northing"}[axis]
+    return {"standard_name": f"projection_{axis}_coordinate", "long_name": name + what, "units": "m"}
 
 
 def create_time_axis(file: netCDF4.Dataset, times: int) -> None:

@@ -11,8 +11,7 @@ import numpy as np
 import shapely
 from shapely.geometry.polygon import orient
 
-from station.archive.netcdf_layout import Series, create_crs
-from station.archive.plane_attributes import axis_attributes
+from station.archive.netcdf_layout import Series, axis_attributes, create_crs
 
 CONTAINER = "area_outline"
 POLYGONS_ATTRIBUTE = "area_outlines_sha256"

@@ -23,6 +23,7 @@ from station.archive.derived.fingerprints import fingerprints_path, is_intact, w
 from station.archive.discovery import time_coverage
 from station.archive.netcdf_layout import (
     Series,
+    axis_attributes,
     create_crs,
     create_time_axis,
     create_variable,
@@ -30,7 +31,6 @@ from station.archive.netcdf_layout import (
     encode_text,
     write_global_attrs,
 )
-from station.archive.plane_attributes import axis_attributes
 from station.archive.read_errors import read_errors
 from station.archive.schema import BY_NAME, FILL, TEXT, TEXT_LENGTH, VERDICTS, Variable
 from station.errors import StationError, StoreError

@@ -15,6 +15,7 @@ import numpy as np
 
 from station.archive.chunk_codec import read_column
 from station.archive.derived.computed_rasters import CHANGE
+from station.archive.discovery import read_plane
 from station.archive.epochs import (
     COMPACTED,
     EpochRef,
@@ -26,7 +27,6 @@ from station.archive.epochs import (
     parse_epoch_filename,
 )
 from station.archive.netcdf_layout import Series, read_scanner
-from station.archive.plane_attributes import read_plane
 from station.archive.read_errors import read_errors
 from station.archive.schema import TEXT_LENGTH, VERDICTS
 from station.archive.series.epoch_reader import middle
