@@ -19,7 +19,7 @@ pytestmark = pytest.mark.integration
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
     folder = tmp_path_factory.mktemp("plane") / "station"
-    simulate(folder, replace(small(hours=4), lines=90, shots_per_line=120, cell_m=10.0, reference_scans=2))
+    simulate(folder, replace(small(hours=3), lines=60, shots_per_line=90, cell_m=10.0, reference_scans=2))
     text = re.sub(r"(?m)^\[areas\]\nfile = .*\n", "", (folder / "site.toml").read_text())
     (folder / "site.toml").write_text(text.replace('"stable.geojson"', '"auto"'))
     return folder

@@ -192,9 +192,8 @@ def _create_axis(file: netCDF4.Dataset, series: Series, axis: str, coordinate: n
     file.createDimension(axis, len(coordinate))
     half_m = series.grid.cell_m / 2
     variable = file.createVariable(axis, "f8", (axis,))
-    variable.setncatts(
-        axis_attributes(axis, series.grid.plane) | {"axis": axis.upper(), "bounds": f"{axis}_bnds"}
-    )
+    horizontal = {"axis": axis.upper()} if series.grid.plane.is_map else {}  # in CF, X and Y are horizontal
+    variable.setncatts(axis_attributes(axis, series.grid.plane) | horizontal | {"bounds": f"{axis}_bnds"})
     variable[:] = coordinate
     bounds = file.createVariable(f"{axis}_bnds", "f8", (axis, "bnds"))
     half_step_m = half_m if axis == "x" else -half_m  # rows run from north to south

@@ -203,7 +203,7 @@ def _compose(
     _draw_colour_bar(draw, scale, (margin, box[3] + round(16 * unit)), round(inner * 0.56), unit)
     _legend(draw, legend, (margin + round(inner * 0.64), box[3] + round(22 * unit)), unit)
     grid = overview.base.grid
-    upward = "N" if grid.plane.is_map else "↑"
+    upward = "N" if grid.plane.is_map else "up"
     _draw_north_and_scale(picture, box, grid.cell_m * nx / size[0], unit, upward)
     return picture
 
