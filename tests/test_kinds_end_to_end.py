@@ -8,11 +8,13 @@ import xarray as xr
 
 import station
 from station.config import read_site
+from station.errors import ConfigError
 from station.operations.batch import process_scans
 from station.operations.site_check import site_findings
 from station.processing.epoch_recorder import page_folder
 from station.products.area_tables import area_cells
 from station.science.geometry.robust_statistics import nmad
+from station.service.store_repair import require_same_map
 from station.simulation.kinds import beach, low_cost_snow, rockfall
 from station.simulation.station import Station, simulate
 
@@ -135,3 +137,7 @@ def test_files_of_a_rock_face_lead_back_to_the_map(run):
     with xr.open_dataset(site.station.data / "processing.nc") as processing:
         stored_m = [float(processing[f"scanner_{axis}"][0]) for axis in ("east", "north", "height")]
     np.testing.assert_allclose(stored_m, scanner_m, atol=1e-6)
+    text = site.path.read_text()
+    (site.path.parent / "other.toml").write_text(text.replace("dip_deg = 90.0", "dip_deg = 85.0"))
+    with pytest.raises(ConfigError, match=r"grid\.plane differs"):
+        require_same_map(read_site(site.path.parent / "other.toml"))
