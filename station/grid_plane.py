@@ -53,8 +53,16 @@ class GridPlane:
         """Return u, v and w (3, ...) of points of the map (3, ...) [m]."""
         if self.is_map:
             return points_m
-        offset_m = (points_m.T - np.array(self.origin_m)).T
-        return np.asarray(np.tensordot(self.axes, offset_m, 1))
+        east_m, north_m, up_m = (axis - origin for axis, origin in zip(points_m, self.origin_m, strict=True))
+        return np.stack(self.in_grid_axes((east_m, north_m, up_m)))
+
+    def to_map(self, points_m: Floats) -> Floats:
+        """Return easting, northing and height (3, ...) of points u, v, w (3, ...) [m]."""
+        if self.is_map:
+            return points_m
+        u_m, v_m, w_m = points_m
+        offset_m = self.in_map_axes((u_m, v_m, w_m))
+        return np.stack([axis + origin for axis, origin in zip(offset_m, self.origin_m, strict=True)])
 
     def place_from_map(self, place_m: Place) -> Place:
         """Return u, v and w of one place of the map [m]."""
@@ -65,12 +73,6 @@ class GridPlane:
         """Return easting, northing and height of one place u, v, w [m]."""
         east_m, north_m, height_m = self.to_map(np.array(place_m)).tolist()
         return east_m, north_m, height_m
-
-    def to_map(self, points_m: Floats) -> Floats:
-        """Return easting, northing and height (3, ...) of points u, v, w (3, ...) [m]."""
-        if self.is_map:
-            return points_m
-        return np.asarray((np.tensordot(self.axes.T, points_m, 1).T + np.array(self.origin_m)).T)
 
     def in_map_axes(self, vector: Vector) -> Vector:
         """Return the components east, north and up of vectors with the components u, v and w (n,)."""
