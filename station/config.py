@@ -18,6 +18,7 @@ from pydantic import BaseModel, ValidationError
 
 from station._version import __version__
 from station.errors import ConfigError
+from station.grid_plane import MAP_PLANE, GridPlane
 from station.quantities import Grid, Scanner
 from station.section_types import Section
 from station.sections.inputs import ScannerSection, SopSection
@@ -42,6 +43,7 @@ KINDS = {  # of stations with a commented site file in config/, by the values of
     "mammoth": "mammoth",
     "low-cost-snow": "low-cost-snow",
     "beach": "beach",
+    "rockfall": "rockfall",
 }
 SCHEMA_NAME = "station-site.schema.json"  # next to the site file, whose first line refers to it
 
@@ -60,7 +62,13 @@ class Site(SiteFile):
     def grid_cells(self) -> Grid:
         """The grid of the products."""
         ny, nx = self.grid.shape
-        return Grid(self.grid.bounds_m.west, self.grid.bounds_m.north, self.grid.cell_m, nx, ny)
+        plane = MAP_PLANE if self.grid.plane is None else GridPlane(**self.grid.plane.model_dump())
+        return Grid(self.grid.bounds_m.west, self.grid.bounds_m.north, self.grid.cell_m, nx, ny, plane)
+
+    @property
+    def grid_crs(self) -> str | None:
+        """The CRS of the grid: that of the map; None if it lies on a plane, whose coordinates are its own."""
+        return self.map.crs if self.grid.plane is None else None
 
     @property
     def instrument(self) -> Scanner:
@@ -99,7 +107,7 @@ class Site(SiteFile):
                 "scans": {"frame", "point_time", "intensity"},
                 "scanner": True,
                 "map": {"crs", "origin", "vertical_datum"},
-                "grid": True,
+                "grid": {"bounds_m", "cell_m", "min_points"},
                 "inclination": {"filter", "cutoff_hz", "mode"},
                 "weather": {"max_age_s"},
                 "air": True,
@@ -110,6 +118,8 @@ class Site(SiteFile):
         )
         if self.scans.convert or self.scans.columns:  # without them, the hash is that of earlier versions
             settings["scans"] |= self.scans.model_dump(mode="json", include={"columns", "convert"})
+        if self.grid.plane:
+            settings["grid"]["plane"] = self.grid.plane.model_dump(mode="json")
         if self.registration:
             settings["registration"] = self.registration.model_dump(mode="json", exclude={"suffix", "wait_s"})
         if self.map.pop:

@@ -15,6 +15,8 @@ from typing import Any, Literal, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from station.grid_plane import MAP_PLANE, GridPlane
+
 Floats = NDArray[np.float64]
 Floats32 = NDArray[np.float32]
 Reals = NDArray[np.floating[Any]]  # of either precision
@@ -112,13 +114,17 @@ class WeatherLog:
 
 @dataclass(frozen=True)
 class Grid:
-    """A fixed raster, pixel-exact: `west_m` and `north_m` are outer edges, rows run from north to south."""
+    """A fixed raster, pixel-exact: `west_m` and `north_m` are outer edges, rows run from north to south.
+
+    On another plane than the map, easting, northing and height stand for its u, v and w.
+    """
 
     west_m: float
     north_m: float
     cell_m: float
     nx: int
     ny: int
+    plane: GridPlane = MAP_PLANE
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -140,10 +146,15 @@ class Grid:
         row = cell // self.nx
         return row, cell - row * self.nx
 
+    def horizontal_range_m(self, row: Any, column: Any, position_m: tuple[float, ...]) -> NDArray[Any]:  # noqa: ANN401 - of any shape
+        """Return the horizontal distance of cells from a position on the grid [m]; of a plane, at w = 0."""
+        x_m, y_m = self.x_m[column] - position_m[0], self.y_m[row] - position_m[1]
+        return self.plane.horizontal_m((x_m, y_m, np.full(1, -position_m[2])))
+
 
 @dataclass(frozen=True)
 class Viewpoint:
-    """A scanner, and its position on the map."""
+    """A scanner, and its position on the grid."""
 
     scanner: Scanner
     position_m: tuple[float, float, float]
@@ -153,7 +164,7 @@ class Viewpoint:
 class ScanGeometry:
     """What does not change from scan to scan: scanner, grid, position and settings.
 
-    `position_m` is the scanner's position on the map, None if scans in the map frame do not contain it;
+    `position_m` is the scanner's position on the grid, None if scans in the map frame do not contain it;
     `axis` is the head's axis of rotation (east, north, up). Scans from several positions have `viewpoints`,
     and scanner and position are those of the first one of the site file.
     """

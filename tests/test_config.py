@@ -12,6 +12,7 @@ from pydantic import ValidationError
 
 from station.config import KINDS, SCHEMA_NAME, read_site, site_schema, write_site
 from station.errors import ConfigError
+from station.grid_plane import GridPlane
 from station.processing.scanner_pose import sop_identity
 from station.scanners import KEYS, SCANNERS, missing_values
 from station.sections.inputs import ScannerSection
@@ -58,6 +59,39 @@ def test_map_must_be_projected_and_in_metres(tmp_path, crs, message):
     with pytest.raises(ConfigError, match=re.escape(f"map.crs: {message}")):
         read(tmp_path, f'{GOOD}[map]\ncrs = "{crs}"\n')
     assert read(tmp_path, f'{GOOD}[map]\ncrs = "EPSG:32632+5773"\n').map.crs
+
+
+PLANE = "plane = { origin_m = [1.0, 2.0, 3.0], facing_deg = 200.0 }"
+
+
+def on_plane(text=GOOD, plane=PLANE):
+    return text.replace("[grid]\n", f"[grid]\n{plane}\n")
+
+
+def test_a_grid_on_a_plane_has_its_own_coordinates(tmp_path):
+    site = read(tmp_path, f'{on_plane()}[map]\ncrs = "EPSG:32632"\n')
+    assert site.grid_cells.plane == GridPlane((1.0, 2.0, 3.0), 200.0, 90.0)
+    assert (site.grid_crs, site.map.crs) == (None, "EPSG:32632")
+    on_map = read(tmp_path, GOOD)
+    assert on_map.grid_cells.plane.is_map
+    assert len({site.science_hash, on_map.science_hash, read(tmp_path, on_plane()).science_hash}) == 3
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        (on_plane(plane=PLANE.replace("200.0", "400.0")), "facing_deg: should be less than or equal to 360"),
+        (on_plane() + '[uncertainty]\nmodel = "voordendag2023"\n', "its terms are those of heights"),
+        (on_plane() + "[uncertainty]\nstore_terms = true\n", "its terms are those of heights"),
+        (
+            on_plane() + '[[product]]\nname = "ice"\nkind = "melt"\ndensity_kg_m3 = 900\nat = [0.0, 0.0]\n',
+            "product 'ice' of kind melt is counted upward",
+        ),
+    ],
+)
+def test_what_has_no_meaning_on_a_plane_is_a_fault(tmp_path, text, message):
+    with pytest.raises(ConfigError, match=re.escape(message)):
+        read(tmp_path, text)
 
 
 @pytest.mark.parametrize("name", ["%y_%y", "%q", "%Y%m%d%", "%H(%M"])

@@ -1,7 +1,8 @@
 """Global attributes by which files are found, cited and combined (ACDD 1.3), in every file of a store.
 
-What people decide comes from `[metadata]` of the site file; extent and times are computed.
-Source: Attribute Convention for Data Discovery 1.3 (ESIP).
+What people decide comes from `[metadata]` of the site file; extent and times are computed. A grid on another
+plane than the map has no extent in degrees, but says how to return to the map.
+Source: Attribute Convention for Data Discovery 1.3 (ESIP); equations.md, 4.13.
 """
 
 from __future__ import annotations
@@ -11,15 +12,27 @@ from collections.abc import Mapping
 from datetime import UTC, datetime, timedelta
 from functools import lru_cache
 from pathlib import Path
+from typing import Any
 
 import h5py
+import netCDF4
 from pyproj import CRS, Transformer
 
 from station._version import __version__
+from station.grid_plane import MAP_PLANE, GridPlane
 from station.quantities import Grid
 
 NO_HEIGHTS = (math.nan, math.nan)
 DENSIFY_POINTS = 21  # of each edge of the grid, which is curved in degrees
+PLANE_ORIGIN, PLANE_FACING, PLANE_DIP, PLANE_CRS = (
+    f"grid_plane_{name}" for name in ("origin_m", "facing_deg", "dip_deg", "map_crs")
+)
+_PLANE_COMMENT = (
+    "the grid lies on a plane through origin (easting, northing, height of the map), whose outer side faces"
+    " the azimuth facing, clockwise from grid north, and that dips by dip (90: vertical). With A = facing and"
+    " D = dip, the axes in east, north, up are x (-cos A, sin A, 0), y (-cos D sin A, -cos D cos A, sin D),"
+    " and along the normal (sin D sin A, sin D cos A, cos D)"
+)
 _STAMP = "%Y-%m-%dT%H:%M:%SZ"
 
 
@@ -67,6 +80,29 @@ def extent(grid: Grid, crs: str | None) -> dict[str, str | float]:
         "geospatial_vertical_positive": "up",
         "geospatial_vertical_units": "m",
     }
+
+
+def plane_attributes(plane: GridPlane, map_crs: str | None) -> dict[str, Any]:
+    """Return the attributes that describe the plane of a grid; none if that is the map."""
+    if plane.is_map:
+        return {}
+    return {
+        PLANE_ORIGIN: list(plane.origin_m),
+        PLANE_FACING: plane.facing_deg,
+        PLANE_DIP: plane.dip_deg,
+        **({PLANE_CRS: map_crs} if map_crs is not None else {}),
+        "grid_plane_comment": _PLANE_COMMENT,
+    }
+
+
+def read_plane(file: netCDF4.Dataset) -> tuple[GridPlane, str | None]:
+    """Return the plane of the grid of a file, and the CRS of the map that its origin refers to."""
+    attrs = {name: file.getncattr(name) for name in file.ncattrs() if name.startswith("grid_plane_")}
+    if PLANE_FACING not in attrs:
+        return MAP_PLANE, None
+    east_m, north_m, height_m = (float(value) for value in attrs[PLANE_ORIGIN])
+    plane = GridPlane((east_m, north_m, height_m), float(attrs[PLANE_FACING]), float(attrs[PLANE_DIP]))
+    return plane, attrs.get(PLANE_CRS)
 
 
 def read_heights(reference: Path) -> tuple[float, float]:

@@ -15,6 +15,7 @@ from pyproj import CRS
 
 from station.archive import discovery
 from station.archive.schema import CHANGE_LENGTH, FILL, TEXT_LENGTH, Variable
+from station.grid_plane import GridPlane
 from station.quantities import Grid, Scanner
 
 CHUNK = 128  # rows and columns of a chunk
@@ -51,6 +52,7 @@ EXTENTS = {  # variables: axis in the names of ACDD's attributes, attributes of 
         },
     ),
 }
+ALONG_NORMAL = "heights are distances from the plane of the grid along its normal, positive outward"
 TIME_ATTRS = {
     "standard_name": "time",
     "units": "seconds since 1970-01-01 00:00:00",
@@ -74,6 +76,9 @@ class Series:
     metadata: tuple[tuple[str, str], ...] = ()  # global attributes that the site file gives
     scanner: Scanner | None = None
     cf_uncertainty: bool = False  # write the attributes of CF's draft on uncertainty
+    plane_crs: str | None = (
+        None  # map of the origin of the grid's plane, if it lies on one: then `crs` is None
+    )
 
     @property
     def vertical_crs(self) -> str | None:
@@ -136,7 +141,7 @@ def write_global_attrs(
     name = series.name or series.station_id
     extent = dict(discovery.extent(series.grid, series.crs))
     heights_m = heights_m or discovery.read_heights(series.folder / "reference.nc")
-    if np.isfinite(heights_m).all():
+    if np.isfinite(heights_m).all() and series.grid.plane.is_map:
         extent |= {"geospatial_vertical_min": heights_m[0], "geospatial_vertical_max": heights_m[1]}
     file.setncatts(
         {
@@ -149,6 +154,7 @@ def write_global_attrs(
             **extent,
             **({"geospatial_bounds_vertical_crs": series.vertical_crs} if series.vertical_crs else {}),
             **_scanner_attributes(series.scanner),
+            **discovery.plane_attributes(series.grid.plane, series.plane_crs),
         }
     )
     _write_extent(file, extent)
@@ -186,19 +192,21 @@ def _create_axis(file: netCDF4.Dataset, series: Series, axis: str, coordinate: n
     file.createDimension(axis, len(coordinate))
     half_m = series.grid.cell_m / 2
     variable = file.createVariable(axis, "f8", (axis,))
-    variable.setncatts(
-        {
-            "standard_name": f"projection_{axis}_coordinate",
-            "long_name": {"x": "easting", "y": "northing"}[axis],
-            "units": "m",
-            "axis": axis.upper(),
-            "bounds": f"{axis}_bnds",
-        }
-    )
+    horizontal = {"axis": axis.upper()} if series.grid.plane.is_map else {}  # in CF, X and Y are horizontal
+    variable.setncatts(axis_attributes(axis, series.grid.plane) | horizontal | {"bounds": f"{axis}_bnds"})
     variable[:] = coordinate
     bounds = file.createVariable(f"{axis}_bnds", "f8", (axis, "bnds"))
     half_step_m = half_m if axis == "x" else -half_m  # rows run from north to south
     bounds[:] = np.stack([coordinate - half_step_m, coordinate + half_step_m], axis=-1)
+
+
+def axis_attributes(axis: str, plane: GridPlane, what: str = "") -> dict[str, str]:
+    """Return name and unit of coordinates along x or y of a grid, of `what` if it is not the cells."""
+    if not plane.is_map:
+        direction = {"x": "along", "y": "up"}[axis]
+        return {"long_name": f"distance {direction} the plane from its origin{what}", "units": "m"}
+    name = {"x": "easting", "y": "northing"}[axis]
+    return {"standard_name": f"projection_{axis}_coordinate", "long_name": name + what, "units": "m"}
 
 
 def create_time_axis(file: netCDF4.Dataset, times: int) -> None:
@@ -327,7 +335,15 @@ def attributes(spec: Variable, series: Series) -> dict[str, Any]:
         attrs["units_metadata"] = "temperature: on_scale"
     if spec.dtype == "S1":
         attrs["_Encoding"] = ENCODING
-    return attrs
+    return _along_normal(attrs, spec, series.grid.plane)
+
+
+def _along_normal(attrs: dict[str, Any], spec: Variable, plane: GridPlane) -> dict[str, Any]:
+    """Return the attributes of a variable on a plane: there, heights are distances along its normal."""
+    if plane.is_map or spec.units != "m" or not (spec.is_raster or spec.standard_name):
+        return attrs
+    comment = f"{spec.comment}; {ALONG_NORMAL}" if spec.comment else ALONG_NORMAL
+    return {key: value for key, value in attrs.items() if key != "standard_name"} | {"comment": comment}
 
 
 def _uncertainty_attributes(spec: Variable) -> dict[str, Any]:

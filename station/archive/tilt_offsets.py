@@ -38,7 +38,7 @@ def stored_tilt_offsets(site: Site) -> dict[str, CyclicError]:
     """Return the tilt offset in the first epoch of each SOP; raise StoreError if an epoch is damaged."""
     if site.inclination is None or site.inclination.mode == "absolute":
         return {}
-    series = Series(site.station.data, site.station.id, site.grid_cells, site.map.crs)
+    series = Series(site.station.data, site.station.id, site.grid_cells, site.grid_crs)
     first: dict[str, CyclicError] = {}
     for run in contiguous_runs(list_epochs(series)):
         scalars = read_source(*run).scalars

@@ -18,7 +18,7 @@ def init(
         str,
         typer.Option(
             help="hef: glacier, VZ-6000. mammoth: snow field, VZ-400i. low-cost-snow: snow slope, Livox."
-            " beach: VZ-2000."
+            " beach: VZ-2000. rockfall: rock face, VZ-400i."
         ),
     ] = "hef",
     source: Annotated[

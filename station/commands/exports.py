@@ -201,7 +201,7 @@ def _export_series(
 
     file_format = FORMATS[kind]
     areas = settings.areas.file if settings.areas else None
-    box_m = parse_box(options.area, areas, settings.map.crs) if options.area else None
+    box_m = parse_box(options.area, areas, settings.grid_crs) if options.area else None
     selection = select(series_for(settings), span, box_m, options.variables, options.chunks)
     if kind == "references":
         selection = replace(selection, url=options.url or settings.station.data.resolve().as_uri())

@@ -10,7 +10,7 @@ import typer
 
 from station.simulation.scenario import NAMES
 
-LIKE = ("hef", "mammoth", "low-cost-snow", "beach")
+LIKE = ("hef", "mammoth", "low-cost-snow", "beach", "rockfall")
 
 
 def _like(kind: str) -> str:
@@ -44,7 +44,7 @@ def simulate(
             metavar="KIND",
             callback=_like,
             help="hef: glacier. mammoth: snow slope, VZ-400i. low-cost-snow: snow slope, Livox."
-            " beach: VZ-2000.",
+            " beach: VZ-2000. rockfall: rock face, VZ-400i.",
         ),
     ] = "hef",
 ) -> None:

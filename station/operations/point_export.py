@@ -156,7 +156,8 @@ def _cells(epoch: EpochRef) -> tuple[dict[str, np.ndarray[Any, Any]], str]:
 def _header(site: Site) -> laspy.LasHeader:
     header = laspy.LasHeader(point_format=POINT_FORMAT, version="1.4")
     grid = site.grid_cells
-    header.scales, header.offsets = np.full(3, SCALE_M), np.round([grid.west_m, grid.north_m, 0.0])
+    corner_m = grid.plane.to_map(np.array([grid.west_m, grid.north_m, 0.0]))
+    header.scales, header.offsets = np.full(3, SCALE_M), np.round(corner_m)
     header.add_extra_dims(
         [laspy.ExtraBytesParams(name, kind, text) for name, (kind, text) in EXTRA_BYTES.items()]
     )
@@ -176,15 +177,17 @@ def _records(
     correction_m: Floats32,
     cells: dict[str, np.ndarray[Any, Any]],
 ) -> laspy.ScaleAwarePointRecord:
-    """Return the points (3, n) that lie on the grid, corrected, with the values of their cells."""
+    """Return the points (3, n) of the map that lie on the grid, corrected, with the values of their cells."""
     grid = site.grid_cells
-    column = np.floor((points_m[0] - grid.west_m) / grid.cell_m).astype(np.int64)
-    row = np.floor((grid.north_m - points_m[1]) / grid.cell_m).astype(np.int64)
+    on_grid_m = grid.plane.from_map(points_m)
+    column = np.floor((on_grid_m[0] - grid.west_m) / grid.cell_m).astype(np.int64)
+    row = np.floor((grid.north_m - on_grid_m[1]) / grid.cell_m).astype(np.int64)
     inside = np.flatnonzero((column >= 0) & (column < grid.nx) & (row >= 0) & (row < grid.ny))
     cell = row[inside], column[inside]
     records = laspy.ScaleAwarePointRecord.zeros(len(inside), header=header)
-    records.x, records.y = points_m[0, inside], points_m[1, inside]
-    records.z = points_m[2, inside] - correction_m[cell]
+    corrected_m = on_grid_m[:, inside]
+    corrected_m[2] -= correction_m[cell]
+    records.x, records.y, records.z = grid.plane.to_map(corrected_m)
     records.return_number[:] = records.number_of_returns[:] = 1
     if shots.time_s is not None:
         records.gps_time = shots.time_s[inside]

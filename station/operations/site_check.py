@@ -26,6 +26,7 @@ from station.operations.site_plausibility import (
     alarm_findings,
     double_tilt_findings,
     overlap_findings,
+    plane_findings,
     position_findings,
     rights_findings,
     setting_findings,
@@ -167,13 +168,16 @@ def _sop_poses(site: Site) -> Iterator[Finding]:
         except StationError as error:
             yield _finding("fault", "sop", str(error))
             continue
-        east_m, north_m, _ = frame.position_m
+        x_m, y_m, above_m = grid.plane.place_from_map(frame.position_m)
         if sop is not None:
             yield from _sop_pose(site, sop, frame)
         distance_m = math.hypot(
-            max(grid.west_m - east_m, 0.0, east_m - grid.west_m - grid.nx * grid.cell_m),
-            max(north_m - grid.north_m, 0.0, grid.north_m - grid.ny * grid.cell_m - north_m),
+            max(grid.west_m - x_m, 0.0, x_m - grid.west_m - grid.nx * grid.cell_m),
+            max(y_m - grid.north_m, 0.0, grid.north_m - grid.ny * grid.cell_m - y_m),
+            0.0 if grid.plane.is_map else above_m,
         )
+        if not grid.plane.is_map:
+            yield from _named("grid", [plane_findings(site, above_m)])
         if distance_m > site.scanner_of(sop).range_max_m:
             yield _finding(
                 "fault", "grid", f"begins {distance_m:,.0f} m from the scanner: beyond range_max_m"
@@ -185,7 +189,7 @@ def _polygons(site: Site) -> Iterator[Finding]:
     files = [site.areas.file] if site.areas else []
     files += [site.adjustment.stable] if isinstance(site.adjustment.stable, Path) else []
     try:
-        for message in (text for file in files for text in mended_outlines(file, site.map.crs)):
+        for message in (text for file in files for text in mended_outlines(file, site.grid_crs)):
             yield _finding("warning", "polygons", message)
         named = load_areas(site)
         areas = {f"area {name}": cells for name, cells in named.items()}

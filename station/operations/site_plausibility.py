@@ -73,6 +73,16 @@ def position_findings(
         )
 
 
+def plane_findings(site: Site, above_m: float) -> LevelAndMessage:
+    """Return how the plane of the grid lies, above which the scanner stands by `above_m` along its normal."""
+    plane = site.grid_cells.plane
+    described = f"on a plane that faces {plane.facing_deg:g}° and dips {plane.dip_deg:g}°"
+    if above_m <= 0:
+        advice = "facing_deg is the azimuth from the face towards the scanner"
+        return "fault", f"{described}: the scanner is {-above_m:,.1f} m behind it: {advice}"
+    return "ok", f"{described}, {above_m:,.1f} m from the scanner; change is positive towards it"
+
+
 def setting_findings(site: Site) -> Iterator[LevelAndMessage]:
     """Yield settings that other programs will not understand, or far from the data sheet of the scanner."""
     datum = site.map.vertical_datum

@@ -34,9 +34,8 @@ def scalar_variables(
         "coverage": float(np.count_nonzero(measurement.count) / measurement.cell_index.size),
     }
     if geometry.position_m is not None:
-        scalars |= dict(
-            zip(("scanner_east", "scanner_north", "scanner_height"), geometry.position_m, strict=True)
-        )
+        position_m = geometry.grid.plane.place_to_map(geometry.position_m)
+        scalars |= dict(zip(("scanner_east", "scanner_north", "scanner_height"), position_m, strict=True))
         scalars |= {"scanner_axis_east": geometry.axis[0], "scanner_axis_north": geometry.axis[1]}
     if tilt_record is not None:
         scalars["platform_roll"] = math.degrees(tilt_record.mean_roll_rad)

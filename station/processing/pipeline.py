@@ -27,7 +27,12 @@ from station.science.adjustment import ground_classes, prior, variance_component
 from station.science.adjustment.ground_classes import SnowTest
 from station.science.adjustment.joint import Adjustment, adjust_scan, tilt_effect
 from station.science.adjustment.normal_equations import LineInclination
-from station.science.adjustment.patches import CellObservations, aggregate_patches
+from station.science.adjustment.patches import (
+    CellObservations,
+    aggregate_patches,
+    distance_along_line,
+    line_length,
+)
 from station.science.geometry.pose import ScannerToMap, TimedRotation, timed_rotation
 from station.science.geometry.robust_statistics import nmad
 from station.science.gridding.cell_estimates import CellEstimator, estimate_cells
@@ -119,6 +124,7 @@ def add_shots(
     gridder: Gridder, points_m: Floats, intensity: Floats | None = None, viewpoint: int = 0
 ) -> None:
     """Add map points (3, n) to the grid, as residuals to the reference where it has a height."""
+    points_m = gridder.grid.plane.from_map(points_m)
     inside, column, row = gridder.locate(points_m[0], points_m[1])
     cell_index = gridder.cell_indices(column, row)
     residual_m = points_m[2][inside] - gridder.datum_height(cell_index, column, row)
@@ -151,7 +157,8 @@ def adjust_to_reference(
     """
     components, reference_state = usual_motion(viewing.reference, inputs.time_s), viewing.reference.shared
     cells = _cells(gridder, viewing, snow_test(gridder, scan_geometry, viewing))
-    patches = aggregate_patches(inputs.params, cells, scan_geometry.scanner.range_max_m)
+    extent_m = line_length(scan_geometry.grid, scan_geometry.scanner.range_max_m)
+    patches = aggregate_patches(inputs.params, cells, *extent_m)
 
     def adjusted(components: VarianceComponents) -> Adjustment:
         state_prior = prior.state_prior(
@@ -214,11 +221,11 @@ def _cells(gridder: Gridder, viewing: ViewingGeometry, test: SnowTest) -> Iterat
             continue
         sector, sums = all_cells.take(observed), sums.take(observed)
         jacobian = viewing.jacobian(sector)
-        east_m, north_m, up_m = viewing.offset_m(sector.cell, sector.height_m)
+        offset_m = viewing.offset_m(sector.cell, sector.height_m)
         yield CellObservations(
             jacobian,
-            np.hypot(east_m, north_m),
-            up_m,
+            distance_along_line(viewing.grid, sector.cell, offset_m),
+            viewing.grid.plane.in_map_axes(offset_m)[2],
             ground_classes.classify(
                 sector.in_class(CellClass.STABLE),
                 sector.in_class(CellClass.HOLDOUT),

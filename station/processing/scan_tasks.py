@@ -342,7 +342,7 @@ def load_reference(site: Site, version: str | None = None) -> Reference | None:
     version = file_version(setting)
     if reference is None or reference.version != version:
         elevation_m = nodes_from_means(read_geotiff(setting, series.grid, series.crs))
-        snow_free = ground_classes.holds_no_snow(elevation_m, series.grid.cell_m)
+        snow_free = ground_classes.holds_no_snow(elevation_m, series.grid)
         write_reference(series, Reference.from_elevation(series.grid, version, elevation_m, snow_free))
         reference = open_reference(series)
     return reference

@@ -25,11 +25,15 @@ def scan_geometry(
     position_m: tuple[float, float, float] | None,
     axis: tuple[float, float, float] = VERTICAL_AXIS,
 ) -> ScanGeometry:
-    """Return the geometry and settings that are the same for all scans under one SOP."""
+    """Return the geometry and settings that are the same for all scans under one SOP.
+
+    `position_m` is the scanner's position on the map, None if it is unknown.
+    """
+    grid = site.grid_cells
     return ScanGeometry(
         scanner=site.instrument,
-        grid=site.grid_cells,
-        position_m=position_m,
+        grid=grid,
+        position_m=None if position_m is None else grid.plane.place_from_map(position_m),
         axis=axis,
         min_points=site.grid.min_points,
         published_budget=site.uncertainty.model == "voordendag2023",

@@ -27,7 +27,7 @@ def series_for(site: Site) -> Series:
         folder=site.station.data,
         station_id=site.station.id,
         grid=site.grid_cells,
-        crs=site.map.crs,
+        crs=site.grid_crs,
         vertical_datum=site.map.vertical_datum,
         name=site.station.name,
         institution=site.station.institution,
@@ -37,13 +37,14 @@ def series_for(site: Site) -> Series:
         ),
         scanner=site.instrument,
         cf_uncertainty=site.products.cf_uncertainty,
+        plane_crs=site.map.crs if site.grid.plane else None,
     )
 
 
 def polygon_cells(file: Path, site: Site) -> Bools:
     """Return the cells (ny, nx) inside any of the polygons of a file."""
     inside = np.zeros(site.grid_cells.shape, bool)
-    for polygon in read_polygons(file, site.map.crs).values():
+    for polygon in read_polygons(file, site.grid_crs).values():
         inside |= cells_inside(polygon, site.grid_cells)
     return inside
 
@@ -61,7 +62,7 @@ def file_version(file: Path) -> str:
 
 def load_area_polygons(site: Site) -> dict[str, shapely.Geometry]:
     """Return the outlines of the areas of a site by name, in map coordinates."""
-    return {} if site.areas is None else read_polygons(site.areas.file, site.map.crs)
+    return {} if site.areas is None else read_polygons(site.areas.file, site.grid_crs)
 
 
 def load_areas(site: Site) -> dict[str, Bools]:
@@ -91,7 +92,7 @@ def _load_product(site: Site, section: ProductSection, areas: dict[str, Bools]) 
         line = sample_line(section.line, grid)
         return Product(section, {section.name: line.cells}, line)
     places = _areas_of(section, areas) if section.needs_areas else {section.name: _cells_at(section, grid)}
-    rasters = {key: read_geotiff(path, grid, site.map.crs) for key, path in section.rasters.items()}
+    rasters = {key: read_geotiff(path, grid, site.grid_crs) for key, path in section.rasters.items()}
     for key in {"low", "high"} & rasters.keys():
         places = {name: cells & np.isfinite(rasters[key]) for name, cells in places.items()}
     if empty := [name for name, cells in places.items() if not cells.any()]:

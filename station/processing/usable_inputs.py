@@ -54,13 +54,13 @@ def usable_site(site: Site, *, save: bool = False) -> Site:
         return path
 
     def check_polygons(path: Path) -> object:
-        return read_polygons(path, site.map.crs)
+        return read_polygons(path, site.grid_crs)
 
     def to_text(path: Path) -> Serialise | None:
         """A layer consists of several files, or is known by its suffix: its copy is a GeoJSON."""
         if path.suffix.lower() not in LAYER_SUFFIXES:
             return None
-        return lambda polygons: to_geojson(polygons, site.map.crs).encode()
+        return lambda polygons: to_geojson(polygons, site.grid_crs).encode()
 
     changes: dict[str, object] = {}
     if site.areas:

@@ -142,7 +142,7 @@ def area_cells(site: Site, polygons: Path | None) -> dict[str, Bools]:
             "no areas: give a GeoJSON file of polygons, or name one as [areas] file in the site file"
         )
     grid = series_in(site.station.data).grid
-    return {name: cells_inside(polygon, grid) for name, polygon in read_polygons(file, site.map.crs).items()}
+    return {name: cells_inside(polygon, grid) for name, polygon in read_polygons(file, site.grid_crs).items()}
 
 
 def _from_file(stored: list[AreaSeries], span: Span, table: EpochTable) -> Iterator[AreaRecord]:

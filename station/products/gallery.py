@@ -239,7 +239,7 @@ def cached_base_map(series: Series, folder: Path, version: str, pixels: int) -> 
                     file["hillshade"] == 0, np.float32(np.nan), (file["hillshade"] - 1.0) / 254.0
                 )
                 ny, nx = shade.shape
-                part = Grid(west_m, north_m, cell_m, nx, ny)
+                part = Grid(west_m, north_m, cell_m, nx, ny, grid.plane)
                 rows, columns = slice(row_start, row_stop), slice(column_start, column_stop)
                 return BaseMap(version, factor, rows, columns, shade.astype(np.float32), part)
     except (OSError, ValueError, KeyError, EOFError, RuntimeError, zipfile.BadZipFile, zlib.error):

@@ -202,7 +202,9 @@ def _compose(
     _draw_header(draw, caption, subtitle, width_px, margin, unit)
     _draw_colour_bar(draw, scale, (margin, box[3] + round(16 * unit)), round(inner * 0.56), unit)
     _legend(draw, legend, (margin + round(inner * 0.64), box[3] + round(22 * unit)), unit)
-    _draw_north_and_scale(picture, box, overview.base.grid.cell_m * nx / size[0], unit)
+    grid = overview.base.grid
+    upward = "N" if grid.plane.is_map else "up"
+    _draw_north_and_scale(picture, box, grid.cell_m * nx / size[0], unit, upward)
     return picture
 
 
@@ -271,9 +273,9 @@ def _legend(
 
 
 def _draw_north_and_scale(
-    picture: Image.Image, box: tuple[int, int, int, int], pixel_m: float, unit: float
+    picture: Image.Image, box: tuple[int, int, int, int], pixel_m: float, unit: float, upward: str
 ) -> None:
-    """Draw scale and north arrow on a plate in the lower left corner of the map."""
+    """Draw scale and arrow, to the north or what is `upward`, on a plate in the lower left of the map."""
     x_min, _, x_max, bottom = box
     length_m = _round_down(pixel_m * (x_max - x_min) / 5)
     length, small, gap = round(length_m / pixel_m), font(19 * unit), round(12 * unit)
@@ -300,7 +302,7 @@ def _draw_north_and_scale(
         ],
         fill=INK,
     )
-    draw.text((middle, y + round(5 * unit)), "N", INK, small, anchor="ms")
+    draw.text((middle, y + round(5 * unit)), upward, INK, small, anchor="ms")
 
 
 @lru_cache(maxsize=8)

@@ -80,6 +80,7 @@ def base_map(series: Series, version: str, pixels: int) -> BaseMap:
         grid.cell_m * factor,
         elevation_m.shape[1],
         elevation_m.shape[0],
+        grid.plane,
     )
     return BaseMap(version, factor, rows, columns, _hillshade(elevation_m, part.cell_m), part)
 

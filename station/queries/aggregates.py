@@ -295,7 +295,7 @@ class Aggregates(EpochReader):
         grid, (row, column) = self.grid, np.nonzero(common_cells)
         holdout = ground_classes.is_holdout(grid.x_m[column], grid.y_m[row])
         stable_ground = _has_quality(epoch_cells.epoch, common_cells, Quality.STABLE_GROUND)
-        smooth = np.hypot(*jacobian.gradient) < ground_classes.MAX_MOVING_SLOPE
+        smooth = jacobian.tan_slope < ground_classes.MAX_MOVING_SLOPE
         ground_class = ground_classes.classify(stable_ground, holdout, smooth, np.zeros_like(stable_ground))
         random_m2 = independent_m2 + epoch_cells.reference.random_variance_m2[common_cells]
         return leverage(independent_m2, random_m2, ground_class, (moving, stable))

@@ -17,7 +17,7 @@ from station.archive.netcdf_layout import Series
 from station.archive.small_variables import read_number
 from station.quantities import Bools, Grid, Ints
 from station.queries.aggregates import Aggregates
-from station.queries.epoch_cells import EpochCells
+from station.queries.epoch_cells import EpochCells, read_scanner
 from station.queries.stable_ground import sample_epochs
 from station.science.analysis.calibration import SparseJacobian, group_means, renormalise
 from station.science.geometry.observation import Observation
@@ -41,7 +41,9 @@ def box_statistics(series: Series, max_epochs: int, progress: Callable[[], None]
         return []
     aggregates = Aggregates(series)
     known = np.isfinite(aggregates.reference().elevation_m)
-    cells, box_index, weights = _choose_boxes(series.grid, known, _scanner_position(epochs[-1])[:2])
+    with h5py.File(epochs[-1].path, "r") as file:
+        scanner_m = read_scanner(file, epochs[-1].index, series.grid)[:3]
+    cells, box_index, weights = _choose_boxes(series.grid, known, scanner_m)
     if not cells.any():
         return []
     table: list[dict[str, Any]] = []
@@ -93,16 +95,8 @@ def _epoch_statistics(
     ]  # fmt: skip
 
 
-def _scanner_position(epoch: EpochRef) -> tuple[float, float, float]:
-    with h5py.File(epoch.path, "r") as file:
-        east_m, north_m, height_m = (
-            read_number(file, f"scanner_{axis}", epoch.index) for axis in ("east", "north", "height")
-        )
-    return east_m, north_m, height_m
-
-
 def _choose_boxes(
-    grid: Grid, known: Bools, scanner_m: tuple[float, float]
+    grid: Grid, known: Bools, scanner_m: tuple[float, ...]
 ) -> tuple[Bools, Ints, sparse.csr_array]:
     """Return the cells of all boxes (ny, nx), the box of each cell (n,), and mean weights (boxes, n)."""
     no_boxes = np.zeros(grid.shape, bool), np.empty(0, np.int64), group_means(np.zeros(1, np.int64))
@@ -119,7 +113,13 @@ def _choose_boxes(
     if not len(block_row):
         return no_boxes
     centre_m = (np.stack([block_column, block_row]) + 0.5) * size * grid.cell_m
-    range_m = np.hypot(grid.west_m + centre_m[0] - scanner_m[0], grid.north_m - centre_m[1] - scanner_m[1])
+    range_m = grid.plane.horizontal_m(
+        (
+            grid.west_m + centre_m[0] - scanner_m[0],
+            grid.north_m - centre_m[1] - scanner_m[1],
+            np.full(1, -scanner_m[2]),
+        )
+    )
     order = np.argsort(range_m)
     chosen = order[np.unique(np.linspace(0, len(order) - 1, min(MAX_BOXES, len(order))).astype(np.int64))]
     box_of_cell = np.full(grid.shape, -1)

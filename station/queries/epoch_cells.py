@@ -16,7 +16,7 @@ from station.archive.reference_files import open_reference
 from station.archive.series.index import list_epochs, nearest_epoch
 from station.archive.small_variables import read_epochs, read_number, read_text, read_variable
 from station.errors import StationError, StoreError
-from station.quantities import Bools, ChangeErrors, Floats, Reference, SharedParameters
+from station.quantities import Bools, ChangeErrors, Floats, Grid, Reference, SharedParameters
 from station.queries.grid_arrays import to_index_or_time
 from station.science.uncertainty.parameters import ParameterLayout, parameter_layout
 from station.science.uncertainty.propagation import align_to
@@ -45,7 +45,7 @@ class EpochCells:
     change_m: Floats
     random_m: Floats
     shared: SharedParameters | None
-    scanner: tuple[float, ...]  # position [m], east and north component of the rotation axis
+    scanner: tuple[float, ...]  # position on the grid [m], east and north component of the rotation axis
     reference: Reference
     adjusted: bool  # to the reference; `shared` is then relative to it
     has_positions: bool  # several, against each other in error
@@ -101,7 +101,7 @@ class EpochReader:
                 np.empty(0) if cells is None else read_cells_of(file, name, epoch.index, cells)
                 for name in (CHANGE, RANDOM)
             )
-            scanner = tuple(read_number(file, name, epoch.index) for name in SCANNER_VARIABLES)
+            scanner = read_scanner(file, epoch.index, self.grid)
             adjusted = read_text(file, "adjustment", epoch.index) == "joint"
             has_positions = POSITIONS in file and read_number(file, POSITIONS, epoch.index) > 1
             shared = self._read_shared(file, epoch, scanner)
@@ -138,6 +138,15 @@ class EpochReader:
         axis_up = float(np.sqrt(max(1 - axis_east**2 - axis_north**2, 0.0)))
         position_m = east_m, north_m, height_m
         return parameter_layout(self.grid, position_m, (axis_east, axis_north, axis_up)), position_m
+
+
+def read_scanner(file: h5py.File, index: int, grid: Grid) -> tuple[float, ...]:
+    """Return position on the grid [m], and east and north component of the rotation axis, of a scanner.
+
+    NaN what the epoch does not know.
+    """
+    east_m, north_m, height_m, *axis = (read_number(file, name, index) for name in SCANNER_VARIABLES)
+    return *grid.plane.place_from_map((east_m, north_m, height_m)), *axis
 
 
 def read_cells_of(file: h5py.File, name: str, index: int, cells: Bools) -> Floats:

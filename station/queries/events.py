@@ -98,9 +98,7 @@ class EventQueries:
     def grid(self) -> Grid:
         """Grid of the blocks; those at the east and south edges may extend beyond the cells."""
         grid, cells = self._series.grid, self._queries.cells
-        return Grid(
-            grid.west_m, grid.north_m, grid.cell_m * cells, -(-grid.nx // cells), -(-grid.ny // cells)
-        )
+        return replace(grid, cell_m=grid.cell_m * cells, nx=-(-grid.nx // cells), ny=-(-grid.ny // cells))
 
     def update(self, progress: Callable[[], None]) -> set[str]:
         """Bring the table up to date; return the epochs whose sums the next scan will need.

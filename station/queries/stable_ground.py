@@ -16,10 +16,10 @@ from station.archive.epochs import EpochRef, read_provenance
 from station.archive.netcdf_layout import Series
 from station.archive.read_errors import read_errors
 from station.archive.series.index import list_epochs
-from station.archive.small_variables import read_number, read_text
+from station.archive.small_variables import read_text
 from station.quantities import Bools, Floats, Floats32, Ints, Quality, Reference, SharedParameters
 from station.queries.aggregates import Aggregates
-from station.queries.epoch_cells import read_window
+from station.queries.epoch_cells import read_scanner, read_window
 from station.science.adjustment import ground_classes
 from station.science.analysis import calibration
 from station.science.geometry.robust_statistics import nmad
@@ -90,12 +90,12 @@ def z_by_range(series: Series, epoch: EpochRef) -> list[tuple[float, float | Non
     with read_errors(epoch.path), h5py.File(epoch.path, "r") as file:
         if "scanner_east" not in file:
             return []
-        east_m, north_m = (read_number(file, name, epoch.index) for name in ("scanner_east", "scanner_north"))
+        position_m = read_scanner(file, epoch.index, grid)[:3]
         quality = file["quality"][epoch.index]
         row, column = np.nonzero((quality & Quality.STABLE_GROUND) > 0)
         holdout = ground_classes.is_holdout(grid.x_m[column], grid.y_m[row])
         row, column = row[holdout], column[holdout]
-        if not len(row) or not np.isfinite(east_m + north_m):
+        if not len(row) or not np.isfinite(position_m).all():
             return []
         window = slice(row.min(), row.max() + 1), slice(column.min(), column.max() + 1)
         change_m, sigma_m = (
@@ -103,7 +103,7 @@ def z_by_range(series: Series, epoch: EpochRef) -> list[tuple[float, float | Non
             for name in (CHANGE, TOTAL)
         )
     z = change_m / sigma_m
-    range_m = np.hypot(grid.x_m[column] - east_m, grid.y_m[row] - north_m)
+    range_m = grid.horizontal_range_m(row, column, position_m)
     band, table = np.searchsorted(RANGE_EDGES_M, range_m, side="right"), []
     for number, (low_m, high_m) in enumerate(pairwise((0.0, *RANGE_EDGES_M, None))):
         band_z = z[(band == number) & np.isfinite(z)]
@@ -173,8 +173,7 @@ class _HoldoutGround:
         )
         row, column = np.nonzero(self.cells)
         x_m, y_m = grid.x_m[column], grid.y_m[row]
-        east_m, north_m = holdout[-1].scanner[:2]
-        range_m = np.hypot(x_m - east_m, y_m - north_m)
+        range_m = grid.horizontal_range_m(row, column, holdout[-1].scanner)
         self.bands = calibration.range_bands(range_m)
         band = np.searchsorted([upper_m for _, upper_m in self.bands], range_m, side="right")
         self.sums: dict[str, tuple[sparse.csr_array, Ints]] = {}

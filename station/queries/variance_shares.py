@@ -67,8 +67,7 @@ class VarianceShares:
     def range_m(self) -> Floats:
         """Horizontal distance of each cell (n,) from the scanner [m]."""
         row, column = np.nonzero(self.cells)
-        grid = self.series.grid
-        return np.hypot(grid.x_m[column] - self.position_m[0], grid.y_m[row] - self.position_m[1])
+        return np.asarray(self.series.grid.horizontal_range_m(row, column, self.position_m))
 
     def by_range(self) -> list[dict[str, Any]]:
         """Return the mean share of each input over single cells, by range band."""

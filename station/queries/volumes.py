@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import h5py
 import numpy as np
 import xarray as xr
@@ -9,12 +11,12 @@ import xarray as xr
 from station.archive.derived.computed_rasters import CHANGE, RANDOM, TOTAL
 from station.archive.epochs import EpochRef
 from station.errors import StoreError
+from station.grid_plane import MAP_PLANE
 from station.quantities import Bools, Floats
 from station.queries.aggregates import Aggregates, common_error_covariance
 from station.queries.epoch_cells import EpochCells, observed_in_all, read_cells_of
 from station.science.analysis.voids import area_weights
 from station.science.analysis.volume import common_contributions, shared_contributions
-from station.science.uncertainty.parameters import parameter_layout
 from station.science.uncertainty.point_covariance import shared_covariance, shot_covariance
 from station.science.uncertainty.propagation import difference_to_reference
 
@@ -148,9 +150,8 @@ class Volumes(Aggregates):
             raise StoreError(
                 f"{epoch.path}: no scanner pose is stored, because the scan is in map coordinates"
             )
-        position_m, (east, north) = epoch_cells.scanner[:3], epoch_cells.scanner[3:]
-        axis = east, north, float(np.sqrt(max(1 - east**2 - north**2, 0.0)))
-        offset_m = points_m - np.array(position_m)
-        params = parameter_layout(self.grid, (position_m[0], position_m[1], position_m[2]), axis)
-        shot_m2 = shot_covariance(offset_m, np.array(axis), scanner)
-        return shot_m2 + shared_covariance(params, offset_m, epoch_cells.shared)
+        params, position_m = self.parameter_layout_of(epoch_cells.scanner)
+        offset_m = points_m - np.array(self.grid.plane.place_to_map(position_m))
+        shot_m2 = shot_covariance(offset_m, np.array(params.axis), scanner)
+        on_map = replace(params, plane=MAP_PLANE)
+        return shot_m2 + shared_covariance(on_map, offset_m, epoch_cells.shared)

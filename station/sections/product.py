@@ -33,6 +33,8 @@ KEYS: dict[str, tuple[set[str], set[str]]] = {  # required and optional, of each
     "contour": ({"line", "height_m"}, {"observations"}),
 }
 
+UPWARD_KINDS = ("snow_depth", "surface_mass_balance", "melt")  # counted from below
+
 
 def product_key(name: str) -> str:
     """Return the name of a product's file: in lower case, with _ for blanks."""

@@ -76,12 +76,20 @@ class MapSection(Section):
 
 
 class Bounds(Section):
-    """Outer edges of the grid in the map CRS."""
+    """Outer edges of the grid in the map CRS, or from the origin of its plane: left, down, right and up."""
 
     west: Place
     south: Place
     east: Place
     north: Place
+
+
+class PlaneSection(Section):
+    """A plane through a point of the map, on which the grid lies: that of a rock face."""
+
+    origin_m: tuple[Place, Place, Place]
+    facing_deg: Annotated[float, Field(ge=0, le=360)]
+    dip_deg: Annotated[float, Field(ge=0, le=180)] = 90.0
 
 
 class GridSection(Section):
@@ -90,6 +98,7 @@ class GridSection(Section):
     bounds_m: Bounds
     cell_m: Annotated[float, Field(ge=0.001)] = 1.0
     min_points: Annotated[int, Field(ge=1)] = 1
+    plane: PlaneSection | None = None
 
     @model_validator(mode="after")
     def _whole_cells(self) -> GridSection:

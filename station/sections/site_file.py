@@ -21,7 +21,7 @@ from station.sections.inputs import (
     SopSection,
     WeatherSection,
 )
-from station.sections.product import ProductSection, product_key
+from station.sections.product import UPWARD_KINDS, ProductSection, product_key
 from station.sections.publish import PublishSection
 from station.sections.results import (
     AdjustmentSection,
@@ -98,7 +98,24 @@ class SiteFile(Section):
         if self.alarms and self.alarms.change and not self.areas:
             raise ValueError("alarms.change needs areas: give their file in [areas]")
         self._require_products()
+        self._require_what_a_plane_has()
         return self
+
+    def _require_what_a_plane_has(self) -> None:
+        """Raise ValueError if something that is counted upward is asked for on a plane."""
+        if self.grid.plane is None:
+            return
+        if self.uncertainty.model != "rigorous" or self.uncertainty.store_terms:
+            raise ValueError(
+                "grid.plane: the published budget and its terms are those of heights: leave out"
+                " uncertainty.model and uncertainty.store_terms"
+            )
+        for product in self.product:
+            if product.kind in UPWARD_KINDS:
+                raise ValueError(
+                    f"grid.plane: product {product.name!r} of kind {product.kind} is counted upward, but"
+                    " change on a plane along its normal: use volume_budget, point or profile"
+                )
 
     def _require_products(self) -> None:
         """Raise ValueError if two products have one file, or one has no areas."""

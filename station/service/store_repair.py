@@ -143,7 +143,7 @@ def require_same_map(site: Site) -> None:
     series = stored_series(series_for(site))
     if series is None:
         return
-    crs = site.map.crs
+    crs = site.grid_crs
     if (crs is None) != (series.crs is None) or (
         crs and series.crs and not is_same_map(horizontal_crs(series.crs), horizontal_crs(crs))
     ):
@@ -163,6 +163,11 @@ def require_same_map(site: Site) -> None:
             (stored.cell_m * stored.nx, configured.cell_m * configured.nx),
         )
     )
+    if stored.plane != configured.plane:
+        raise ConfigError(
+            f"grid.plane differs from that of {site.station.data}: restore it, or give station.data a new"
+            " folder"
+        )
     if stored.shape != configured.shape or deviation_m > 1e-3 * configured.cell_m:
         raise ConfigError(
             f"[grid] differs from that of {site.station.data}: {stored.nx} x {stored.ny} cells of"

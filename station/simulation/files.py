@@ -102,8 +102,8 @@ def write_matrix(path: Path, matrix: Floats, meaning: str) -> None:
     np.savetxt(path, matrix, fmt="%.16f", header=meaning)
 
 
-def write_polygons(path: Path, rings_m: dict[str, Floats], map_crs: str) -> None:
-    """Write named polygons as GeoJSON with map eastings and northings, to the millimetre.
+def write_polygons(path: Path, rings_m: dict[str, Floats], map_crs: str | None) -> None:
+    """Write named polygons as GeoJSON with coordinates of the grid, to the millimetre.
 
     The member `crs` is that of GeoJSON 2008, which GIS programs still read.
     """
@@ -115,9 +115,12 @@ def write_polygons(path: Path, rings_m: dict[str, Floats], map_crs: str) -> None
         }
         for name, ring_m in rings_m.items()
     ]
-    crs = {"type": "name", "properties": {"name": f"urn:ogc:def:crs:EPSG::{map_crs.removeprefix('EPSG:')}"}}
+    declared = ""
+    if map_crs is not None:
+        name = f"urn:ogc:def:crs:EPSG::{map_crs.removeprefix('EPSG:')}"
+        declared = f'"crs": {json.dumps({"type": "name", "properties": {"name": name}})}, '
     lines = ",\n".join(json.dumps(feature) for feature in features)
-    head = f'{{"type": "FeatureCollection", "crs": {json.dumps(crs)}, "features": [\n'
+    head = f'{{"type": "FeatureCollection", {declared}"features": [\n'
     path.write_text(f"{head}{lines}\n]}}\n", encoding="ascii")
 
 

@@ -119,8 +119,41 @@ def beach(hours: int = 24, seed: int = 1) -> Scenario:
     )
 
 
+def rockfall(hours: int = 24, seed: int = 1) -> Scenario:
+    """Return a VZ-400i before a vertical rock face, every hour; blocks fall halfway after the reference."""
+    reference_scans = min(8, max(1, hours // 2))
+    return Scenario(
+        seed=seed,
+        start=datetime(2026, 4, 10, tzinfo=UTC),
+        hours=hours,
+        kind="rockfall",
+        mark=Mark(46.3320, 9.6420, 1150.0, 32632, 882.0, (12.0, 882.0, 50.0)),
+        terrain_step_m=0.5,
+        roughness_m=0.15,
+        roughness_length_m=4.0,
+        cell_m=0.5,
+        extent_m=(-110.0, -60.0, 110.0, 70.0),
+        lines=760,
+        shots_per_line=620,
+        scan_s=300.0,
+        azimuth_deg=(42.0, 90.0),
+        elevation_deg=(-9.0, 25.0),
+        range_max_m=800.0,
+        reference_scans=reference_scans,
+        mount_heading_deg=0.0,
+        mount_position_m=(0.0, 0.0, 1.6),
+        range_noise_m=0.003,
+        beam_divergence_mrad=0.35,
+        brightness="reflectance",
+        wavelength_nm=1550,
+        rockfall_m=1.0,
+        rockfall_hour=(reference_scans + hours) / 2,
+    )
+
+
 KINDS: dict[str, Callable[[int, int], Scenario]] = {
     "mammoth": mammoth,
     "low-cost-snow": low_cost_snow,
     "beach": beach,
+    "rockfall": rockfall,
 }

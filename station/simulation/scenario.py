@@ -32,7 +32,7 @@ ERRORS = (
     "range_bias_m", "range_noise_m", "beam_divergence_mrad", "echo_loss", "airborne_share", "airborne_clouds",
     "log_noise_deg", "log_bias_deg", "log_cyclic_deg", "log_cyclic_change", "log_clock_s", "log_fault",
     "melt_m_per_h", "snowfall_m", "avalanche_m", "settling_m_per_h", "winter_m", "summer_melt_m",
-    "heave_m", "creep_m", "bar_growth_m", "deposits",
+    "heave_m", "creep_m", "bar_growth_m", "rockfall_m", "deposits",
 )  # fmt: skip
 
 
@@ -83,7 +83,9 @@ class Scenario:
     interval_s: float = 3600.0  # from scan to scan
 
     # the place
-    kind: Literal["valley", "mammoth", "low-cost-snow", "beach"] = "valley"  # its landscape and site file
+    kind: Literal["valley", "mammoth", "low-cost-snow", "beach", "rockfall"] = (
+        "valley"  # landscape, site file
+    )
     mark: Mark = Mark()
     size: float = 1.0  # of the valley relative to the real one, heights included
     terrain_step_m: float = 2.0
@@ -190,6 +192,8 @@ class Scenario:
     tide_m: float = 0.0  # amplitude of the tide at a beach
     bar_growth_m: float = 0.0  # height of the bar that grows on a beach over the whole series
     deposits: tuple[Deposit, ...] = ()  # anywhere, also on stable ground
+    rockfall_m: float = 0.0  # depth of the largest scar in a rock face
+    rockfall_hour: float = 0.0
 
     # known stable ground: rock all round, or only a far ridge and a hut that snow never covers
     stable_ground: Literal["good", "poor"] = "good"
@@ -215,6 +219,11 @@ class Scenario:
     def without_errors(self) -> Scenario:
         """Return the same station with every error and every change switched off."""
         return replace(self, **{name: type(getattr(self, name))() for name in ERRORS})
+
+    @property
+    def map_crs(self) -> str | None:
+        """The map of the station; None if it is local, east-north-up at the mark."""
+        return None if self.kind == "rockfall" else self.mark.crs
 
     @property
     def scans(self) -> int:

@@ -20,6 +20,7 @@ from station.simulation.world.air import weather
 from station.simulation.world.beach import build_beach, sea_level_m, wet_ground
 from station.simulation.world.change import BREATHING, SurfaceChange, ground_at, snow_cover, surface_changes
 from station.simulation.world.relief import with_rock_relief
+from station.simulation.world.rock_face import build_rock_face
 from station.simulation.world.snow_slope import build_snow_slope
 from station.simulation.world.stable import Rectangle, areas, inside_rectangles, stable_ground
 from station.simulation.world.terrain import NodeField, Valley, build_valley
@@ -28,6 +29,14 @@ __all__ = ["Scenario", "Station", "demo", "full_resolution", "named", "simulate"
 
 WEATHER_MARGIN_S = 3600.0  # the weather log covers this margin on both sides of the scans
 STORED_STEP_M = 1e-4  # resolution of the stored surfaces
+LANDSCAPES = {  # of stations of other kinds than the valley
+    "mammoth": build_snow_slope,
+    "low-cost-snow": build_snow_slope,
+    "beach": build_beach,
+    "rockfall": build_rock_face,
+}
+ELEVATIONS = "Elevations are cell means above the WGS 84 ellipsoid."
+ON_FACE = "Elevations are cell means of the distance out of the face, x and y along it and up it."
 
 
 class Station:
@@ -42,7 +51,7 @@ class Station:
         """The valley, or another landscape, before any surface change."""
         scenario = self.scenario
         if scenario.kind != "valley":
-            return build_beach(scenario) if scenario.kind == "beach" else build_snow_slope(scenario)
+            return LANDSCAPES[scenario.kind](scenario)
         valley = build_valley(
             scenario.seed,
             scenario.size,
@@ -109,8 +118,8 @@ class Station:
             scan_id=("time", [files.stem(scenario, scan) for scan in scans]),
         ).assign_attrs(
             title="The truth of a simulated station",
-            crs=scenario.mark.crs,
-            comment=f"Elevations are cell means above the WGS 84 ellipsoid. {CONVENTIONS}",
+            crs=scenario.map_crs or "east-north-up at the mark",
+            comment=f"{ELEVATIONS if scenario.map_crs else ON_FACE} {CONVENTIONS}",
             seed=scenario.seed,
         )  # fmt: skip
 
@@ -164,9 +173,9 @@ def simulate(folder: Path, scenario: Scenario) -> None:
         files.write_polygons(
             folder / "stable.geojson",
             {rectangle.name: rectangle.ring_m(grid) for rectangle in station.stable},
-            scenario.mark.crs,
+            scenario.map_crs,
         )
-        files.write_polygons(folder / "areas.geojson", areas(scenario, station.valley), scenario.mark.crs)
+        files.write_polygons(folder / "areas.geojson", areas(scenario, station.valley), scenario.map_crs)
         if scenario.air:
             files.write_weather(folder / "weather.dat", weather(scenario, _minutes(scenario)))
         for scan in range(scenario.scans):

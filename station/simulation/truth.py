@@ -15,6 +15,7 @@ from scipy.interpolate import RectBivariateSpline
 
 from station.quantities import Bools, Floats, Grid
 from station.simulation.scenario import Mark, Scenario
+from station.simulation.world import rock_face
 from station.simulation.world.change import SurfaceChange
 from station.simulation.world.terrain import NodeField, Valley
 
@@ -48,11 +49,17 @@ def geocentric_from_enu(mark: Mark) -> Floats:
 
 
 def grid_of(scenario: Scenario) -> Grid:
-    """Return the map raster that covers the scenario's extent, its edges at whole multiples of a cell."""
+    """Return the map raster that covers the scenario's extent, its edges at whole multiples of a cell.
+
+    On a rock face it is that of the face.
+    """
     west, south, east, north = (scenario.size * edge for edge in scenario.extent_m)
+    cell_m = scenario.cell_m
+    if scenario.kind == "rockfall":
+        nx, ny = round((east - west) / cell_m), round((north - south) / cell_m)
+        return Grid(west, north, cell_m, nx, ny, rock_face.plane())
     to_map = map_from_enu(scenario.mark)
     eastings, northings, _ = to_map.transform([0.0, 0.0], [0.0, 0.0], [0.0, 1.0])
-    cell_m = scenario.cell_m
     west_m = np.floor((eastings[0] + west) / cell_m) * cell_m
     north_m = np.ceil((northings[0] + north) / cell_m) * cell_m
     return Grid(
@@ -146,7 +153,7 @@ class TrueSurface:
 def true_surface(valley: Valley, changes: tuple[SurfaceChange, ...], grid: Grid, mark: Mark) -> TrueSurface:
     """Average the ground and its change patterns over the cells of the map, from many points in each."""
     fine = max(2, round(FINENESS * grid.cell_m / valley.ground.step_m))
-    verticals = fit_verticals(grid, mark)
+    verticals = fit_verticals(grid, mark) if grid.plane.is_map else None
     share = (np.arange(fine) + 0.5) / fine - 0.5
     easting_m = (grid.x_m[:, None] + share * grid.cell_m).ravel()
     rows = max(1, STRIP_POINTS // (len(easting_m) * fine))
@@ -164,11 +171,15 @@ def true_surface(valley: Valley, changes: tuple[SurfaceChange, ...], grid: Grid,
 def _fields(
     valley: Valley,
     changes: tuple[SurfaceChange, ...],
-    verticals: Verticals,
+    verticals: Verticals | None,
     northing_m: Floats,
     easting_m: Floats,
 ) -> Floats:
-    """Return height, ice and each pattern on the mesh (2 + changes, ny, nx)."""
+    """Return height, ice and each pattern on the mesh (2 + changes, ny, nx); of a rock face, out of it."""
+    if verticals is None:
+        mesh = np.meshgrid(easting_m, northing_m)
+        fields = (valley.ground, valley.ice, *(change.pattern for change in changes))
+        return np.stack([field.at(*mesh) for field in fields])
     base, up = verticals.at(northing_m, easting_m)
     height_m = surface_heights(valley.ground, verticals, northing_m, easting_m)
     east_m, north_m = base[0] + height_m * up[0], base[1] + height_m * up[1]

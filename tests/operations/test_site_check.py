@@ -14,6 +14,7 @@ from station.config import read_site
 from station.inbox import listing
 from station.operations import site_check
 from station.operations import site_plausibility as plausibility
+from station.processing.scanner_pose import map_position
 from station.sections.results import FlagsSection, RetentionSection
 from station.simulation.station import simulate, small
 
@@ -51,6 +52,28 @@ def test_polygon_off_the_grid_is_a_fault(folder):
     findings = polygon_findings(folder)
     assert findings["area glacier"]["level"] == "fault"
     assert findings["area rock"]["level"] == "ok"
+
+
+@pytest.mark.parametrize(("facing_deg", "level", "message"), [
+    (180.0, "ok", "200.3 m from the scanner; change is positive towards it"),
+    (0.0, "fault", "the scanner is 200.3 m behind it: facing_deg is the azimuth from the face"),
+])  # fmt: skip
+def test_a_plane_faces_the_scanner(folder, facing_deg, level, message):
+    """A face 200 m to the north of the mark, from which the scanner stands 0.3 m to the south."""
+    site = read_site(folder / "site.toml")
+    east_m, north_m, height_m = map_position(site)
+    text = (folder / "site.toml").read_text()
+    origin = f"[{east_m}, {north_m + 200.0}, {height_m}]"
+    plane = f"[grid]\nplane = {{ origin_m = {origin}, facing_deg = {facing_deg} }}\n"
+    bounds = "bounds_m = { west = -50.0, south = -50.0, east = 50.0, north = 50.0 }"
+    (folder / "site.toml").write_text(re.sub(r"bounds_m = .*", bounds, text.replace("[grid]\n", plane)))
+    (finding,) = [
+        finding
+        for finding in site_check._sop_poses(read_site(folder / "site.toml"))
+        if finding["what"] == "grid"
+    ]
+    assert finding["level"] == level
+    assert message in finding["message"]
 
 
 def test_unreadable_polygon_file_is_a_fault(folder):

@@ -10,7 +10,8 @@ from typer.testing import CliRunner
 from station.cli import app
 from station.config import KINDS as SITES
 from station.config import read_site, write_site
-from station.simulation.kinds import KINDS, beach, low_cost_snow
+from station.simulation.instrument.motion import sop
+from station.simulation.kinds import KINDS, beach, low_cost_snow, rockfall
 from station.simulation.station import Station, simulate
 from station.simulation.world.beach import MEAN_SEA_M, RUN_UP_M
 
@@ -89,6 +90,30 @@ def test_snow_lies_on_the_slope_but_not_on_the_rock(snowy):
     assert np.mean(snow_m[(steepness < np.tan(np.radians(39))) & (station.valley.ice.node == 1)]) > 0.2
 
 
+def test_beams_meet_the_rock_face():
+    """A face to 205°: a point on it, by hand; and without errors, recorded points are where beams meet it."""
+    scenario = replace(rockfall(hours=2), lines=40, shots_per_line=40, terrain_step_m=1.0).without_errors()
+    station = Station(scenario)
+    scan, ground = station.scan(0), station.valley.ground
+    along = np.array([np.cos(np.radians(25)), -np.sin(np.radians(25)), 0.0])
+    out = np.array([-np.sin(np.radians(25)), -np.cos(np.radians(25)), 0.0])
+    offset_m = scan.true_m - np.array([120.0, 270.0, 40.0])
+    np.testing.assert_allclose(offset_m @ out, ground.at(offset_m @ along, offset_m[:, 2]), atol=2e-5)
+    recorded_m = np.stack((scan.x_m, scan.y_m, scan.z_m))
+    placed_m = (sop(scenario) @ np.vstack([recorded_m, np.ones(len(scan.x_m))]))[:3]
+    np.testing.assert_allclose(placed_m.T, scan.true_m, atol=1e-6)
+    assert len(scan.x_m) > 1000
+    assert np.linalg.norm(recorded_m, axis=0).min() > 280
+
+
+def test_a_block_leaves_a_scar_and_debris():
+    station = Station(replace(rockfall(hours=4), terrain_step_m=1.0))
+    before, after = (station.ground(scan).node for scan in (0, 3))
+    assert (after - before).min() == pytest.approx(-1.0, abs=0.05)
+    assert (after - before).max() == pytest.approx(0.25, abs=0.02)
+    assert np.mean(after != before) < 0.03
+
+
 @pytest.mark.parametrize("kind", KINDS)
 def test_site_file_of_a_simulated_station_is_that_of_its_kind(kind, tmp_path):
     scenario = replace(KINDS[kind](1, 1), lines=2, shots_per_line=2, terrain_step_m=4.0, cell_m=5.0)
@@ -122,6 +147,6 @@ def test_scenarios_are_of_the_glacier_only(tmp_path):
     assert "scenarios are those of hef" in result.output
     result = CliRunner().invoke(app, ["simulate", str(tmp_path / "s"), "--like", "volcano"])
     assert result.exit_code == 2
-    assert "choose from hef, mammoth, low-cost-snow, beach" in result.output
+    assert "choose from hef, mammoth, low-cost-snow, beach, rockfall" in result.output
     assert not (tmp_path / "s").exists()
     assert set(KINDS) < set(SITES)

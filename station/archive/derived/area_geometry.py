@@ -11,7 +11,7 @@ import numpy as np
 import shapely
 from shapely.geometry.polygon import orient
 
-from station.archive.netcdf_layout import Series, create_crs
+from station.archive.netcdf_layout import Series, axis_attributes, create_crs
 
 CONTAINER = "area_outline"
 POLYGONS_ATTRIBUTE = "area_outlines_sha256"
@@ -57,16 +57,9 @@ def write_polygons(file: netCDF4.Dataset, series: Series, polygons: Mapping[str,
         variable = file.createVariable(name, "i4", (dim,))
         variable.long_name = long_name
         variable[:] = values
-    for axis, column, direction in (("x", 0, "easting"), ("y", 1, "northing")):
+    for column, axis in enumerate("xy"):
         node = file.createVariable(f"area_node_{axis}", "f8", ("area_node",))
-        node.setncatts(
-            {
-                "standard_name": f"projection_{axis}_coordinate",
-                "long_name": f"{direction} of the outline",
-                "units": "m",
-                "axis": axis.upper(),
-            }
-        )
+        node.setncatts(axis_attributes(axis, series.grid.plane, " of the outline") | {"axis": axis.upper()})
         node[:] = nodes[:, column]
     file.setncattr(POLYGONS_ATTRIBUTE, polygons_hash(polygons))
 

@@ -166,7 +166,7 @@ def daily_file(grid: Grid, cells: int) -> BlockFile:
 
 def _coarse(grid: Grid, cells: int) -> Grid:
     """Return the grid of blocks; those at the east and south edges may extend beyond the grid."""
-    return Grid(grid.west_m, grid.north_m, grid.cell_m * cells, -(-grid.nx // cells), -(-grid.ny // cells))
+    return replace(grid, cell_m=grid.cell_m * cells, nx=-(-grid.nx // cells), ny=-(-grid.ny // cells))
 
 
 def update_days(

@@ -23,6 +23,7 @@ from station.archive.derived.fingerprints import fingerprints_path, is_intact, w
 from station.archive.discovery import time_coverage
 from station.archive.netcdf_layout import (
     Series,
+    axis_attributes,
     create_crs,
     create_time_axis,
     create_variable,
@@ -259,15 +260,9 @@ def _write_geometry(file: netCDF4.Dataset, series: Series, product: ProductFile)
     if series.crs is not None:
         create_crs(file, series)
         file["crs"].delncattr("GeoTransform")  # there is no raster
-    for axis, direction, values in (("x", "easting", product.x_m), ("y", "northing", product.y_m)):
+    for axis, values in (("x", product.x_m), ("y", product.y_m)):
         variable = file.createVariable(f"{product.dim}_{axis}", "f8", (product.dim,))
-        variable.setncatts(
-            {
-                "standard_name": f"projection_{axis}_coordinate",
-                "long_name": direction,
-                "units": "m",
-            }
-        )
+        variable.setncatts(axis_attributes(axis, series.grid.plane))
         variable[:] = values
     if product.distance_m is not None:
         variable = file.createVariable(DISTANCE, "f8", (DISTANCE,))

@@ -15,6 +15,7 @@ import numpy as np
 
 from station.archive.chunk_codec import read_column
 from station.archive.derived.computed_rasters import CHANGE
+from station.archive.discovery import read_plane
 from station.archive.epochs import (
     COMPACTED,
     EpochRef,
@@ -251,6 +252,8 @@ def _read_header(folder: Path, path: Path) -> Series:
         x_m, y_m = (np.asarray(file[axis][:], dtype=np.float64) for axis in "xy")
         x_bounds, y_bounds = (file[f"{axis}_bnds"][0] for axis in "xy")
         west_m, north_m = float(x_bounds.min()), float(y_bounds.max())
-        grid = Grid(west_m, north_m, float(np.ptp(x_bounds)), len(x_m), len(y_m))
+        plane, plane_crs = read_plane(file)
+        grid = Grid(west_m, north_m, float(np.ptp(x_bounds)), len(x_m), len(y_m), plane)
         crs = str(file["crs"].crs_wkt) if "crs" in file.variables else None
-        return Series(folder, str(file.station_id), grid, crs, scanner=read_scanner(file))
+        scanner = read_scanner(file)
+        return Series(folder, str(file.station_id), grid, crs, scanner=scanner, plane_crs=plane_crs)

@@ -119,7 +119,7 @@ def load_viewing_geometry(site: Site, geometry: ScanGeometry, reference: Referen
         series_for(site),
         reference,
         (geometry.position_m, geometry.axis),
-        repr((geometry.grid, geometry.scanner, geometry.published_budget, site.map.crs, polygon_hash)),
+        repr((geometry.grid, geometry.scanner, geometry.published_budget, site.grid_crs, polygon_hash)),
         lambda: reference_viewing_geometry(reference, geometry, stable_cells(site, reference)),
     )
 

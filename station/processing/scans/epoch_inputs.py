@@ -90,12 +90,13 @@ def _inputs_of_positions(site: Site, scan: OpenScan, each: list[ScanInputs]) -> 
         site, scan.start + (scan.end - scan.start) / 2, transform.position_m[2], warnings
     )
     viewpoints = tuple(
-        Viewpoint(inputs.geometry.scanner, inputs.pose.frame.position_m)
+        Viewpoint(inputs.geometry.scanner, site.grid_cells.plane.place_from_map(inputs.pose.frame.position_m))
         for inputs in each
         if inputs.pose.frame is not None
     )
     geometry = replace(scan_geometry(site, transform.position_m, axis), viewpoints=viewpoints)
-    params = parameters.parameter_layout(geometry.grid, transform.position_m, axis)
+    assert geometry.position_m is not None  # noqa: S101 - that of the SOP
+    params = parameters.parameter_layout(geometry.grid, geometry.position_m, axis)
     lines = prior.line_times(params, rotation, None)
     covariance = partial(
         prior.log_only_covariance, params, lines, None, NO_CYCLIC_ERROR, weather_known=weather_known

@@ -138,7 +138,8 @@ def position_inputs(
     geometry = scan_geometry(site, transform.position_m, axis)
     if wait_for_weather and site.weather is not None and not weather_known:
         raise NotReadyError(next(warning for warning in warnings if warning.startswith("weather")))
-    params = parameters.parameter_layout(geometry.grid, transform.position_m, axis)
+    assert geometry.position_m is not None  # noqa: S101 - that of the SOP
+    params = parameters.parameter_layout(geometry.grid, geometry.position_m, axis)
     lines = prior.line_times(params, rotation, track)
     assumed_rad, line_inclination = np.zeros((3, params.line_groups)), None
     if tilt_record is not None:
@@ -184,11 +185,10 @@ def position_inputs(
 
 def inputs_in_map_frame(site: Site, start_s: float) -> ScanInputs:
     """Return the inputs of a scan that is already on the map."""
-    position_m = map_position(site)
-    geometry, adjustment_inputs = scan_geometry(site, position_m), None
+    geometry, adjustment_inputs = scan_geometry(site, map_position(site)), None
     log_only_covariance: CovarianceOf | None = None
-    if position_m is not None:  # registered elsewhere, with unknown accuracy
-        params = parameters.parameter_layout(geometry.grid, position_m)
+    if geometry.position_m is not None:  # registered elsewhere, with unknown accuracy
+        params = parameters.parameter_layout(geometry.grid, geometry.position_m)
         lines = prior.line_times(params, np.eye(3), None)
         adjustment_inputs = AdjustmentInputs(
             params, lines, np.zeros((3, params.line_groups)), None, start_s, weather_known=False

@@ -44,7 +44,8 @@ class SampledCells:
     @property
     def group(self) -> Ints:
         """Number of the cells of about the same azimuth and range to which each belongs."""
-        range_bin = (np.hypot(*self.offset_m[:2]) / GROUP_M).astype(np.int64)
+        range_m = self.jacobian.params.plane.horizontal_m(self.offset_m)
+        range_bin = (range_m / GROUP_M).astype(np.int64)
         return np.asarray(range_bin + self.jacobian.knot_position.astype(np.int64) * MAX_GROUPS)
 
     @cached_property

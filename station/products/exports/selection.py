@@ -58,7 +58,7 @@ class Selection:
         grid, (ny, nx) = self.series.grid, self.shape
         west_m = grid.west_m + self.columns.start * grid.cell_m
         north_m = grid.north_m - self.rows.start * grid.cell_m
-        return replace(self.series, grid=Grid(west_m, north_m, grid.cell_m, nx, ny))
+        return replace(self.series, grid=replace(grid, west_m=west_m, north_m=north_m, nx=nx, ny=ny))
 
     @property
     def refers_to_store(self) -> bool:

@@ -163,7 +163,7 @@ class BlockCodes:
             return np.ones(self.count)
         offset_m = self.surface.observation.offset_m
         block_m = self._queries.cells * self._series.grid.cell_m
-        ratio = sigma_ratio(jacobian, shared, (offset_m[0], offset_m[1]), block_m)
+        ratio = sigma_ratio(jacobian, shared, offset_m, block_m)
         with suppress(StoreError, OSError):
             path.parent.mkdir(parents=True, exist_ok=True)
             replace_file(path, ratio.tobytes())

@@ -18,18 +18,23 @@ AT_ONCE = 1000  # blocks
 
 
 def sigma_ratio(
-    jacobian: HeightJacobian, shared: SharedParameters, offset_m: tuple[Floats, Floats], block_m: float
+    jacobian: HeightJacobian,
+    shared: SharedParameters,
+    offset_m: tuple[Floats, Floats, Floats],
+    block_m: float,
 ) -> Floats:
     """Return the systematic sigma of the mean of each block (n,), in sigmas of its middle.
 
-    `offset_m` are the eastward and northward distances of the middle from the scanner. Within a block only
-    the azimuth of its places matters: the other derivatives change linearly. Source: equations.md, 6.2.
+    `offset_m` is that of the middle from the scanner, on the grid. Within a block only the azimuth of its
+    places matters: the other derivatives change linearly. Source: equations.md, 6.2.
     """
-    east_m, north_m = offset_m
+    plane = jacobian.params.plane
+    east_m, north_m, _ = plane.in_map_axes(offset_m)
     ratio = np.ones(len(jacobian))
     near = np.flatnonzero(np.hypot(east_m, north_m) * TILT_KNOT_RAD * MIN_SPAN < block_m)
     step_m = (np.arange(PLACES) + 0.5) / PLACES * block_m - block_m / 2
-    step_east_m, step_north_m = (steps.ravel() for steps in np.meshgrid(step_m, step_m))
+    step_x_m, step_y_m = (steps.ravel() for steps in np.meshgrid(step_m, step_m))
+    step_east_m, step_north_m, _ = plane.in_map_axes((step_x_m, step_y_m, 0.0))
     for first in range(0, len(near), AT_ONCE):
         chosen = near[first : first + AT_ONCE]
         middle = east_m[chosen, None] + 1j * north_m[chosen, None]

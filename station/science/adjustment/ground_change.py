@@ -19,7 +19,7 @@ from scipy import sparse
 
 from station.quantities import Bools, Floats, Ints, Reals
 from station.science.adjustment.normal_equations import ScaledCholesky
-from station.science.adjustment.patches import RANGE_BIN_M, Patches
+from station.science.adjustment.patches import Patches
 from station.science.uncertainty import common_mode
 from station.science.uncertainty.parameters import GLOBAL, TILT_KNOT_RAD
 
@@ -163,7 +163,7 @@ class GroundChange:
         """Return the mean estimated change of moving ground by azimuth sector and range ring."""
         moving = patches.take(self.moving)
         azimuth_rad = patches.jacobian.params.start_rad + TILT_KNOT_RAD * moving.jacobian.knot_position
-        distance_m = (moving.range_bin + 0.5) * RANGE_BIN_M
+        distance_m = (moving.range_bin + 0.5) * patches.bin_m
         return common_mode.polar_mean(azimuth_rad, distance_m, (self.design @ estimate_m)[self.moving])
 
 
@@ -228,7 +228,7 @@ def _knots(patches: Patches, shares: Floats) -> tuple[sparse.csr_array, list[Flo
 
 def _position(patches: Patches) -> tuple[Reals, Reals, Reals]:
     """Return the offset east and north of the scanner, and the distance of patches (n,) [m]."""
-    distance_m = (patches.range_bin + 0.5) * RANGE_BIN_M
+    distance_m = (patches.range_bin + 0.5) * patches.bin_m
     azimuth_rad = patches.jacobian.params.start_rad + TILT_KNOT_RAD * patches.jacobian.knot_position
     east_m, north_m = (distance_m * wave(azimuth_rad) for wave in (np.sin, np.cos))
     return east_m, north_m, distance_m
@@ -254,8 +254,7 @@ def _trends(patches: Patches, share: Floats) -> sparse.csr_array:
 
 def _thin_snow(patches: Patches, moving: Bools) -> sparse.csr_array:
     """Return the design matrix (n, 2) of thin snow: stable patches that hold snow, and that hold some."""
-    tan_slope = np.hypot(*patches.jacobian.pose[3:5])
-    snow_class = np.digitize(tan_slope, MAX_SNOW_SLOPES)
+    snow_class = np.digitize(patches.jacobian.tan_slope, MAX_SNOW_SLOPES)
     return sparse.csr_array(np.stack([(snow_class == index) & ~moving for index in range(2)], axis=1) * 1.0)
 
 

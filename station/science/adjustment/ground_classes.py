@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from station.quantities import Bools, Floats, Floats32, Ints, Reals
+from station.quantities import Bools, Floats, Floats32, Grid, Ints, Reals
 from station.science.adjustment.patches import GroundClass
 from station.science.geometry.terrain import smooth_gradient
 
@@ -56,10 +56,9 @@ def classify(stable: Bools, holdout: Bools, smooth: Bools, changed: Bools) -> In
     return np.where(stable & ~changed, stable_class, changeable)
 
 
-def holds_no_snow(elevation_m: Floats, cell_m: float) -> Bools:
+def holds_no_snow(elevation_m: Floats, grid: Grid) -> Bools:
     """Return True for cells (ny, nx) of a surface that are too steep to hold snow."""
-    east, north = smooth_gradient(elevation_m, cell_m)
-    return np.asarray(np.hypot(east, north) > MIN_STABLE_SLOPE)
+    return np.asarray(grid.plane.tan_slope(*smooth_gradient(elevation_m, grid.cell_m)) > MIN_STABLE_SLOPE)
 
 
 @dataclass(frozen=True)
@@ -160,7 +159,7 @@ def _ratio(intensity: Floats32, reference: Floats32) -> Floats32:
     return np.divide(intensity, reference, out=ratio, where=reference > 0)
 
 
-def noise_class(range_m: Floats, tan_slope: Floats) -> Ints:
+def noise_class(range_m: Reals, tan_slope: Reals) -> Ints:
     """Return the noise class (ny, nx), from 0: cells of similar random error, by range and slope."""
     slope = np.minimum((np.nan_to_num(tan_slope) / NOISE_CLASS_SLOPE).astype(np.int64), 7)
-    return (range_m / NOISE_CLASS_RANGE_M).astype(np.int64) * 8 + slope
+    return np.asarray((range_m / NOISE_CLASS_RANGE_M).astype(np.int64) * 8 + slope)

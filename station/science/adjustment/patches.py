@@ -8,11 +8,12 @@ from enum import IntEnum
 
 import numpy as np
 
-from station.quantities import Bools, Floats, Floats32, Ints, Ints32, Reals
+from station.quantities import Bools, Floats, Floats32, Grid, Ints, Ints32, Reals
 from station.science.uncertainty.jacobian import HeightJacobian
 from station.science.uncertainty.parameters import GLOBAL, LINE_GROUPS_PER_KNOT, ParameterLayout
 
 RANGE_BIN_M = 80.0  # range extent of a patch
+FACE_BINS = 8  # of a face, from its foot to its top
 ROBUST_ITERATIONS = 3
 CAUCHY = 2.385  # 95 % efficient for normal errors
 CHI2_MEDIAN = 0.45494  # with one degree of freedom
@@ -32,7 +33,7 @@ class CellObservations:
     """Cells (n,) of a scan: Jacobian, ground class, residual to the reference and its random variance."""
 
     jacobian: HeightJacobian
-    range_m: Floats  # horizontal
+    range_m: Reals  # along the scan line, see `distance_along_line`
     height_m: Reals  # above the scanner
     ground_class: Ints
     residual_m: Floats
@@ -52,6 +53,7 @@ class Patches:
     variance_m2: Floats  # (m,) random variance of the residual
     cell_count: Floats  # (m,)
     sampling_step: tuple[int, int] = (1, 1)  # that of the cells
+    bin_m: float = RANGE_BIN_M  # extent of a range bin
 
     def __len__(self) -> int:
         """Return the number of patches."""
@@ -68,17 +70,40 @@ class Patches:
             self.variance_m2[selection],
             self.cell_count[selection],
             self.sampling_step,
+            self.bin_m,
         )
 
 
+def distance_along_line(grid: Grid, cell: Ints32, offset_m: tuple[Reals, Reals, Reals]) -> Reals:
+    """Return how far cells (n,) lie along their scan lines [m]: from the scanner, on a face from its foot.
+
+    On the map that is the horizontal range. Up a face the range hardly changes.
+    """
+    if grid.plane.is_map:
+        return np.asarray(np.hypot(*offset_m[:2]))
+    row, _ = grid.row_and_column(cell)
+    return np.asarray((grid.ny - 0.5 - row) * grid.cell_m)
+
+
+def line_length(grid: Grid, range_max_m: float) -> tuple[float, float]:
+    """Return the largest distance along a scan line, and the extent of a patch along it [m]."""
+    if grid.plane.is_map:
+        return range_max_m, RANGE_BIN_M
+    height_m = grid.ny * grid.cell_m
+    return height_m, height_m / FACE_BINS
+
+
 def aggregate_patches(
-    params: ParameterLayout, blocks: Iterable[CellObservations], max_range_m: float
+    params: ParameterLayout,
+    blocks: Iterable[CellObservations],
+    max_range_m: float,
+    bin_m: float = RANGE_BIN_M,
 ) -> Patches:
     """Return the patches of all cells, with robust means: outliers in a patch get small weights.
 
-    `max_range_m` is the largest horizontal range; cells beyond it go to the last range bin.
+    `max_range_m` is the largest range; cells beyond it go to the last range bin.
     """
-    range_bins = int(max_range_m / RANGE_BIN_M) + 1
+    range_bins = int(max_range_m / bin_m) + 1
     class_size = params.line_groups * range_bins
     size = class_size * GroundClass.UNUSED
     sums = np.zeros((len(GLOBAL) + 5, GroundClass.UNUSED, params.line_groups, range_bins))
@@ -89,7 +114,7 @@ def aggregate_patches(
         if not len(used):
             continue
         jacobian, ground_class, line = cells.jacobian, cells.ground_class[used], cells.jacobian.line[used]
-        range_bin = np.minimum((cells.range_m[used] / RANGE_BIN_M).astype(np.int64), range_bins - 1)
+        range_bin = np.minimum((cells.range_m[used] / bin_m).astype(np.int64), range_bins - 1)
         precision = 1 / cells.variance_m2[used]
         # A block covers few line groups; adding to all groups for every block would dominate the run time.
         first, lines = int(line.min()), int(np.ptp(line)) + 1
@@ -124,6 +149,7 @@ def aggregate_patches(
         variance_m2,
         count,
         sampling_step,
+        bin_m,
     )
 
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import sparse, special
 
-from station.quantities import Bools, Floats, Ints, SharedParameters
+from station.quantities import Bools, Floats, Ints, Reals, SharedParameters
 from station.science.geometry.robust_statistics import MEDIAN_ABSOLUTE_NORMAL
 from station.science.gridding.significance import SIGNIFICANT_SIGMAS
 from station.science.uncertainty.jacobian import HeightJacobian, line_tilt_variance
@@ -83,7 +83,7 @@ def sigma_scale(z_of_epochs: list[Floats]) -> SigmaScale:
     return SigmaScale(factor, low, high, advised=bool(differs and not low <= 1 <= high))
 
 
-def range_bands(range_m: Floats) -> list[tuple[float, float]]:
+def range_bands(range_m: Reals) -> list[tuple[float, float]]:
     """Return four or five range bands [m] between round numbers that cover all cells."""
     farthest = max(float(np.max(range_m)), 1.0)
     step = 10 ** np.floor(np.log10(farthest / 4))

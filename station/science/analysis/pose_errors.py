@@ -66,9 +66,11 @@ class PoseErrorModel:
     def _height_errors(self, parameters: Floats) -> Floats:
         """Heights of the points above the surface (draws, n) [m], for scanner errors (p, draws)."""
         by_name = {name: parameters[index][:, None] for index, (name, _) in enumerate(GLOBAL)}
+        plane = self.jacobian.params.plane
+        u_m, v_m, w_m = (axis - origin for axis, origin in zip(self.points, self.position_m, strict=True))
         x_m, y_m, z_m = (
-            axis - origin - by_name[f"translation_{name}"]
-            for axis, origin, name in zip(self.points, self.position_m, ("east", "north", "up"), strict=True)
+            axis - by_name[f"translation_{name}"]
+            for axis, name in zip(plane.in_map_axes((u_m, v_m, w_m)), ("east", "north", "up"), strict=True)
         )
         x_m, y_m = _rotate(x_m, y_m, by_name["heading"])
         sight_tilt_rad, refraction, cross_tilt_rad = self._interpolate_knots(parameters)
@@ -86,9 +88,8 @@ class PoseErrorModel:
         bent_m, z_m = _rotate(horizontal_m, z_m, refraction_rad - sight_tilt_rad)
         x_m, y_m = x_m * bent_m / horizontal_m, y_m * bent_m / horizontal_m
         scale = 1 + by_name["range_bias"] / np.hypot(bent_m, z_m) + 1e-6 * by_name["range_scale"]
-        east_m, north_m, up_m = (
-            origin + scale * axis for origin, axis in zip(self.position_m, (x_m, y_m, z_m), strict=True)
-        )
+        moved_m = plane.in_grid_axes((scale * x_m, scale * y_m, scale * z_m))
+        east_m, north_m, up_m = (origin + axis for origin, axis in zip(self.position_m, moved_m, strict=True))
         grid = self.surface.grid
         column, row = (east_m - grid.west_m) / grid.cell_m, (grid.north_m - north_m) / grid.cell_m
         return np.asarray(up_m - self.surface.height_and_gradient(column, row)[0])

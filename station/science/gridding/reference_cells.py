@@ -96,7 +96,7 @@ def cell_arrays(
     cell_class = np.where(stable[known], CellClass.STABLE, 0) | np.where(
         ground_classes.is_holdout(x_m, y_m), CellClass.HOLDOUT, 0
     )
-    slope = np.hypot(east, north)
+    slope = grid.plane.tan_slope(east, north)
     cell_class |= np.where(slope < ground_classes.MAX_MOVING_SLOPE, CellClass.SMOOTH, 0)
     cell_class |= np.where(slope > ground_classes.MIN_BARE_SLOPE, CellClass.STEEP, 0)
     knot_position: Reals = np.zeros(len(row))
@@ -119,12 +119,12 @@ def cell_arrays(
         cell_class |= np.where(enclosed, CellClass.ENCLOSED, 0) | np.where(ratio < limit, CellClass.EVEN, 0)
         last = np.nextafter(np.float32(params.knot_intervals), np.float32(0))
         knot_position = np.minimum(knot_position.astype(np.float32), last)
-        range_m = np.hypot(observation.offset_m[0], observation.offset_m[1])
+        range_m = grid.plane.horizontal_m(observation.offset_m)
         noise_class = variance_factors.noise_class(range_m, ratio, enclosed)
-        range_bin = (range_m / VISIBILITY_BIN_M).astype(np.int64)
-        visibility_bin = (knot_position / TILT_KNOTS_PER_REFRACTION).astype(np.int64) * visibility_bins(
-            grid, position_m
-        ) + range_bin
+        range_bins = visibility_bins(grid, position_m)
+        range_bin = np.minimum((range_m / VISIBILITY_BIN_M).astype(np.int64), range_bins - 1)
+        sector = (knot_position / TILT_KNOTS_PER_REFRACTION).astype(np.int64)
+        visibility_bin = sector * range_bins + range_bin
     if published:
         point_variance_m2, reference_variance_m2 = shot_m2, np.zeros(len(row), np.float32)
     else:
@@ -163,7 +163,7 @@ def mark_bare(
             cells["east_gradient"][block],
             cells["north_gradient"][block],
         )
-        range_m = np.hypot(*observation.offset_m[:2])
+        range_m = grid.plane.horizontal_m(observation.offset_m)
         return cells["intensity"][block], range_m, observation.cos_incidence
 
     count = len(cells["cell"])
@@ -197,11 +197,8 @@ def visibility_step(count: int) -> slice:
 
 def visibility_bins(grid: Grid, position_m: Position) -> int:
     """Return the number of range bins from the scanner to the farthest cell of a grid."""
-    east_m, north_m = (
-        np.abs(axis_m - scanner_m).max()
-        for axis_m, scanner_m in zip((grid.x_m, grid.y_m), position_m[:2], strict=True)
-    )
-    return int(math.hypot(east_m, north_m) / VISIBILITY_BIN_M) + 1
+    row, column = np.array([0, 0, -1, -1]), np.array([0, -1, 0, -1])  # of the corners
+    return int(grid.horizontal_range_m(row, column, position_m).max() / VISIBILITY_BIN_M) + 1
 
 
 def _well_sampled(cell_class: Array) -> Bools:

@@ -140,11 +140,11 @@ def _empirical_variance(
         window = slice(max(rows.start - HALO_ROWS, 0), rows.stop + HALO_ROWS)
         inner = slice(rows.start - window.start, rows.stop - window.start)
         east, north = smooth_gradient(elevation_m[window] - position_m[2], grid.cell_m, rows=inner)
-        tan_slope = np.hypot(east, north)
-        range_m = np.hypot(grid.x_m[None, :] - position_m[0], grid.y_m[rows, None] - position_m[1])
+        row, column = np.ogrid[rows.start : rows.stop, : grid.nx]
+        range_m = grid.horizontal_range_m(row, column, position_m)
         classes[rows], steep[rows] = (
-            ground_classes.noise_class(range_m, tan_slope),
-            tan_slope > ground_classes.MIN_STABLE_SLOPE,
+            ground_classes.noise_class(range_m, np.hypot(east, north)),
+            grid.plane.tan_slope(east, north) > ground_classes.MIN_STABLE_SLOPE,
         )
     factor = stack.variance_factor(classes)
     return factor, np.isfinite(elevation_m) & steep & (factor < MAX_VARIANCE_FACTOR)

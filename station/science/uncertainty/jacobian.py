@@ -19,6 +19,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy import sparse
 
+from station.grid_plane import STEEPEST_UP
 from station.quantities import Bools, Floats, Floats32, Grid, Ints, Reals, SharedParameters
 from station.science.geometry.air import EARTH_RADIUS_M
 from station.science.uncertainty.parameters import (
@@ -65,8 +66,14 @@ class HeightJacobian:
 
     @property
     def gradient(self) -> Reals:
-        """Gradient of the ground eastward and northward (2, n) [1]."""
-        return np.asarray(self.pose[3:5] / -self.pose[5])
+        """Gradient of the ground along x and y of the grid (2, n) [1]."""
+        x, y, down = self.params.plane.in_grid_axes((self.pose[3], self.pose[4], self.pose[5]))
+        return np.asarray(np.stack([x, y]) / -down)
+
+    @property
+    def tan_slope(self) -> Reals:
+        """Tangent of the slope of the ground (n,) [1]; overhangs count as vertical."""
+        return np.asarray(np.hypot(*self.pose[3:5] / np.maximum(-self.pose[5], STEEPEST_UP)))
 
     @cached_property
     def line(self) -> Ints:
@@ -221,24 +228,27 @@ def height_jacobian(
     knot_position: Reals | None = None,
     rock: Bools | None = None,
 ) -> HeightJacobian:
-    """Return the Jacobian of the heights of cells at `offset_m` (each (n,)) from the scanner.
+    """Return the Jacobian of the heights of cells at `offset_m` (each (n,)) from the scanner, on the grid.
 
     `knot_position` (n,) skips its computation where it is known already. `rock` (n,) marks ground that
     is no ice or snow; by default there is none. Signs: scanner state minus assumed state.
     Source: equations.md, 6.1.
     """
-    x_m, y_m, z_m = offset_m
+    x_m, y_m, z_m = params.plane.in_map_axes(offset_m)
+    # The vector against the normal of the ground: on the map its gradient, and -1.
+    east, north, down = params.plane.in_map_axes((east_gradient, north_gradient, -1.0))
+    up = -down
     horizontal_m2 = x_m**2 + y_m**2  # np.hypot takes five times as long
     range_m2 = horizontal_m2 + z_m**2
     horizontal_m = np.maximum(np.sqrt(horizontal_m2), 1e-6)
-    slope_m = east_gradient * x_m + north_gradient * y_m
-    normal_m = z_m - slope_m  # n_u · P
-    rise_m = horizontal_m + z_m * slope_m / horizontal_m  # F
+    slope_m = east * x_m + north * y_m
+    normal_m = up * z_m - slope_m  # n_u · P
+    rise_m = up * horizontal_m + z_m * slope_m / horizontal_m  # F
     refraction_m = horizontal_m * rise_m / (2 * EARTH_RADIUS_M)
     rotation_m = (
-        -(y_m + north_gradient * z_m),
-        x_m + east_gradient * z_m,
-        east_gradient * y_m - north_gradient * x_m,
+        -(up * y_m + north * z_m),
+        up * x_m + east * z_m,
+        east * y_m - north * x_m,
     )
     # A rotation about the line of sight does not move the point. The line of sight has the components
     # `radial_m` normal to the head's axis and `axial_m` along it: the effects of rotating about both cancel.
@@ -251,9 +261,9 @@ def height_jacobian(
         pose=np.stack(
             [
                 *rotation_m,
-                east_gradient,
-                north_gradient,
-                np.full_like(x_m, -1.0),
+                east,
+                north,
+                np.full_like(x_m, down),
                 normal_m / np.sqrt(np.maximum(range_m2, 1e-12)),
                 normal_m * 1e-6,
                 refraction_m,

@@ -11,6 +11,7 @@ from functools import lru_cache
 
 import numpy as np
 
+from station.grid_plane import MAP_PLANE, GridPlane
 from station.quantities import VERTICAL_AXIS, Bools, Floats, Grid, Ints, Reals
 
 GLOBAL = (
@@ -40,13 +41,15 @@ class ParameterLayout:
     north. Every scan line therefore has one azimuth, even on a tilted mount. Azimuth zero is the direction
     normal to the axis that is closest to north. Of an axis within 45° of north it is the one closest to down,
     of an axis within 45° of south the one closest to up: north would be lost or turn with the axis. The first
-    knot lies at `start_rad`; with `full_circle` the knots cover all 360°.
+    knot lies at `start_rad`; with `full_circle` the knots cover all 360°. The parameters refer to east, north
+    and up also if the heights that they change are those above another `plane`.
     """
 
     start_rad: float
     knot_intervals: int  # between sight-tilt knots
     full_circle: bool
     axis: tuple[float, float, float] = VERTICAL_AXIS
+    plane: GridPlane = MAP_PLANE
 
     @property
     def sight_tilt_knots(self) -> int:
@@ -130,7 +133,8 @@ class ParameterLayout:
         return np.stack([*np.broadcast_arrays(*range(len(GLOBAL)), *columns)], axis=-1)
 
     def knot_position(self, offset_m: tuple[Reals, Reals, Reals]) -> Reals:
-        """Return the fractional sight-tilt knot index (n,) of points at `offset_m` from the scanner."""
+        """Return the fractional sight-tilt knot index (n,) of points at `offset_m`, on the grid."""
+        offset_m = self.plane.in_map_axes(offset_m)
         east, north = (
             sum(component * offset for component, offset in zip(direction, offset_m, strict=True))
             for direction in _head_axes(self.axis)
@@ -165,19 +169,28 @@ def parameter_layout(
     grid: Grid, position_m: tuple[float, float, float], axis: tuple[float, float, float] = VERTICAL_AXIS
 ) -> ParameterLayout:
     """Return the parameter layout for a grid seen from `position_m`: knots cover the sector it spans."""
-    east = np.array([grid.west_m, grid.west_m + grid.nx * grid.cell_m]) - position_m[0]
-    north = np.array([grid.north_m - grid.ny * grid.cell_m, grid.north_m]) - position_m[1]
-    inside = east[0] <= 0 <= east[1] and north[0] <= 0 <= north[1]
-    if inside or axis[2] < MAX_AXIS_TILT_COS:
-        return ParameterLayout(0.0, round(2 * math.pi / TILT_KNOT_RAD), full_circle=True, axis=axis)
-    corners = np.array([math.atan2(e, n) for e in east for n in north])
-    middle = math.atan2(east.mean(), north.mean())
+    x_m = np.array([grid.west_m, grid.west_m + grid.nx * grid.cell_m]) - position_m[0]
+    y_m = np.array([grid.north_m - grid.ny * grid.cell_m, grid.north_m]) - position_m[1]
+    offset_m = np.repeat(x_m, 2), np.tile(y_m, 2), np.full(4, -position_m[2])
+    east, north, _ = grid.plane.in_map_axes(offset_m)
+    corners = np.array([math.atan2(e, n) for e, n in zip(east, north, strict=True)])
+    middle = math.atan2(east[[0, -1]].mean(), north[[0, -1]].mean())
     relative_rad = (corners - middle + math.pi) % (2 * math.pi) - math.pi
+    inside = np.ptp(relative_rad) >= math.pi or (
+        grid.plane.is_map and x_m[0] <= 0 <= x_m[1] and y_m[0] <= 0 <= y_m[1]
+    )
+    if inside or axis[2] < MAX_AXIS_TILT_COS:
+        knots = round(2 * math.pi / TILT_KNOT_RAD)
+        return ParameterLayout(0.0, knots, full_circle=True, axis=axis, plane=grid.plane)
     spacing_rad = TILT_KNOT_RAD * TILT_KNOTS_PER_REFRACTION
     first = math.floor((middle + relative_rad.min()) / spacing_rad)
     last = math.ceil((middle + relative_rad.max()) / spacing_rad)
     return ParameterLayout(
-        first * spacing_rad, (last - first) * TILT_KNOTS_PER_REFRACTION, full_circle=False, axis=axis
+        first * spacing_rad,
+        (last - first) * TILT_KNOTS_PER_REFRACTION,
+        full_circle=False,
+        axis=axis,
+        plane=grid.plane,
     )
 
 

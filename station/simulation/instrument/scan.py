@@ -14,9 +14,11 @@ from station.simulation.instrument.airborne import (
     cloud_of_scan,
     particle_brightness,
 )
+from station.simulation.instrument.face_casting import cast_onto_face
 from station.simulation.instrument.ray_casting import RayHits, cast_rays, trace_from
 from station.simulation.randomness import rng_for
 from station.simulation.scenario import Scenario
+from station.simulation.world import rock_face
 from station.simulation.world.air import (
     AirOfScan,
     air_of_scan,
@@ -154,20 +156,12 @@ def _simulate_lines(
         elevation_rad + beam_error[1] + conditions.jitter_rad[line],
         elapsed_s,
     )
-    bearing_rad = np.unwrap(np.arctan2(direction[1], direction[0]))
     air = conditions.air
-    coefficient_at = air.coefficient_at if air else np.zeros_like
-    slope = direction[2] / np.hypot(direction[0], direction[1])
-    hits = cast_rays(ground, eye_m, bearing_rad, slope, _reach_m(ground), coefficient_at)
-    if conditions.cold_air:
-        rays = (bearing_rad, slope, coefficient_at(bearing_rad))
-        hits = bend_over_ice(conditions.cold_air, ground, ice, eye_m, rays, hits)
-    rise_m = hits.up_m - eye_m[2]
+    hits, true_m, cos_incidence = _meet_ground(scenario, ground, ice, conditions, eye_m, direction)
+    rise_m = true_m[:, 2] - eye_m[2]
     range_m = np.hypot(hits.along_m, rise_m)
-    cos_incidence = _cos_incidence(hits, direction)
     echo = (cos_incidence > np.cos(np.radians(scenario.incidence_max_deg))) & (range_m < scenario.range_max_m)
     echo &= (hits.up_m > sea_m) & (rng.random(len(line)) >= scenario.echo_loss)
-    true_m = np.stack((hits.east_m, hits.north_m, hits.up_m), axis=1)
     rock, white = _reflectances(scenario)
     intensity = (rock + (white - rock) * cover.at(hits.east_m, hits.north_m)) * cos_incidence
     echo &= intensity * (scenario.range_max_m / range_m) ** 2 > scenario.faintest_reflectance
@@ -194,6 +188,33 @@ def _simulate_lines(
         true_m=true_m[echo],
         airborne=airborne[echo],
     )
+
+
+def _meet_ground(
+    scenario: Scenario,
+    ground: NodeField,
+    ice: NodeField,
+    conditions: ScanConditions,
+    eye_m: Floats,
+    direction: Floats,
+) -> tuple[RayHits, Floats, Floats]:
+    """Return where beams meet the ground, the same in east-north-up (n, 3), and the cosine of incidence.
+
+    Hits on a rock face are along, up and out of it.
+    """
+    coefficient_at = conditions.air.coefficient_at if conditions.air else np.zeros_like
+    bearing_rad = np.unwrap(np.arctan2(direction[1], direction[0]))
+    if scenario.kind == "rockfall":
+        hits = cast_onto_face(ground, eye_m, direction, coefficient_at(bearing_rad))
+        place_m = np.stack((hits.east_m, hits.north_m, hits.up_m))
+        return hits, rock_face.from_face(place_m).T, _cos_incidence(hits, rock_face.axes() @ direction)
+    slope = direction[2] / np.hypot(direction[0], direction[1])
+    hits = cast_rays(ground, eye_m, bearing_rad, slope, _reach_m(ground), coefficient_at)
+    if conditions.cold_air:
+        rays = (bearing_rad, slope, coefficient_at(bearing_rad))
+        hits = bend_over_ice(conditions.cold_air, ground, ice, eye_m, rays, hits)
+    true_m = np.stack((hits.east_m, hits.north_m, hits.up_m), axis=1)
+    return hits, true_m, _cos_incidence(hits, direction)
 
 
 def bend_over_ice(

@@ -17,6 +17,7 @@ from station.simulation.randomness import rng_for
 from station.simulation.scenario import Deposit, Scenario
 from station.simulation.world.beach import bar
 from station.simulation.world.places import roof
+from station.simulation.world.rock_face import falls
 from station.simulation.world.terrain import NodeField, Valley, bumps
 
 # Release and deposit of the avalanche: east, north, half length, half width, times size [m]; the half axes
@@ -59,6 +60,7 @@ def surface_changes(scenario: Scenario, valley: Valley) -> tuple[SurfaceChange, 
             (_summer, scenario.summer_melt_m),
             (_creep, scenario.creep_m),
             (_sand, scenario.bar_growth_m),
+            (_rockfall, scenario.rockfall_m),
         )
         if size
     )
@@ -200,6 +202,13 @@ def _sand(scenario: Scenario, valley: Valley) -> SurfaceChange:
         return scenario.bar_growth_m * float(np.clip(share, 0, 1))
 
     return SurfaceChange("sand", bar(valley), amount)
+
+
+def _rockfall(scenario: Scenario, valley: Valley) -> SurfaceChange:
+    def amount(hours: float) -> float:
+        return scenario.rockfall_m if hours >= scenario.rockfall_hour else 0.0
+
+    return SurfaceChange("rockfall", falls(valley), amount)
 
 
 def _rock(valley: Valley) -> Floats:

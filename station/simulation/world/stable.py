@@ -11,12 +11,12 @@ import numpy as np
 from station.quantities import Bools, Floats, Grid
 from station.simulation.scenario import Mark, Scenario
 from station.simulation.truth import TrueSurface, map_from_enu
-from station.simulation.world import beach, snow_slope
+from station.simulation.world import beach, rock_face, snow_slope
 from station.simulation.world.change import DEPOSIT, ON_STABLE_GROUND, SurfaceChange
 from station.simulation.world.places import RIDGE_DEG, RIDGE_FROM_M, ROCK_ICE, hut_cells, hut_m
 from station.simulation.world.terrain import Valley
 
-BLOCK_M = {"valley": 50.0, "mammoth": 3.0, "low-cost-snow": 3.0, "beach": 5.0}  # times size
+BLOCK_M = {"valley": 50.0, "mammoth": 3.0, "low-cost-snow": 3.0, "beach": 5.0, "rockfall": 5.0}  # times size
 GLACIER = (-700.0, 1020.0, 280.0, 280.0)  # octagon on the ice: east, north, half axes, times size [m]
 ROCK = (-250.0, 1850.0, 100.0)  # square on the northern wall: east, north, half length, times size [m]
 
@@ -66,6 +66,8 @@ def areas(scenario: Scenario, valley: Valley) -> dict[str, Floats]:
 
     In the valley they are glacier, avalanche deposit and rock.
     """
+    if scenario.kind == "rockfall":
+        return {name: _ring(*place_m, corners=4) for name, place_m in rock_face.AREAS_M.items()}
     if scenario.kind != "valley":
         places_m = beach.AREAS_M if scenario.kind == "beach" else snow_slope.AREAS_M
         return {

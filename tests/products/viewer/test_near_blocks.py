@@ -28,7 +28,7 @@ def test_the_sigma_of_a_block_is_that_of_the_mean_of_its_cells():
         return height_jacobian(params, offset_m, slope, 0.2 * slope, rock=slope > 0)
 
     blocks = jacobian(*middle_m)
-    ratio = sigma_ratio(blocks, shared, tuple(middle_m), BLOCK_M)
+    ratio = sigma_ratio(blocks, shared, (*middle_m, 0.1 * middle_m[0] - 60), BLOCK_M)
     for index, (east_m, north_m) in enumerate(middle_m.T):
         east, north = (part.ravel() for part in np.meshgrid(east_m + step_m, north_m + step_m))
         cells = jacobian(east, north)

@@ -60,7 +60,7 @@ def test_slopes_above_40_degrees_hold_no_snow():
     x_m = np.arange(30) * 5.0
     for slope_deg, expected in ((39, False), (41, True)):
         plane = np.tan(np.radians(slope_deg)) * (0.6 * x_m[None, :] + 0.8 * x_m[:, None])
-        assert (ground_classes.holds_no_snow(plane, 5.0) == expected).all()
+        assert (ground_classes.holds_no_snow(plane, Grid(0.0, 150.0, 5.0, 30, 30)) == expected).all()
 
 
 FLAT, STEEP = np.zeros(1, bool), np.ones(1, bool)
