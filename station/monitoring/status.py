@@ -96,7 +96,7 @@ def _queue_status(site: Site, journal: JournalReader, entries: list[Entry]) -> S
         clock_problem(site.station.data, time.time()),
         *site.input_faults,
         weather_fault(site),
-        *(_renewal_fault(site, name) for name in RENEWALS),
+        *(_renewal_fault(site, name) for name in wanted_renewals(site)),
         *_publish_faults(site),
         pause_reason(site.station.data),
     )
@@ -107,16 +107,21 @@ def _queue_status(site: Site, journal: JournalReader, entries: list[Entry]) -> S
     }
 
 
+def wanted_renewals(site: Site) -> list[str]:
+    """Return the names in RENEWALS of what the service renews at a site."""
+    is_wanted = {"mirror": site.mirror is not None, "levels": site.products.levels, "derived": True}
+    return [name for name in RENEWALS if is_wanted[name]]
+
+
 def fault_file(site: Site, name: str) -> Path:
     """Return the file that says why the service could not renew the files of RENEWALS with this name."""
     return site.station.data / f".{name}_fault"
 
 
 def _renewal_fault(site: Site, name: str) -> str:
-    """Return why the service could not renew some files; '' if it could, or is not to."""
-    is_wanted = {"mirror": site.mirror is not None, "levels": site.products.levels}.get(name, True)
+    """Return why the service could not renew some files; '' if it could."""
     try:
-        fault = fault_file(site, name).read_text(encoding="utf-8") if is_wanted else ""
+        fault = fault_file(site, name).read_text(encoding="utf-8")
     except (OSError, ValueError):
         return ""
     return fault and f"{RENEWALS[name]} not up to date: {fault}"

@@ -14,13 +14,41 @@ from station.archive.atomic_files import atomic_write
 from station.config import Site
 from station.errors import NotReadyError, StationError
 from station.logs import logfmt
-from station.monitoring.status import fault_file
-from station.processing.store_tasks import LOWEST_PRIORITY, MAX_STORE_TASK_S
+from station.monitoring.status import fault_file, wanted_renewals
+from station.processing.store_tasks import LOWEST_PRIORITY, MAX_STORE_TASK_S, renew_derived, renew_levels
 from station.processing.workers.worker_process import Progress
 from station.service.host import Host
+from station.service.mirror import update_mirror
 
 log = logging.getLogger("station")
 RenewalTask = Callable[[Site, Progress], str]  # returns why files could not be renewed, or ''
+TASKS: dict[str, RenewalTask] = {"mirror": update_mirror, "levels": renew_levels, "derived": renew_derived}
+
+
+class Renewals:
+    """All that the service renews in the background: the mirror, levels, derived files far behind."""
+
+    def __init__(self, site: Site, host: Host) -> None:
+        self._by_name = {
+            name: Renewal(site, name, TASKS[name], host, is_due=name != "derived")
+            for name in wanted_renewals(site)
+        }
+
+    def require(self, *, derived: bool) -> None:
+        """Renew files when no scan waits: the series has changed; `derived` ones if they are far behind."""
+        for name, renewal in self._by_name.items():
+            if derived or name != "derived":
+                renewal.require()
+
+    def proceed(self) -> None:
+        """Record what has finished, and start what is due."""
+        for renewal in self._by_name.values():
+            renewal.proceed()
+
+    def close(self) -> None:
+        """Stop at once; what is unfinished is renewed after the next start."""
+        for renewal in self._by_name.values():
+            renewal.close()
 
 
 class Renewal:

@@ -31,8 +31,6 @@ from station.processing.store_tasks import (
     Checksums,
     compact_epochs,
     delete_expired,
-    renew_derived,
-    renew_levels,
     update_between_scans,
     update_series,
     update_stored_levels,
@@ -41,10 +39,9 @@ from station.processing.usable_inputs import with_usable_inputs
 from station.processing.workers.worker_process import Progress
 from station.service.background_compaction import BackgroundCompaction
 from station.service.host import Host
-from station.service.mirror import update_mirror
 from station.service.publishing import publish
 from station.service.reference_builder import ReferenceBuilder
-from station.service.renewal import Renewal
+from station.service.renewal import Renewals
 from station.service.retention import apply_retention, expired_scans
 from station.service.store_repair import StoreRepair, require_same_map
 
@@ -94,15 +91,7 @@ class Worker:
         self.store = StoreRepair(site, journal, self.run, self._update_series, self._host.clock)
         self._reference = ReferenceBuilder(site, journal, self.run, self.store, self._processed)
         self._compaction = BackgroundCompaction(site, on_compacted, self._host)
-        self._renewals = [
-            Renewal(site, name, task, self._host)
-            for name, task, is_wanted in (
-                ("mirror", update_mirror, site.mirror is not None),
-                ("levels", renew_levels, site.products.levels),
-            )
-            if is_wanted
-        ]
-        self._catch_up = Renewal(site, "derived", renew_derived, self._host, is_due=False)
+        self._renewals = Renewals(site, self._host)
 
     def process(self, scan: ScanFile, *, ahead: bool = False) -> bool:
         """Measure and store a scan, record it in journal and log; return True if it is stored.
@@ -201,13 +190,11 @@ class Worker:
     def close(self) -> None:
         """Stop what runs in the background."""
         self._compaction.close()
-        for renewal in (*self._renewals, self._catch_up):
-            renewal.close()
+        self._renewals.close()
 
     def proceed_with_renewals(self) -> None:
-        """Renew in the background what follows the series: the mirror, levels, derived files far behind."""
-        for renewal in (*self._renewals, self._catch_up):
-            renewal.proceed()
+        """Renew in the background what follows the series, see `Renewals`."""
+        self._renewals.proceed()
 
     def finish_levels(self, *, verify: bool) -> None:
         """Bring the files of levels up to date without a running service, if there are to be any.
@@ -223,10 +210,7 @@ class Worker:
             uncompacted, is_behind = self.store.with_repair(update_between_scans)
         else:
             uncompacted, is_behind = self.store.with_repair(update_series), False
-        for renewal in self._renewals:
-            renewal.require()
-        if is_behind:
-            self._catch_up.require()
+        self._renewals.require(derived=is_behind)
         return uncompacted
 
     def _record_compacted(self, checksums: Checksums) -> None:
