@@ -31,8 +31,8 @@ def open(site_or_folder: str | Path, chunks: Chunks = None) -> xr.Dataset:  # no
     Takes a site file, the station's data folder, or its `series.nc`. `chunks` are those of
     `xarray.open_dataset`, `{}` for chunks of 24 MB. The dataset has the coordinate system for rioxarray, can
     be written in any part with `to_netcdf`, and answers queries with `ds.station`: `variance`, `volume`,
-    `between`, `at`. Raises StoreError if there is no series yet or a file is missing, and if one vanishes
-    while the dataset is in use.
+    `between`, `at`, `error_structure`. Raises StoreError if there is no series yet or a file is missing, and
+    if one vanishes while the dataset is in use.
     """
     import station.queries.accessor  # noqa: F401 - registers ds.station
     from station.archive.series.lazy import open_series

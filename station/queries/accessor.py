@@ -113,6 +113,21 @@ class StationAccessor:
         except KeyError as error:
             raise StationError(f"no cell at x={x}, y={y}: the point is outside the dataset") from error
 
+    def error_structure(self) -> xr.Dataset:
+        """Return change and errors of the cells of a dataset with one epoch, and their correlations [m].
+
+        In the form of obsarray, which then forms covariances, and with punpy propagates them. Raises
+        StationError if the dataset has several epochs or too many cells.
+        """
+        if len(self._epochs) != 1:
+            raise StationError(
+                f"the dataset has {len(self._epochs)} epochs: select one, with .isel(time=...)"
+            )
+        grid, x_m, y_m = self._volumes.grid, self._ds["x"].values, self._ds["y"].values
+        cells = np.zeros(grid.shape, np.bool_)
+        cells[np.ix_(np.isin(grid.y_m, y_m), np.isin(grid.x_m, x_m))] = True
+        return self._volumes.error_structure(cells, self._epochs[0])
+
     def _over_time(self, name: str, units: str, value: Callable[[EpochRef], float]) -> xr.DataArray:
         """Return a value of each epoch of the dataset."""
         time = self._ds["time"]

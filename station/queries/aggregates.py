@@ -166,7 +166,7 @@ class Aggregates(EpochReader):
     def cell_variances(self, area: ObservedArea) -> tuple[Floats, Floats]:
         """Return the random and the systematic variance (n,) of each cell of an area in one epoch [m²]."""
         epoch_cells = area.epochs[0]
-        shared = _shared_of(area.epochs, epoch_cells, above_surface=area.above_surface)
+        shared = shared_of(area.epochs, epoch_cells, above_surface=area.above_surface)
         random_m2 = area.random_m2[0]
         if shared is None:
             return random_m2, np.zeros(len(random_m2))
@@ -254,7 +254,7 @@ class Aggregates(EpochReader):
         """
         variance, lower_bound, aggregated = 0.0, 0.0, []
         for epoch_cells, independent_m2 in zip(epochs, random_m2, strict=True):
-            shared = _shared_of(epochs, epoch_cells, above_surface=above_surface)
+            shared = shared_of(epochs, epoch_cells, above_surface=above_surface)
             scaled_m2 = random_factor * independent_m2
             if shared is None:
                 variance, lower_bound = (
@@ -372,7 +372,7 @@ class Aggregates(EpochReader):
 LEVERAGE_VARIABLES = ("adjustment_leverage_moving", "adjustment_leverage_stable")
 
 
-def _shared_of(
+def shared_of(
     epochs: list[EpochCells], epoch_cells: EpochCells, *, above_surface: bool
 ) -> SharedParameters | None:
     """Return the shared parameters of one of the epochs whose cells are summed; None if it has none.

@@ -1,24 +1,28 @@
-"""Volumes between epochs with the sources of their uncertainty; covariance of single points."""
+"""Volumes between epochs with the sources of their uncertainty; covariance of points and of cells."""
 
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import h5py
 import numpy as np
 import xarray as xr
 
-from station.archive.derived.computed_rasters import CHANGE, RANDOM, TOTAL
+from station.archive.derived.computed_rasters import CHANGE, RANDOM, SYSTEMATIC, TOTAL
 from station.archive.epochs import EpochRef
-from station.errors import StoreError
+from station.errors import StationError, StoreError
 from station.grid_plane import MAP_PLANE
 from station.quantities import Bools, Floats
-from station.queries.aggregates import Aggregates, common_error_covariance
+from station.queries.aggregates import Aggregates, ObservedArea, common_error_covariance, shared_of
 from station.queries.epoch_cells import EpochCells, observed_in_all, read_cells_of
 from station.science.analysis.voids import area_weights
 from station.science.analysis.volume import common_contributions, shared_contributions
 from station.science.uncertainty.point_covariance import shared_covariance, shot_covariance
-from station.science.uncertainty.propagation import difference_to_reference
+
+MAX_CELLS = 4096  # their correlations take 0.13 GB
+CORRELATION = "error_correlation"
+_DIMS = ["y", "x"]
 
 
 class Volumes(Aggregates):
@@ -116,11 +120,9 @@ class Volumes(Aggregates):
         random_part, shared_part, jacobians = np.zeros(len(weights)), np.zeros(len(weights)), []
         for epoch_cells, independent_m2 in zip(epochs, random_m2, strict=True):
             random_part += weights**2 * independent_m2
-            shared_params = epoch_cells.shared
+            shared_params = shared_of(epochs, epoch_cells, above_surface=False)
             if shared_params is None:
                 continue
-            if len(epochs) == 1 and not epoch_cells.adjusted:
-                shared_params = difference_to_reference(shared_params, epoch_cells.reference.shared)
             jacobian = self.jacobian(epoch_cells, common_cells)
             noise_leverage = (
                 self.leverage(epoch_cells, common_cells, jacobian, independent_m2)
@@ -133,6 +135,51 @@ class Volumes(Aggregates):
         if common_covariance is not None:
             shared_part -= common_contributions(weights, (jacobians[0], jacobians[1]), common_covariance)
         return random_part, shared_part
+
+    def error_structure(self, cells: Bools, epoch: EpochRef) -> xr.Dataset:
+        """Return the change of a rectangle of cells (ny, nx) in an epoch, with its errors [m].
+
+        In the form of obsarray, after the project FIDUCEO (Mittaz et al., 2019): `error_correlation` is that
+        of the systematic errors of all pairs of cells, row after row. Cells without a change are NaN, and
+        their errors not correlated with others. Raises StationError if there are too many cells.
+        """
+        rows, columns = (np.flatnonzero(cells.any(axis=axis)) for axis in (1, 0))
+        count = len(rows) * len(columns)
+        if count > MAX_CELLS:
+            raise StationError(
+                f"the correlations of {count:,} cells do not fit the memory: select at most {MAX_CELLS:,},"
+                f" for example {int(MAX_CELLS**0.5)} x {int(MAX_CELLS**0.5)} with .isel(y=..., x=...)"
+            )
+        area = self.observe(cells, epoch)
+        seen = np.zeros(cells.shape, np.bool_) if area is None else area.cells
+        inside = seen[np.ix_(rows, columns)]
+        covariance_m2 = np.zeros((np.count_nonzero(inside),) * 2)
+        values = {name: np.full(inside.shape, np.nan) for name in (CHANGE, RANDOM, SYSTEMATIC)}
+        if area is not None:
+            covariance_m2 = self._systematic_covariance(area)
+            values[CHANGE][inside] = area.value_m
+            values[RANDOM][inside] = np.sqrt(area.random_m2[0])
+            values[SYSTEMATIC][inside] = np.sqrt(np.diag(covariance_m2))
+        correlation, index = np.eye(count), np.flatnonzero(inside)
+        correlation[np.ix_(index, index)] = _correlation(covariance_m2)
+        variables: dict[str, Any] = {name: (_DIMS, raster) for name, raster in values.items()}
+        variables[CORRELATION] = (("cell", "other_cell"), correlation, {"units": "1"})
+        grid = self.grid
+        dataset = xr.Dataset(variables, {"y": grid.y_m[rows], "x": grid.x_m[columns]})
+        dataset[CHANGE].attrs = {"units": "m", "unc_comps": [RANDOM, SYSTEMATIC]}
+        dataset[RANDOM].attrs = _error_attributes("random", [])
+        dataset[SYSTEMATIC].attrs = _error_attributes("err_corr_matrix", [CORRELATION])
+        return dataset
+
+    def _systematic_covariance(self, area: ObservedArea) -> Floats:
+        """Return the systematic covariance (n, n) of the cells of an area in one epoch [m²]: J C Jᵀ.
+
+        Source: equations.md, 6.2.
+        """
+        shared = shared_of(area.epochs, area.epochs[0], above_surface=area.above_surface)
+        if shared is None:
+            return np.zeros((len(area.value_m),) * 2)
+        return self.jacobian(area.epochs[0], area.cells).covariance(shared)
 
     def point_covariance(self, points_m: Floats, epoch: EpochRef) -> Floats:
         """Return the covariance (n, 3, 3) of map points (n, 3) in an epoch [m²]: shot, pose, tilt, air.
@@ -155,3 +202,23 @@ class Volumes(Aggregates):
         shot_m2 = shot_covariance(offset_m, np.array(params.axis), scanner)
         on_map = replace(params, plane=MAP_PLANE)
         return shot_m2 + shared_covariance(on_map, offset_m, epoch_cells.shared)
+
+
+def _error_attributes(form: str, parameters: list[str]) -> dict[str, Any]:
+    return {
+        "units": "m",
+        "pdf_shape": "gaussian",
+        "err_corr_1_dim": _DIMS,
+        "err_corr_1_form": form,
+        "err_corr_1_units": [],
+        "err_corr_1_params": parameters,
+    }
+
+
+def _correlation(covariance: Floats) -> Floats:
+    """Return the correlation matrix (n, n) of a covariance; where the variance is zero there is none."""
+    sigma = np.sqrt(np.diag(covariance))
+    scale = np.outer(sigma, sigma)
+    correlation: Floats = np.divide(covariance, scale, out=np.zeros_like(covariance), where=scale > 0)
+    np.fill_diagonal(correlation, 1.0)
+    return correlation

@@ -191,6 +191,13 @@ class HeightJacobian:
         ).astype(columns.dtype)
         return np.asarray(self.sight_tilt**2 * line_rad2[self.line - lines.start] + knot_m2)
 
+    def covariance(self, shared: SharedParameters) -> Floats:
+        """Return the systematic covariance of cell heights (n, n) [m²]: J C Jᵀ plus that of line tilts."""
+        design = self.to_sparse()
+        lines = self.line_tilt_to_sparse() @ knot_interpolation(self.params).residual_projector
+        line_m2 = (lines * line_tilt_variance(self.params, shared)) @ lines.T
+        return np.asarray(design @ (design @ shared.covariance).T + line_m2, np.float64)
+
     def _columns(self) -> Reals:
         """Return the non-zero columns of J (16, n), in the order of `ParameterLayout.active_parameters`."""
         pose_count = len(GLOBAL)
