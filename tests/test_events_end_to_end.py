@@ -14,7 +14,7 @@ DEPOSIT_SCAN = 10  # the first scan that is searched is the next
 
 
 @pytest.mark.integration
-def test_debris_2_km_away_is_told_by_the_second_scan_with_its_volume(tmp_path):
+def test_debris_2_km_away_is_found_by_the_second_scan_with_its_volume(tmp_path):
     station = full_resolution(named("disturbed", SCANS, seed=2))
     sector = replace(
         station,
