@@ -22,13 +22,7 @@ from station.inbox.journal_reader import JournalReader
 from station.inbox.listing import ScanFile
 from station.processing.epoch_recorder import EpochRecorder
 from station.processing.epoch_scalars import air_key, log_metrics, scalar_variables
-from station.processing.pipeline import (
-    AdjustmentInputs,
-    has_brightness,
-    holdout_statistics,
-    measure,
-    usual_motion,
-)
+from station.processing.pipeline import has_brightness, holdout_statistics, measure, usual_motion
 from station.processing.scans.adjusted_scan import grid_and_adjust, is_usable, load_viewing_geometry
 from station.processing.scans.epoch_inputs import load_scan_inputs
 from station.processing.scans.open_scans import open_scan_for
@@ -49,8 +43,7 @@ from station.readers.raster import read_geotiff
 from station.readers.scan import reject_future
 from station.scan_names import scan_id
 from station.science.adjustment import ground_classes
-from station.science.adjustment.joint import Adjustment
-from station.science.analysis import inclination_check, verdict
+from station.science.analysis import verdict
 from station.science.geometry.terrain import nodes_from_means
 
 
@@ -231,7 +224,7 @@ def _compute_epoch(
     components = usual_motion(reference, start.timestamp()) if reference else VarianceComponents()
     errors = scan_errors(inputs, gridder, viewing, adjustment, components)
     stored_parameters = errors.stored_parameters(viewing)
-    log_warnings, clock_scalars = _check_log(adjustment, reference)
+    log_check = scan_on_grid.log_check
     measurement = measure(
         gridder, inputs.geometry, errors.shared, viewing, adjustment, errors.factors, errors.positions
     )
@@ -246,11 +239,14 @@ def _compute_epoch(
             "systematic_variance_factor": errors.factors.systematic,
         }
         scalars |= dict(zip(LEVERAGE_VARIABLES, adjustment[1].leverage_m2, strict=True))
+    if log_check is not None and log_check.clock_offset is not None:
+        scalars["log_clock_offset"] = log_check.clock_offset.offset_s
+        scalars["log_clock_offset_uncertainty"] = log_check.clock_offset.sigma_s
     if errors.positions is not None:
         scalars["position_count"] = float(len(errors.positions.baseline_m))
     verdict_name, reason = verdict.assess(
         flag,
-        [*inputs.warnings, *log_warnings, *registration_warnings],
+        [*inputs.warnings, *(log_check.warnings if log_check else ()), *registration_warnings],
         measurement,
         viewing,
         attempt,
@@ -269,7 +265,7 @@ def _compute_epoch(
         redundancy=adjustment[1].redundancy if adjustment else None,
         verdict=verdict_name,
         verdict_reason=reason,
-        scalars=scalars | clock_scalars | registration,
+        scalars=scalars | registration,
         provenance={
             "scan_sha256": scan_sha256,
             "log_sha256": sha256_log(scan),
@@ -282,28 +278,6 @@ def _compute_epoch(
             **inputs.provenance,
         },
     )
-
-
-def _check_log(
-    adjustment: tuple[AdjustmentInputs, Adjustment] | None, reference: Reference | None
-) -> tuple[list[str], dict[str, float]]:
-    """Return warnings about a scan's inclination log checked against the ground, and its clock offset [s]."""
-    if adjustment is None or reference is None:
-        return [], {}
-    prediction = inclination_check.leave_log_out(adjustment[0].lines, adjustment[1])
-    if prediction is None:
-        return [], {}
-    warnings = inclination_check.sensor_warnings(prediction)
-    clock_offset = inclination_check.estimate_clock_offset(
-        prediction, reference.components, len(reference.scan_ids)
-    )
-    trim_heap()
-    if clock_offset is None:
-        return warnings, {}
-    return warnings + clock_offset.warnings(), {
-        "log_clock_offset": clock_offset.offset_s,
-        "log_clock_offset_uncertainty": clock_offset.sigma_s,
-    }
 
 
 def _identical_epoch(series: Series, epoch: epochs.Epoch) -> epochs.EpochFile | None:

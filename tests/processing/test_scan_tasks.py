@@ -219,12 +219,48 @@ def test_scan_without_its_absolute_log_is_unusable(folder, keep, reason):
 
 
 @pytest.mark.integration
+def test_a_log_that_the_ground_contradicts_is_not_used(folder):
+    """A sensor that is off by 0.03° has no effect on the state of the scanner: it is that without a log."""
+    site = edited_site(folder)
+    scans = [scan_file(site, path) for path in sorted(site.scans.inbox.glob("*.laz"))]
+    reference_tasks.build_reference_version(site, scans[:1], "1", lambda: None)
+
+    def state():
+        result, sigma = process(folder)
+        path = site.station.data / result.epoch
+        with netCDF4.Dataset(path) as file:
+            estimate = np.array(file["shared_parameter"][0])
+        path.unlink()
+        return result, estimate, sigma
+
+    good, *_ = state()
+    assert good.verdict == "good"
+
+    def off(rows):
+        return [
+            f"{t},{float(roll) + 0.03:.3f},{pitch}" for t, roll, pitch in (row.split(",") for row in rows)
+        ]
+
+    change_log(folder, off)
+    result, estimate, sigma = state()
+    assert result.verdict == "degraded"
+    assert re.search(
+        r"the inclination sensor is off by 0\.0[23]\d degrees, .*: its log is not used", result.reason
+    )
+    log_file(folder).unlink()
+    _, estimate_without, sigma_without = state()
+    assert np.abs((estimate - estimate_without) / sigma_without).max() < 0.1
+    np.testing.assert_allclose(sigma, sigma_without, rtol=0.25)  # the variance factor is that of other points
+
+
+@pytest.mark.integration
 def test_swapped_axes_of_the_log_are_named(folder):
     """The mount of the simulated station rolls by 2.1° and pitches by -1.3°."""
     change_log(folder, lambda rows: ["{0},{2},{1}".format(*row.split(",")) for row in rows])
     result, _ = process(folder)
     assert result.verdict == "degraded"
     assert "axes of the inclination log are wrong: roll and pitch are swapped" in result.reason
+    assert result.reason.endswith("it is not used")
     assert "in the SOP 2.10, -1.30" in result.reason
     (finding,) = site_check._newest_scan(read_site(folder / "site.toml"))
     assert finding["level"] == "warning"

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -24,6 +24,7 @@ from station.processing.site_files import polygon_cells, series_for
 from station.processing.workers.worker_process import Progress, trim_heap
 from station.quantities import Bools, Reference, ScanGeometry
 from station.science.adjustment.joint import Adjustment
+from station.science.analysis.inclination_check import LogCheck, check_log
 from station.science.gridding.gridder import Gridder
 from station.science.gridding.viewing_geometry import ViewingGeometry
 from station.science.gridding.viewpoints import seen_from_viewpoints
@@ -38,6 +39,7 @@ class AdjustedScan:
     """A gridded scan with its adjustment to the reference, if there is one.
 
     `inputs` have the pose, and `viewing` the variances of shots, with which it was gridded and adjusted.
+    `log_check` is None without a log, and without a usable adjustment.
     """
 
     inputs: ScanInputs
@@ -45,6 +47,7 @@ class AdjustedScan:
     gridder: Gridder
     point_count: int
     adjustment: tuple[AdjustmentInputs, Adjustment] | None
+    log_check: LogCheck | None = None
 
 
 def grid_and_adjust(
@@ -52,10 +55,32 @@ def grid_and_adjust(
 ) -> AdjustedScan:
     """Return a scan on the grid, adjusted to the reference as `viewing` shows it.
 
+    If the ground contradicts the inclination log, the scan is adjusted again without it.
+    Raises ScanError if no point falls on the grid.
+    """
+    scan = _adjusted_with_log(site, opened, inputs, viewing, progress)
+    if scan.adjustment is None or scan.viewing is None or scan.inputs.is_given:
+        return scan
+    adjustment_inputs, adjustment = scan.adjustment
+    if not is_usable(adjustment):
+        return scan
+    check = check_log(adjustment_inputs.lines, adjustment, scan.viewing.reference)
+    if check is not None and check.warnings:
+        without_log = replace(adjustment_inputs, log=None)
+        adjustment = adjust_to_reference(scan.gridder, scan.inputs.geometry, without_log, scan.viewing)
+        scan = replace(scan, adjustment=(without_log, adjustment))
+    trim_heap()
+    return replace(scan, log_check=check)
+
+
+def _adjusted_with_log(
+    site: Site, opened: OpenScan, inputs: ScanInputs, viewing: ViewingGeometry | None, progress: Progress
+) -> AdjustedScan:
+    """Return a scan on the grid, adjusted to the reference with its inclination log.
+
     If the scanner turned so far that its points lie beside the ground they hit, as after a season, they are
     gridded a second time, at the estimated pose: ground does not respond to a
     motion of the beams as the slope of the reference tells, so that the first estimate is off.
-    Raises ScanError if no point falls on the grid.
     """
 
     def gridded(inputs: ScanInputs) -> tuple[Gridder, int]:

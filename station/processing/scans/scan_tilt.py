@@ -51,13 +51,12 @@ def log_of_scan(
             if site.inclination.required:
                 warnings.append("inclination log missing")
             return None
-        log = _clean_log(site, raw, warnings)
+        log = _clean_log(site, raw, rotation, warnings)
     except ScanError as error:
         warnings.append(f"inclination log unusable: {error}")
         return None
     if log is None:
         return None
-    warnings += inclination.axes_warnings(log, rotation)
     if track is None:
         return log
     log = align_gps_week(log, float(track.time_s[0]))
@@ -187,8 +186,10 @@ def _converted_log(site: Site, reader: ScanReader) -> tuple[Path, ...]:
     return (path,) if path.is_file() else ()
 
 
-def _clean_log(site: Site, raw: InclinationLog, warnings: list[str]) -> InclinationLog | None:
-    """Return the valid rows of a log; None if they are too few or the sensor was saturated."""
+def _clean_log(
+    site: Site, raw: InclinationLog, rotation: Floats, warnings: list[str]
+) -> InclinationLog | None:
+    """Return the valid rows of a log; None if they are too few, saturated, or of wrong axes."""
     assert site.inclination is not None  # noqa: S101 - checked by the caller
     range_rad = site.instrument.inclination_range_rad
     log, dropped = inclination.clean(raw, range_rad)
@@ -206,7 +207,9 @@ def _clean_log(site: Site, raw: InclinationLog, warnings: list[str]) -> Inclinat
         return None
     if dropped > 0.1 * (dropped + rows):
         warnings.append(f"inclination log bad: {dropped} of {dropped + rows} rows rejected")
-    return log
+    wrong_axes = inclination.axes_warnings(log, rotation)
+    warnings += [f"{message}: it is not used" for message in wrong_axes]
+    return None if wrong_axes else log
 
 
 def _overlaps(site: Site, log: InclinationLog, track: AzimuthTrack, warnings: list[str]) -> bool:

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import linalg, special
 
-from station.quantities import Bools, Floats, VarianceComponents
+from station.quantities import Bools, Floats, Reference, VarianceComponents
 from station.science.adjustment.joint import Adjustment
 from station.science.adjustment.prior import BIAS_MODES, LineTimes, tilt_covariance
 
@@ -46,7 +46,15 @@ class ClockOffset:
         ):
             return []
         offset_text = f"{abs(self.offset_s):.1f} s {'late' if self.offset_s > 0 else 'early'}"
-        return [f"inclination log {offset_text} (± {self.sigma_s:.1f} s), compared with the ground"]
+        return [f"inclination log {offset_text} (± {self.sigma_s:.1f} s) by the ground: it is not used"]
+
+
+@dataclass(frozen=True)
+class LogCheck:
+    """What the ground says against the log of a scan, and its clock offset, None if it is too short."""
+
+    warnings: list[str]
+    clock_offset: ClockOffset | None
 
 
 @dataclass(frozen=True)
@@ -66,14 +74,24 @@ class LogPrediction:
     weighted_residual: Floats
 
 
+def check_log(lines: LineTimes, adjustment: Adjustment, reference: Reference) -> LogCheck | None:
+    """Return the check of the log that an adjustment used; None if it used none."""
+    prediction = leave_log_out(lines, adjustment)
+    if prediction is None:
+        return None
+    clock_offset = estimate_clock_offset(prediction, reference.components, len(reference.scan_ids))
+    clock_warnings = clock_offset.warnings() if clock_offset else []
+    return LogCheck(sensor_warnings(prediction) + clock_warnings, clock_offset)
+
+
 def leave_log_out(lines: LineTimes, adjustment: Adjustment) -> LogPrediction | None:
-    """Return the prediction of the log by an adjustment without it; None if the scan has no log.
+    """Return the prediction of the log by an adjustment without it; None without a log of the scan's time.
 
     With m and K the adjusted tilt and its covariance, R the covariance of noise and sensor errors, and r the
     log minus m, the difference to the prediction without the log is R (R - K)⁻¹ r: the leave-one-out
     residual, for all lines at once.
     """
-    if (log := adjustment.log) is None:
+    if (log := adjustment.log) is None or not log.weight.any():
         return None
     order = np.argsort(lines.time_s)
     order = order[log.weight[order] > 0]
@@ -115,10 +133,16 @@ def sensor_warnings(prediction: LogPrediction) -> list[str]:
         for prediction in (~biases, biases)
     )
     chosen = biases if bias_p < cyclic_p else ~biases
-    largest_deg = np.degrees(np.abs(prediction.error_modes[:, chosen] @ estimate[chosen]).max())
+    # Without the prior, which it exceeds.
+    size = (
+        np.linalg.pinv(variance[np.ix_(chosen, chosen)], MIN_OBSERVABILITY, hermitian=True) @ estimate[chosen]
+    )
+    largest_deg = np.degrees(np.abs(prediction.error_modes[:, chosen] @ size).max())
     if bias_p < cyclic_p:
-        return [f"the inclination sensor is off by {largest_deg:.3f} degrees, beyond its usual bias"]
-    return [f"the inclination sensor's cyclic error differs by {largest_deg:.3f} degrees from its usual one"]
+        deviation = f"is off by {largest_deg:.3f} degrees, beyond its usual bias"
+    else:
+        deviation = f"has a cyclic error that differs by {largest_deg:.3f} degrees from its usual one"
+    return [f"the inclination sensor {deviation}: its log is not used"]
 
 
 def _p_value(estimate: Floats, variance: Floats) -> float:
