@@ -227,7 +227,11 @@ def _knots(patches: Patches, shares: Floats) -> tuple[sparse.csr_array, list[Flo
 
 
 def _position(patches: Patches) -> tuple[Reals, Reals, Reals]:
-    """Return the offset east and north of the scanner, and the distance of patches (n,) [m]."""
+    """Return the offset east and north of the scanner, and the distance of patches (n,) [m].
+
+    On a face the distance is the height above its foot (`patches.distance_along_line`). Trends only need
+    coordinates that vary smoothly over the ground.
+    """
     distance_m = (patches.range_bin + 0.5) * patches.bin_m
     azimuth_rad = patches.jacobian.params.start_rad + TILT_KNOT_RAD * patches.jacobian.knot_position
     east_m, north_m = (distance_m * wave(azimuth_rad) for wave in (np.sin, np.cos))

@@ -46,7 +46,7 @@ class Patches:
     """Patches (m,): cells of one line group, range bin and ground class, one observation each."""
 
     jacobian: HeightJacobian  # of the mean height of the patch
-    range_bin: Ints  # (m,) index of the range bin
+    range_bin: Ints  # (m,) index of the bin along the scan line, see `distance_along_line`
     height_m: Floats  # (m,) above the scanner
     ground_class: Ints  # (m,)
     residual_m: Floats  # (m,) above the reference surface
