@@ -22,8 +22,8 @@ from benchmarks.accuracy_measures import (
     Records,
     StationErrors,
     common_reason,
+    reason_share,
     summarise,
-    told_share,
     verdict_shares,
 )
 from benchmarks.accuracy_rows import ROWS, Row
@@ -87,7 +87,7 @@ def figures_of(row: Row, measures: list[Measures]) -> Figures:
     figures = summarise(records, measures[0][2]) | {
         "verdicts": verdict_shares(verdicts),
         "reason": common_reason(verdicts),
-        "told": told_share(verdicts, row.told),
+        "reason_share": reason_share(verdicts, row.reason),
     }
     return figures | {"missed": missed(row, figures)}
 

@@ -223,6 +223,6 @@ def common_reason(verdicts: list[tuple[str, str]]) -> str:
     return counts.most_common(1)[0][0] if counts else ""
 
 
-def told_share(verdicts: list[tuple[str, str]], pattern: str) -> float:
+def reason_share(verdicts: list[tuple[str, str]], pattern: str) -> float:
     """Return the share of the scans with a reason that matches a pattern."""
     return float(np.mean([re.search(pattern, reason) is not None for _, reason in verdicts]))

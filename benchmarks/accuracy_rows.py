@@ -24,7 +24,7 @@ class Row:
     z_bands: bool = False  # also in every band of range
     significant: Limits | None = None  # share of unchanged cells flagged as changed
     good: bool = False  # at least 95 % of the verdicts are "good"
-    told: str = ""  # pattern: at least 95 % of the scans have a matching reason
+    reason: str = ""  # pattern: at least 95 % of the scans have a matching reason
     retained: bool = False  # the share of the change that is retained is .9 to 1.1, or sigma covers the error
     sign: bool = False  # the mean error does not keep its sign beyond chance
     wider: bool = False  # sigma of 100 m boxes is larger than before
@@ -65,7 +65,7 @@ ROWS = {
         Row("airborne", "0.1 % of the echoes from the air", "airborne", (0.02, 0.04)),
         Row(
             "airborne-heavy", "1 % of the echoes from the air, and clouds", "airborne-heavy", SNOW_M,
-            told="echo|air",
+            reason="echo|air",
         ),
         Row("snow", "0.4 m of snow", "snowfall", SNOW_M, SNOW_AIM_M, good=True, second_half=True),
         Row(
@@ -78,7 +78,7 @@ ROWS = {
         Row(
             "snow-no-brightness", "the same without brightness", "snow-no-brightness",
             NO_BRIGHTNESS_M, NO_BRIGHTNESS_AIM_M,
-            z=(0.8, 1.4), told="no brightness", sign=True, second_half=True,
+            z=(0.8, 1.4), reason="no brightness", sign=True, second_half=True,
         ),
         Row("snow-poor", "0.4 m of snow, far ridge and hut", "snowfall", second_half=True, poor=True),
         Row("ice-refraction", "k over ice differs by 0.1", "ice-refraction", ICE_M, ICE_AIM_M, good=True),
@@ -98,7 +98,7 @@ ROWS = {
         *(
             Row(
                 f"log-{fault}", title, f"log-{fault}",
-                z=LOG_Z, told="log", wider=fault != "time", second_half=True,
+                z=LOG_Z, reason="log", wider=fault != "time", second_half=True,
             )
             for fault, title in (
                 ("cut", "inclination log ends early"),

@@ -35,7 +35,7 @@ def missed(row: Row, figures: Figures) -> list[str]:
         *((f"z {scale}", z[scale], row.z) for scale in SCALES),
         ("significant", figures["significant"], row.significant),
         ("good", figures["verdicts"]["good"], (SHARE, 1.0) if row.good else None),
-        ("reason", figures["told"], (SHARE, 1.0) if row.told else None),
+        ("reason", figures["reason_share"], (SHARE, 1.0) if row.reason else None),
         ("sign", figures["sign_chance"], (CHANCE, 1.0) if row.sign else None),
         ("wider", figures.get("sigma_ratio", math.nan), (WIDER, math.inf) if row.wider else None),
     ]

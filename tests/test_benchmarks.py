@@ -158,7 +158,7 @@ def records_of(factor, true_m, retained=1.0):
 
 def figures_of_row(records, good=1.0, reason_share=1.0):
     verdicts = {"good": good, "degraded": 1 - good, "unusable": 0.0}
-    return summarise(records, 0) | {"verdicts": verdicts, "reason": "", "told": reason_share}
+    return summarise(records, 0) | {"verdicts": verdicts, "reason": "", "reason_share": reason_share}
 
 
 def test_accuracy_figures_are_those_of_the_simulated_errors():

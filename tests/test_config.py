@@ -138,7 +138,7 @@ def test_data_and_inbox_must_be_separate(tmp_path, data):
         ),
     ],
 )
-def test_faults_are_told_once_and_without_python_classes(tmp_path, more, message):
+def test_faults_are_reported_once_and_without_python_classes(tmp_path, more, message):
     with pytest.raises(ConfigError) as error:
         read(tmp_path, GOOD + more)
     assert "1 to fix" in str(error.value)

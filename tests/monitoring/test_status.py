@@ -97,7 +97,7 @@ def test_status_before_the_first_start(make_site):
 
 
 def test_status_tells_why_the_service_pauses(make_site):
-    """For instance for a fault of the store that status itself cannot see; what it sees is told once."""
+    """For instance for a fault of the store that status itself cannot see; what it sees is reported once."""
     site = make_site()
     with exclusive_lock(site.station.data) as folder:
         for reason in ("epoch.nc: damaged\nat byte 7", f"the inbox {site.scans.inbox} cannot be listed: no"):

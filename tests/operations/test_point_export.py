@@ -146,7 +146,7 @@ def test_m3c2_of_py4dgeo_finds_the_stored_change(processed, tmp_path):
     assert 0.2 < 1.4826 * np.median(np.abs(z)) < 1.5
 
 
-def test_a_span_without_epochs_and_a_missing_scan_are_told(processed, tmp_path):
+def test_a_span_without_epochs_and_a_missing_scan_are_reported(processed, tmp_path):
     site = read_site(processed / "site.toml")
     with pytest.raises(StationError, match="no epoch in this span"):
         list(export_points(site, Span.parse("2030-01-01", None), tmp_path))

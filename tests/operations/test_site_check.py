@@ -105,13 +105,13 @@ def test_alarms_of_unknown_areas_and_without_their_library_are_faults(folder, mo
     assert "tls-station[alarms]" in missing
 
 
-def test_areas_on_stable_ground_are_told(folder):
+def test_areas_on_stable_ground_are_reported(folder):
     shutil.copy(folder / "areas.geojson", folder / "stable.geojson")
     messages = [finding["message"] for finding in site_check._polygons(read_site(folder / "site.toml"))]
     assert "100% of the area glacier is declared stable: its change is adjusted away" in messages
 
 
-def test_sop_in_millimetres_is_told(folder):
+def test_sop_in_millimetres_is_reported(folder):
     site = read_site(folder / "site.toml")
     origin_m = site_check.map_position(site)
     far_off_m = (origin_m[0] + 1700, origin_m[1], origin_m[2] + 2000)
@@ -131,7 +131,7 @@ def test_sop_in_millimetres_is_told(folder):
         ({}, {"beam_divergence_mrad": 0.00012}, "scanner.beam_divergence_mrad = 0.00012, but a riegl"),
     ],
 )
-def test_unusual_settings_are_told(folder, map_section, scanner, message):
+def test_unusual_settings_are_reported(folder, map_section, scanner, message):
     site = read_site(folder / "site.toml")
     site = site.model_copy(
         update={
@@ -160,7 +160,7 @@ def test_tilt_of_sop_and_log_are_compared(folder):
     assert list(site_check._inclination(read_site(folder / "site.toml"))) == []
 
 
-def test_an_absolute_log_under_an_sop_that_contains_the_tilt_is_told(folder):
+def test_an_absolute_log_under_an_sop_that_contains_the_tilt_is_reported(folder):
     path = folder / "site.toml"
     path.write_text(path.read_text().replace('mode = "relative"', 'mode = "absolute"'))
     (finding,) = site_check._inclination(read_site(path))
@@ -170,14 +170,14 @@ def test_an_absolute_log_under_an_sop_that_contains_the_tilt_is_told(folder):
     assert list(site_check._inclination(read_site(path))) == []
 
 
-def test_weather_log_of_another_time_zone_is_told():
+def test_weather_log_of_another_time_zone_is_reported():
     (message,) = warnings(plausibility.weather_time_findings(time.time() + 7200))
     assert "2.0 h in the future" in message
     assert not warnings(plausibility.weather_time_findings(time.time() - 60))
 
 
 @pytest.mark.skipif(os.geteuid() != 0, reason="tells root what another user may not do")
-def test_rights_of_the_user_of_the_service_are_told_to_root(folder):
+def test_rights_of_the_user_of_the_service_are_reported_to_root(folder):
     site = read_site(folder / "site.toml")
     (folder / "sop.dat").chmod(0o600)
     messages = warnings(plausibility.rights_findings(site, [folder / "sop.dat"], "nobody"))
@@ -245,7 +245,7 @@ def test_scan_without_brightness_is_a_warning_that_says_what_it_costs(folder):
 
 
 @pytest.mark.integration
-def test_tilt_in_the_points_that_nobody_uses_is_told(folder):
+def test_tilt_in_the_points_that_nobody_uses_is_reported(folder):
     path = folder / "site.toml"
     path.write_text(re.sub(r"(?ms)^\[inclination\].*?(?=^\[)", "", path.read_text()))
     site = read_site(path)

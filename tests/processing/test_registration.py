@@ -41,13 +41,13 @@ def test_points_on_the_map_need_a_place_to_count_rotations_from(registered):
 
 
 @pytest.mark.parametrize(
-    ("use", "up_m", "is_told"), [("given", 0.9, True), ("given", 0.7, False), ("start", 9.0, False)]
+    ("use", "up_m", "is_reported"), [("given", 0.9, True), ("given", 0.7, False), ("start", 9.0, False)]
 )
-def test_a_given_registration_is_warned_of_beyond_three_sigma(registered, use, up_m, is_told):
+def test_a_given_registration_is_warned_of_beyond_three_sigma(registered, use, up_m, is_reported):
     """The own sigma is that of the registration: together 0.354 m, three times that is 1.06 m."""
     estimate = np.array([0, 0, 0, 0, 0, up_m * 1.25, 0, 0])
     adjustment = SimpleNamespace(estimate=estimate, covariance=np.eye(8) * 0.25**2)
     scalars, warnings = registration_difference(registered(use), SimpleNamespace(matrices=[]), adjustment)
     assert scalars["registration_translation"] == pytest.approx(up_m * 1.25)
     assert scalars["registration_rotation"] == 0.0
-    assert bool(warnings) == is_told
+    assert bool(warnings) == is_reported

@@ -140,7 +140,7 @@ def test_station_restarts_without_an_optional_file_only_if_it_was_good_before(si
     assert len(usable_site(read_site(site.path)).input_faults) == 1
 
 
-def test_faults_are_told_in_status_page_and_alarms(site, tmp_path):
+def test_faults_are_reported_in_status_page_and_alarms(site, tmp_path):
     usable_site(site, save=True)
 
     def faults():

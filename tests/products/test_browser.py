@@ -347,7 +347,7 @@ def test_a_link_leads_to_the_curve_of_a_place(tab, address, folder):
 
 
 def test_page_of_several_stations_reads_their_pages(tab, folder, tmp_path):
-    """From a folder: a row each, its state and newest map; a station without a page is told."""
+    """From a folder: a row each, its state and newest map; a station without a page is named."""
     station_id = json.loads((folder / "summary.js").read_text().partition("[")[2].partition("]")[0])
     stations = [(station_id, EVIL, folder), ("gone", "Far away", tmp_path / "nothing")]
     write_stations(tmp_path / "all" / "index.html", stations, "en")

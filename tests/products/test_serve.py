@@ -192,7 +192,7 @@ def test_several_stations_are_served_below_one_page(site, tmp_path):
 
 
 @pytest.mark.parametrize("missing", ["starlette", "uvicorn"])
-def test_missing_library_is_told_instead_of_an_address(write_site, monkeypatch, capsys, missing):
+def test_missing_library_is_reported_instead_of_an_address(write_site, monkeypatch, capsys, missing):
     site = write_site()
     page = site.parent / "data" / "page"
     page.mkdir(parents=True)

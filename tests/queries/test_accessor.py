@@ -181,7 +181,7 @@ def test_change_between_two_epochs_and_at_a_point(ds):
         ds.station.at(631_999.0, 5_185_495.0)
 
 
-def test_unknown_names_and_datasets_are_told(folder, ds):
+def test_unknown_names_and_datasets_are_reported(folder, ds):
     with pytest.raises(StationError, match=r"no area 'glacier' .* areas: square"):
         station.volume(folder, "glacier", 0)
     with pytest.raises(ValueError, match="no cell of the grid"):

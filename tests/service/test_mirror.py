@@ -62,7 +62,7 @@ def test_the_files_of_the_mirror_follow_the_epochs(site):
 
 
 @pytest.mark.integration
-def test_a_fault_of_one_format_is_told_and_the_others_are_renewed(site):
+def test_a_fault_of_one_format_is_reported_and_the_others_are_renewed(site):
     (site.path.parent / "served").mkdir()
     (site.path.parent / "served" / "test.ncml").write_text("mine")
     assert renew(site).startswith("ncml: ")

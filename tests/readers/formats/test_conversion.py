@@ -50,7 +50,7 @@ def test_the_converted_scan_is_read_under_its_own_name_and_removed(tmp_path, wri
         ("import os, signal; os.kill(os.getpid(), signal.SIGSEGV)", InconclusiveError, "exit status -11"),
     ],
 )
-def test_commands_that_fail_are_told(tmp_path, script, error, message):
+def test_commands_that_fail_are_reported(tmp_path, script, error, message):
     with pytest.raises(error, match=message):
         convert(command(script), tmp_path / "a.rxp", tmp_path / "a.laz", **LIMITS)
 

@@ -122,7 +122,7 @@ def test_wrong_axes_of_a_log_are_named(roll_deg, pitch_deg, fault):
 
 
 @pytest.mark.parametrize("roll_deg", [0.0, 0.06])
-def test_axes_of_a_level_mount_cannot_be_told(roll_deg):
+def test_axes_of_a_level_mount_cannot_be_recognised(roll_deg):
     mount = Rotation.from_euler("x", roll_deg, degrees=True).as_matrix()
     noise = np.random.default_rng(6).normal(0, NOISE, (2, 900))
     log = inclination_log(noise[0] - np.radians(roll_deg + 0.03), noise[1] + np.radians(0.03))
