@@ -15,7 +15,7 @@ from station.archive.netcdf_layout import Series, decode_text
 from station.archive.series.epoch_reader import contiguous_runs, read_source
 from station.archive.series.index import list_epochs
 from station.config import Site
-from station.science.geometry.inclination import NO_CYCLIC_ERROR, CyclicError
+from station.science.geometry.cyclic_error import NO_CYCLIC_ERROR, CyclicError
 
 FOLDER = "sop_tilt_offset"
 

@@ -39,6 +39,7 @@ from station.readers.scan import utc_interval
 from station.readers.sop import read_matrix
 from station.readers.weather import VALID_RANGES, interpolate_air, read_weather
 from station.science.geometry import inclination, pose
+from station.science.geometry.cyclic_error import fit_cyclic_error
 from station.sections.inputs import ScansSection, WeatherSection
 
 for library in ("pye57", "pyogrio"):  # extras, whose own memory does not count
@@ -221,7 +222,7 @@ def check_inclination(path, _dice):
         return
     time_s = np.linspace(0.0, 60.0, 100)
     track = AzimuthTrack(time_s, np.linspace(2.6, 2.9, 100))
-    zero = inclination.fit_cyclic_error(log, track, 1.4e-4)
+    zero = fit_cyclic_error(log, track, 1.4e-4)
     tilt = inclination.relative_tilt(log, track, zero, 1.4e-4, None, filtered=True)
     assert np.isfinite(tilt.mean_roll_rad)
     assert np.isfinite(tilt.mean_pitch_rad)

@@ -32,7 +32,7 @@ from station.quantities import (
 from station.science.adjustment.ground_classes import SnowTest
 from station.science.adjustment.prior import line_times, log_only_covariance
 from station.science.geometry.air import air_correction
-from station.science.geometry.inclination import NO_CYCLIC_ERROR
+from station.science.geometry.cyclic_error import NO_CYCLIC_ERROR
 from station.science.geometry.pose import scanner_to_local_map, scanner_to_map_by_origin
 from station.science.gridding import cell_estimates, reference_cells
 from station.science.gridding.reference_surface import build_surface, centre_reference

@@ -20,7 +20,7 @@ from station.processing.scans.scan_inputs import MEAN_TILT, ScanInputs, inputs_i
 from station.quantities import Viewpoint
 from station.readers.sop import valid_sop
 from station.science.adjustment import prior
-from station.science.geometry.inclination import NO_CYCLIC_ERROR
+from station.science.geometry.cyclic_error import NO_CYCLIC_ERROR
 from station.science.uncertainty import parameters
 
 

@@ -44,7 +44,8 @@ from station.quantities import (
 )
 from station.science.adjustment import prior
 from station.science.geometry.air import air_correction
-from station.science.geometry.inclination import NO_CYCLIC_ERROR, TiltRecord
+from station.science.geometry.cyclic_error import NO_CYCLIC_ERROR
+from station.science.geometry.inclination import TiltRecord
 from station.science.uncertainty import parameters
 
 MEAN_TILT = "one mean tilt for the whole scan"

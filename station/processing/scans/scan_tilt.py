@@ -20,7 +20,8 @@ from station.readers.inclination import align_gps_week, read_inclination
 from station.readers.scan import ScanReader
 from station.scan_names import scan_stem
 from station.science.geometry import inclination
-from station.science.geometry.inclination import NO_CYCLIC_ERROR, CyclicError, TiltRecord
+from station.science.geometry.cyclic_error import NO_CYCLIC_ERROR, CyclicError, fit_cyclic_error
+from station.science.geometry.inclination import TiltRecord
 from station.sections.inputs import SopSection
 
 MIN_LOG_COVERAGE = 0.97  # of the scan duration that a complete log covers
@@ -257,5 +258,5 @@ def _load_earlier_log(site: Site, sop: SopSection) -> tuple[InclinationLog | Non
 
 def _fit_tilt_offset(log: InclinationLog, track: AzimuthTrack | None, sigma_rad: float) -> CyclicError:
     if track is not None:
-        return inclination.fit_cyclic_error(log, track, sigma_rad)
+        return fit_cyclic_error(log, track, sigma_rad)
     return CyclicError((float(log.roll_rad.mean()), 0.0, 0.0), (float(log.pitch_rad.mean()), 0.0, 0.0))

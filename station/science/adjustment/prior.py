@@ -17,7 +17,8 @@ from station.quantities import (
 )
 from station.science.adjustment.line_tilt import LineTiltPrior
 from station.science.adjustment.normal_equations import LineInclination, StatePrior
-from station.science.geometry.inclination import NO_CYCLIC_ERROR, SENSOR_STEP_RAD, CyclicError, TiltRecord
+from station.science.geometry.cyclic_error import NO_CYCLIC_ERROR, CyclicError
+from station.science.geometry.inclination import SENSOR_STEP_RAD, TiltRecord
 from station.science.uncertainty.jacobian import sight_tilt_of
 from station.science.uncertainty.parameters import (
     GLOBAL,

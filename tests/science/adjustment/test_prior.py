@@ -9,7 +9,8 @@ from scipy.spatial.transform import Rotation
 
 from station.quantities import AzimuthTrack, InclinationLog, TiltSeries, VarianceComponents
 from station.science.adjustment import prior, variance_components
-from station.science.geometry.inclination import NO_CYCLIC_ERROR, CyclicError, TiltRecord, relative_tilt
+from station.science.geometry.cyclic_error import NO_CYCLIC_ERROR, CyclicError
+from station.science.geometry.inclination import TiltRecord, relative_tilt
 from station.science.uncertainty import parameters
 from station.science.uncertainty.jacobian import height_jacobian
 

@@ -12,7 +12,7 @@ from station.science.adjustment import prior
 from station.science.adjustment.joint import Adjustment
 from station.science.adjustment.normal_equations import LineInclination
 from station.science.analysis import inclination_check
-from station.science.geometry.inclination import CyclicError
+from station.science.geometry.cyclic_error import CyclicError
 from station.science.uncertainty.parameters import GLOBAL, ParameterLayout
 
 PARAMS = ParameterLayout(math.radians(60.0), 120, full_circle=False)  # 600 line groups

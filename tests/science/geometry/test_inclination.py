@@ -10,7 +10,13 @@ from scipy.spatial.transform import Rotation
 
 from station.quantities import AzimuthTrack, InclinationLog
 from station.science.geometry import inclination
-from station.science.geometry.inclination import NO_CYCLIC_ERROR, CyclicError
+from station.science.geometry.cyclic_error import (
+    NO_CYCLIC_ERROR,
+    CyclicError,
+    clock_offset,
+    fit_cyclic_error,
+    head_azimuth,
+)
 
 STEP = math.radians(0.001)
 NOISE = math.radians(0.008)
@@ -168,8 +174,8 @@ def test_cyclic_error_is_recovered_from_one_turn():
     rng = np.random.default_rng(2)
     track = AzimuthTrack(np.array([0.0, 2770.0]), np.array([0.0, 2 * math.pi]))
     time_s = np.arange(0.0, 2770.0)
-    roll, pitch = CYCLIC_ERROR.at(inclination.head_azimuth(track, time_s))
-    fitted = inclination.fit_cyclic_error(
+    roll, pitch = CYCLIC_ERROR.at(head_azimuth(track, time_s))
+    fitted = fit_cyclic_error(
         inclination_log(
             roll + rng.normal(0, NOISE, len(roll)), pitch + rng.normal(0, NOISE, len(roll)), time_s
         ),
@@ -185,9 +191,9 @@ def test_clock_offset_of_a_tilted_mount():
     rng = np.random.default_rng(3)
     cyclic_error = CyclicError((0.0, math.radians(5), 0.0), (0.0, 0.0, math.radians(5)))
     time_s = np.arange(0.0, 920.0)
-    roll, pitch = cyclic_error.at(inclination.head_azimuth(AZIMUTH_TRACK, time_s))
+    roll, pitch = cyclic_error.at(head_azimuth(AZIMUTH_TRACK, time_s))
     log = inclination_log(roll + rng.normal(0, NOISE, 920), pitch + rng.normal(0, NOISE, 920), time_s + 3.3)
-    offset_s, sigma_s = inclination.clock_offset(log, AZIMUTH_TRACK, cyclic_error, NOISE)
+    offset_s, sigma_s = clock_offset(log, AZIMUTH_TRACK, cyclic_error, NOISE)
     assert offset_s == pytest.approx(3.3, abs=0.2)
     assert sigma_s < 0.3  # includes drift of the mount
 
@@ -196,9 +202,9 @@ def test_clock_offset_of_a_minute_overrules_the_prior():
     rng = np.random.default_rng(5)
     cyclic_error = CyclicError((0.0, math.radians(5), 0.0), (0.0, 0.0, math.radians(5)))
     time_s = np.arange(-80.0, 1000.0)
-    roll, pitch = cyclic_error.at(inclination.head_azimuth(AZIMUTH_TRACK, time_s))
+    roll, pitch = cyclic_error.at(head_azimuth(AZIMUTH_TRACK, time_s))
     noise = rng.normal(0, NOISE, (2, len(time_s)))
-    offset_s, sigma_s = inclination.clock_offset(
+    offset_s, sigma_s = clock_offset(
         inclination_log(roll + noise[0], pitch + noise[1], time_s + 60), AZIMUTH_TRACK, cyclic_error, NOISE
     )
     assert offset_s == pytest.approx(60, abs=0.4)
@@ -211,7 +217,7 @@ def test_clock_offset_sigma_is_calibrated_while_the_mount_moves():
     rng = np.random.default_rng(6)
     cyclic_error = CyclicError((0.0, math.radians(0.5), 0.0), (0.0, 0.0, math.radians(0.5)))
     time_s = np.arange(0.0, 920.0)
-    azimuth_rad = inclination.head_azimuth(AZIMUTH_TRACK, time_s)
+    azimuth_rad = head_azimuth(AZIMUTH_TRACK, time_s)
 
     def drift_and_noise():
         steps = rng.normal(0, math.radians(0.0018) * math.sqrt(2 / 300), (2, 920))
@@ -221,12 +227,12 @@ def test_clock_offset_sigma_is_calibrated_while_the_mount_moves():
     z = []
     for _ in range(60):
         cyclic_tilt = np.stack(cyclic_error.at(azimuth_rad))
-        fitted = inclination.fit_cyclic_error(
+        fitted = fit_cyclic_error(
             inclination_log(*(cyclic_tilt + drift_and_noise()), time_s), AZIMUTH_TRACK, NOISE
         )
         delay_s = rng.uniform(-5, 5)
         log = inclination_log(*(cyclic_tilt + drift_and_noise()), time_s + delay_s)
-        offset_s, sigma_s = inclination.clock_offset(log, AZIMUTH_TRACK, fitted, NOISE)
+        offset_s, sigma_s = clock_offset(log, AZIMUTH_TRACK, fitted, NOISE)
         z.append((offset_s - delay_s) / sigma_s)
     assert 0.5 < np.sqrt(np.mean(np.square(z))) < 1.3
 
@@ -244,7 +250,7 @@ def test_saturated_samples_are_removed_and_counted():
 def test_clock_offset_without_cyclic_error_is_the_prior():
     rng = np.random.default_rng(3)
     log = inclination_log(*rng.normal(0, NOISE, (2, 900)))
-    offset_s, sigma_s = inclination.clock_offset(log, AZIMUTH_TRACK, NO_CYCLIC_ERROR, NOISE)
+    offset_s, sigma_s = clock_offset(log, AZIMUTH_TRACK, NO_CYCLIC_ERROR, NOISE)
     assert offset_s == pytest.approx(0.0, abs=1e-9)
     assert sigma_s == pytest.approx(2.5, rel=1e-3)
 
@@ -252,8 +258,8 @@ def test_clock_offset_without_cyclic_error_is_the_prior():
 def test_tilt_contained_in_the_sop_is_not_applied_again():
     """For the scan that the SOP was solved from, without motion, the relative tilt is zero."""
     time_s = np.arange(0.0, 920.0)
-    log = inclination_log(*CYCLIC_ERROR.at(inclination.head_azimuth(AZIMUTH_TRACK, time_s)), time_s)
-    cyclic_error = inclination.fit_cyclic_error(log, AZIMUTH_TRACK, NOISE)
+    log = inclination_log(*CYCLIC_ERROR.at(head_azimuth(AZIMUTH_TRACK, time_s)), time_s)
+    cyclic_error = fit_cyclic_error(log, AZIMUTH_TRACK, NOISE)
     record = inclination.relative_tilt(log, AZIMUTH_TRACK, cyclic_error, NOISE)
     assert np.abs(record.tilt.roll_rad).max() < math.radians(1e-4)
     assert np.abs(record.tilt.pitch_rad).max() < math.radians(1e-4)
@@ -263,7 +269,7 @@ def test_relative_tilt_passes_drift_and_removes_noise():
     rng = np.random.default_rng(8)
     time_s = np.arange(0.0, 920.0)
     drift = math.radians(0.006) * time_s / 920
-    roll, pitch = CYCLIC_ERROR.at(inclination.head_azimuth(AZIMUTH_TRACK, time_s))
+    roll, pitch = CYCLIC_ERROR.at(head_azimuth(AZIMUTH_TRACK, time_s))
     log = inclination_log(roll + drift + rng.normal(0, NOISE, 920), pitch + rng.normal(0, NOISE, 920), time_s)
     record = inclination.relative_tilt(log, AZIMUTH_TRACK, CYCLIC_ERROR, NOISE)
     middle = slice(60, -60)

@@ -9,7 +9,7 @@ from scipy import ndimage
 
 from station.quantities import Grid, Reference, Scanner, SharedParameters, VarianceComponents
 from station.science.adjustment import prior
-from station.science.geometry.inclination import NO_CYCLIC_ERROR
+from station.science.geometry.cyclic_error import NO_CYCLIC_ERROR
 from station.science.gridding import reference_cells, viewing_geometry
 from station.science.gridding.reference_cells import CellClass
 from station.science.gridding.viewing_geometry import compute_viewing_geometry

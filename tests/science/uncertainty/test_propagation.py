@@ -10,6 +10,7 @@ from station.quantities import Grid, SharedParameters, VarianceComponents
 from station.science.adjustment import prior
 from station.science.geometry import inclination
 from station.science.geometry.air import EARTH_RADIUS_M
+from station.science.geometry.cyclic_error import NO_CYCLIC_ERROR, CyclicError
 from station.science.uncertainty import parameters, propagation
 from station.science.uncertainty.jacobian import height_jacobian
 
@@ -180,7 +181,7 @@ def test_shared_errors_do_not_average_out_in_an_area_mean():
     jacobian = height_jacobian(params, offset_m, np.full(4000, EAST), np.full(4000, NORTH))
     lines = prior.line_times(params, np.eye(3), None)
     posterior = prior.log_only_covariance(
-        params, lines, None, inclination.NO_CYCLIC_ERROR, VarianceComponents(), weather_known=True
+        params, lines, None, NO_CYCLIC_ERROR, VarianceComponents(), weather_known=True
     )
     weights = np.full(4000, 1 / 4000)
     mean_m2 = propagation.aggregate_variance(weights, np.full(4000, 0.01), jacobian, posterior)
@@ -193,8 +194,8 @@ def test_log_only_covariance_is_symmetric_and_smaller_with_a_log():
     time_s = np.arange(0.0, 920.0)
     noise = np.radians(np.random.default_rng(3).normal(0, 0.008, (2, 920)))
     log = inclination.InclinationLog(time_s, *noise)
-    record = inclination.relative_tilt(log, None, inclination.NO_CYCLIC_ERROR, math.radians(0.008))
-    cyclic_error = inclination.CyclicError((0, 7e-4, 0), (0, 0, 7e-4))
+    record = inclination.relative_tilt(log, None, NO_CYCLIC_ERROR, math.radians(0.008))
+    cyclic_error = CyclicError((0, 7e-4, 0), (0, 0, 7e-4))
     lines = prior.line_times(params, np.eye(3), None)
     with_log, without = (
         prior.log_only_covariance(
