@@ -54,7 +54,7 @@ from station.processing.store_tasks import update_series
 from station.quantities import Bools, Grid, Measurement, Reference, SharedParameters
 from station.queries.blocks import BlockQueries, update_boxes
 from station.queries.events import EventQueries
-from station.science.gridding.cell_estimates import quantum, round_total
+from station.science.gridding.stored_precision import quantum, round_total
 from station.science.uncertainty.parameters import parameter_layout
 from station.service.publishing import publish
 

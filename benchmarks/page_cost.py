@@ -40,7 +40,7 @@ from station.products.viewer.value_tiles import CellTiles, write_cells
 from station.queries.block_sums import QUALITY, EpochSummer, keep_epoch_sums
 from station.queries.blocks import BlockQueries, update_boxes
 from station.queries.epoch_cells import EpochReader
-from station.science.gridding.cell_estimates import quantum
+from station.science.gridding.stored_precision import quantum
 
 MAPS_PER_UPDATE = 8  # at most
 LOST = 0.05  # share of the cells that a copy with other noise lacks

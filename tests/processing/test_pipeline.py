@@ -34,7 +34,7 @@ from station.science.adjustment.prior import line_times, log_only_covariance
 from station.science.geometry.air import air_correction
 from station.science.geometry.cyclic_error import NO_CYCLIC_ERROR
 from station.science.geometry.pose import scanner_to_local_map, scanner_to_map_by_origin
-from station.science.gridding import cell_estimates, reference_cells
+from station.science.gridding import cells_outside, reference_cells
 from station.science.gridding.reference_surface import build_surface, centre_reference
 from station.science.gridding.scan_stack import ScanStack
 from station.science.uncertainty import budget
@@ -264,8 +264,8 @@ def test_result_is_independent_of_the_height_of_bands(rows, monkeypatch):
     surface_m = np.where((row // 20 + column // 20) % 2, np.nan, complete.elevation_m)
     shots = shots_at(*random_positions(60_000, 3), seed=3)
     results = []
-    for band_rows in (cell_estimates.BAND_ROWS, rows):
-        monkeypatch.setattr(cell_estimates, "BAND_ROWS", band_rows)
+    for band_rows in (cells_outside.BAND_ROWS, rows):
+        monkeypatch.setattr(cells_outside, "BAND_ROWS", band_rows)
         results.append(process_shots(shots, Reference.from_elevation(GRID, "some", surface_m))[0])
     outside = (results[0].quality & Quality.OUTSIDE_REFERENCE) > 0
     assert outside.mean() > 0.2

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass, fields
+from collections.abc import Callable
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,7 +12,6 @@ from station.quantities import (
     CELL_DTYPE,
     Floats,
     Floats32,
-    Grid,
     Ints,
     Ints32,
     Measurement,
@@ -24,57 +23,18 @@ from station.quantities import (
 )
 from station.science.adjustment.ground_classes import SnowTest
 from station.science.geometry.observation import Observation
-from station.science.geometry.terrain import HALO_ROWS, gradient_at
 from station.science.gridding import significance
+from station.science.gridding.cells_outside import CellsOutside, iter_cells_outside
 from station.science.gridding.gridder import CellSums, Gridder, slope_sampling_variance
 from station.science.gridding.reference_cells import HIGH_INCIDENCE_COS, CellClass
+from station.science.gridding.stored_precision import quantum, round_sigma, round_total
 from station.science.gridding.viewing_geometry import AzimuthSector, ViewingGeometry
 from station.science.gridding.viewpoints import PositionErrors, mean_shot_variance
 from station.science.uncertainty import budget, parameters, shot_noise
 from station.science.uncertainty.jacobian import HeightJacobian, height_jacobian
 from station.science.uncertainty.variance_factors import class_with_excess
 
-BAND_ROWS = 64  # rows whose cells outside the reference are read at once
-BLOCK_CELLS = 50_000  # cells outside the reference that are estimated at once
 FEW_POINTS = 3
-MANTISSA_BITS, EXPONENT = 23, np.uint32(0x7F800000)  # of a float32
-SIGMA_BITS = 5  # of the mantissa: two digits, 1.6 % at most
-LEAST_STEP_M = 2.0**-24  # of the total σ
-QUANTA_PER_SIGMA = 4.0  # at least, of heights and changes as stored
-QUANTUM_M = (2.0**-14, 2.0**-4)  # smallest and largest
-
-
-def round_sigma(sigma_m: Reals) -> Floats32:
-    """Return standard deviations (n,) rounded to two digits, so that they take less space [m]."""
-    step = np.uint32(1 << (MANTISSA_BITS - SIGMA_BITS))
-    bits = sigma_m.astype(np.float32).view(np.uint32)
-    return ((bits + step // np.uint32(2)) & ~(step - np.uint32(1))).view(np.float32)
-
-
-def round_total(random_m: Floats32, systematic_m: Floats32) -> Floats32:
-    """Return the total σ (n,) of a random and a systematic part, rounded [m].
-
-    As many digits are kept as its difference to the systematic part needs to give the random part with two.
-    """
-    total_m = np.sqrt(random_m * random_m + systematic_m * systematic_m)
-    with np.errstate(invalid="ignore"):
-        range_m = np.asarray(random_m * random_m / total_m, np.float32)
-    step_m = np.fmax(_power_of_two(range_m) * np.float32(2.0**-SIGMA_BITS), np.float32(LEAST_STEP_M))
-    return np.asarray(np.rint(total_m / step_m) * step_m)
-
-
-def quantum(random_m: Floats32) -> Floats32:
-    """Return the power of two that heights and changes of cells (n,) are rounded to, by their random σ [m].
-
-    Its error, at most an 8th of σ, adds less than 0.3 % to σ.
-    """
-    quantum_m = _power_of_two(random_m) * np.float32(1 / QUANTA_PER_SIGMA)
-    return np.asarray(np.clip(quantum_m, np.float32(QUANTUM_M[0]), np.float32(QUANTUM_M[1])))
-
-
-def _power_of_two(values: Floats32) -> Floats32:
-    """Return the greatest power of two that is not above each of the positive values (n,)."""
-    return (values.view(np.uint32) & EXPONENT).view(np.float32)
 
 
 def estimate_cells(
@@ -104,7 +64,7 @@ def estimate_cells(
                 continue
             sector, sums, cell_index = whole.take(observed), sums.take(observed), first + observed
             builder.write(cell_index, sums, estimator.in_reference(cell_index, sector, sums, viewing))
-    for outside in _iter_cells_outside(gridder, scan_geometry, viewing):
+    for outside in iter_cells_outside(gridder, scan_geometry, viewing):
         sums = gridder.take(outside.cell_index)
         shares = gridder.viewpoint_shares(outside.cell_index)
         estimates = estimator.outside_reference(outside, sums, shares, gridder.datum_m)
@@ -118,115 +78,6 @@ def estimate_cells(
         builder.quality,
         builder.terms,
     )
-
-
-@dataclass(frozen=True)
-class _CellsOutside:
-    """Cells (n,) outside the reference, with terrain gradients from the scan itself."""
-
-    cell_index: Ints32
-    cell: Ints32  # in the flattened grid
-    east_gradient: Floats
-    north_gradient: Floats
-
-    @classmethod
-    def concatenate(cls, parts: list[_CellsOutside]) -> _CellsOutside:
-        """Return the parts concatenated."""
-        return cls(
-            *(np.concatenate([getattr(part, column.name) for part in parts]) for column in fields(cls))
-        )
-
-    def split(self) -> Iterator[_CellsOutside]:
-        """Yield blocks of cells that are estimated at once."""
-        for first in range(0, len(self.cell), BLOCK_CELLS):
-            yield _CellsOutside(
-                *(getattr(self, column.name)[first : first + BLOCK_CELLS] for column in fields(self))
-            )
-
-
-def _iter_cells_outside(
-    gridder: Gridder, scan_geometry: ScanGeometry, viewing: ViewingGeometry | None
-) -> Iterator[_CellsOutside]:
-    """Yield the cells outside the reference, in blocks whose intermediate results stay in the cache."""
-    new_cells = gridder.new_cells()
-    heights = _HeightWindow(gridder, viewing, new_cells, scan_geometry.min_points)
-    parts: list[_CellsOutside] = []
-    for top in range(0, scan_geometry.grid.ny, BAND_ROWS):
-        rows = slice(top, min(top + BAND_ROWS, scan_geometry.grid.ny))
-        parts.append(
-            _cells_outside(
-                gridder, scan_geometry, heights, rows, _rows_slice(new_cells, rows, scan_geometry.grid)
-            )
-        )
-        if sum(len(part.cell) for part in parts) > BLOCK_CELLS or rows.stop == scan_geometry.grid.ny:
-            yield from _CellsOutside.concatenate(parts).split()
-            parts = []
-
-
-def _rows_slice(cell: Ints32, rows: slice, grid: Grid) -> Ints32:
-    """Return those of the ascending flattened cells (n,) that lie in the given rows."""
-    # In the dtype of the cells: otherwise numpy would convert all of them.
-    edges = np.array([rows.start * grid.nx, rows.stop * grid.nx], cell.dtype)
-    first, last = np.searchsorted(cell, edges)
-    return cell[first:last]
-
-
-def _cells_outside(
-    gridder: Gridder, scan_geometry: ScanGeometry, heights: _HeightWindow, rows: slice, cell: Ints32
-) -> _CellsOutside:
-    """Return the cells (n,) of some rows outside the reference, with their gradients."""
-    east, north = np.zeros((2, len(cell)))
-    if scan_geometry.position_m is not None:
-        window_m, inner = heights.window(rows)
-        if len(cell):
-            row, column = scan_geometry.grid.row_and_column(cell)
-            row += inner.start - rows.start
-            gradient = gradient_at(window_m, scan_geometry.grid.cell_m, row, column)
-            east, north = (np.nan_to_num(component.astype(np.float64)) for component in gradient)
-    return _CellsOutside(gridder.cell_index.reshape(-1).take(cell), cell, east, north)
-
-
-class _HeightWindow:
-    """Heights above one datum, row by row, read from the sums of cells before these are overwritten."""
-
-    def __init__(
-        self, gridder: Gridder, viewing: ViewingGeometry | None, new_cells: Ints32, min_points: int
-    ) -> None:
-        """Start north of the grid; `new_cells` (n,) are the cells outside the reference, ascending."""
-        self._gridder, self._viewing = gridder, viewing
-        self._new_cells, self._min_points = new_cells, min_points
-        self._datum_offset_m = 0.0 if viewing is None else gridder.datum_m - viewing.datum_m
-        self._rows = slice(0, 0)
-        self._height_m = np.empty((0, gridder.grid.nx), np.float32)
-
-    def window(self, rows: slice) -> tuple[Floats32, slice]:
-        """Return heights (r, nx) of some rows and adjacent ones, NaN where empty, and the slice of the rows.
-
-        Calls must proceed southward: sums that were read once are not read again.
-        """
-        window_rows = slice(max(rows.start - HALO_ROWS, 0), min(rows.stop + HALO_ROWS, self._gridder.grid.ny))
-        kept_m = self._height_m[window_rows.start - self._rows.start :]
-        self._height_m = np.concatenate([kept_m, self._read(slice(self._rows.stop, window_rows.stop))])
-        self._rows = window_rows
-        return self._height_m, slice(rows.start - window_rows.start, rows.stop - window_rows.start)
-
-    def _read(self, rows: slice) -> Floats32:
-        """Return heights (r, nx) of some rows: of the reference if known, otherwise means of the scan."""
-        gridder, grid = self._gridder, self._gridder.grid
-        cell_index = gridder.cell_index[rows]
-        if self._viewing is None:
-            height_m = np.full(cell_index.shape, np.nan, np.float32)
-        else:
-            # The reference's own heights are better where known. Cells outside get all bits set: NaN.
-            outside = cell_index.view(np.uint32) >= np.uint32(gridder.reference_cells)
-            bits = np.negative(outside.view(np.int8), dtype=np.int32)
-            bits |= self._viewing.height_above_datum_m[rows].view(np.int32)
-            height_m = bits.view(np.float32)
-        cell = _rows_slice(self._new_cells, rows, grid) - rows.start * grid.nx
-        sums = gridder.take(cell_index.reshape(-1).take(cell))
-        enough = sums.count >= self._min_points
-        height_m.reshape(-1)[cell] = np.where(enough, sums.mean_residual() + self._datum_offset_m, np.nan)
-        return height_m
 
 
 @dataclass(frozen=True)
@@ -349,7 +200,7 @@ class CellEstimator:
         return _CellEstimates(elevation_m, change_m, sigma_m, np.sqrt(random_m2), flags, terms)
 
     def outside_reference(
-        self, outside: _CellsOutside, sums: CellSums, shares: Floats, datum_m: float
+        self, outside: CellsOutside, sums: CellSums, shares: Floats, datum_m: float
     ) -> _CellEstimates:
         """Return estimates for cells (n,) outside the reference, whose sums are above a datum.
 
