@@ -54,8 +54,9 @@ class Adjustment:
     `change_size_m` is one sigma of the change of moving ground. `stable_weights` (patches,) are the robust
     weights of the stable patches, 0 to 1. `leverage_m2` holds the leverage variances of moving and stable
     cells (see `leverage`). `mean_sigma_m` is the uncertainty of the mean height of moving ground that comes
-    from the state. `redundancy` (p,) is the share of the prior variance of each parameter that the scan has
-    removed: 0 if its value is the prior's, 1 if the observations alone determine it. `log` is the inclination
+    from the state. `sigma` (p,) is that of each parameter; `redundancy` (p,) is the share of its prior
+    variance that the scan has removed: 0 if its value is the prior's, 1 if the observations alone determine
+    it. `log` is the inclination
     log that was used, and `predicted_log_rad` (lines,) is what the adjustment predicts for it, without the
     errors of the sensor. `unapplied_rad` (3,) is the estimated rotation about east, north and up that the
     points lack, as a mean over the lines.
@@ -68,6 +69,7 @@ class Adjustment:
     stable_weights: Floats
     leverage_m2: tuple[float, float]
     mean_sigma_m: float
+    sigma: Floats
     redundancy: Floats
     log: LineInclination | None
     predicted_log_rad: Floats
@@ -173,6 +175,7 @@ def adjust_scan(
     )
     leverage_m2 = fit_leverage(patches, weight, equations, posterior)
     state, predicted_log_rad = _state_and_log(params, mixture.estimate, reduced, log)
+    sigma = np.sqrt(np.diag(posterior.to_shared_parameters(state).covariance))
     return Adjustment(
         params,
         state,
@@ -181,7 +184,8 @@ def adjust_scan(
         robust_weight[~moving],
         leverage_m2,
         _mean_sigma(patches, moving, posterior),
-        _redundancy(prior, posterior, state),
+        sigma,
+        np.clip(1 - sigma**2 / np.diag(prior.knot_covariance), 0.0, 1.0),  # redundancy numbers of the prior
         log,
         predicted_log_rad,
         state[:3] * HEADING_CLOCKWISE - applied_rad.mean(axis=1),
@@ -196,16 +200,6 @@ def _mean_sigma(patches: Patches, moving: Bools, posterior: Posterior) -> float:
     unknowns, line_tilt = posterior.covariance_with(*effects)
     variance_m2 = float(effects[0] @ unknowns[: len(effects[0])] + effects[1] @ line_tilt)
     return float(np.sqrt(max(variance_m2, 0.0)))
-
-
-def _redundancy(prior: StatePrior, posterior: Posterior, estimate: Floats) -> Floats:
-    """Return the redundancy number of the prior of each parameter (p,) [1]: 1 - posterior / prior variance.
-
-    Source: the redundancy matrix of adjustment theory, for pseudo-observations that are independent of each
-    other in good approximation.
-    """
-    variance = np.diag(posterior.to_shared_parameters(estimate).covariance)
-    return np.clip(1 - variance / np.diag(prior.knot_covariance), 0.0, 1.0)
 
 
 def _state_and_log(

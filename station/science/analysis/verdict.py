@@ -20,7 +20,7 @@ from station.science.uncertainty.parameters import TILT_KNOT_RAD, TILT_KNOTS_PER
 
 MAX_REJECTED_SHARE = 0.3  # of the stable ground, rejected by the adjustment
 MAX_MEAN_SIGMA_M = 0.05  # of the mean change of moving ground
-MOVED_SIGMAS = 4.0  # of the usual motion from scan to scan
+MOVED_SIGMAS = 4.0  # of the usual motion from scan to scan, and of the error of its estimate
 MIN_VISIBILITY = 0.75  # of the usual cells; less is not due to chance
 UNUSABLE_VISIBILITY = 0.02  # of the usual cells; less is unusable
 CLEAR_RANGE_SHARE = 0.9  # of the best range bin; there the air is clear enough to detect an empty sector
@@ -119,16 +119,14 @@ def adjustment_warnings(adjustment: Adjustment, components: VarianceComponents) 
             "stable ground cannot tell the change of the ground from motion of the scanner:"
             f" sigma of its mean is {adjustment.mean_sigma_m:.2g} m"
         )
-    tilt_rad = float(np.hypot(*adjustment.estimate[:2]))
-    if tilt_rad > MOVED_SIGMAS * components.tilt_rad:
-        reasons.append(f"scanner tilted by {np.degrees(tilt_rad):.3f} degrees against its SOP: moved?")
-    for name, part, sigma, unit in (
-        ("rotated", slice(2, 3), components.heading_rad, "rad"),
-        ("shifted", slice(3, 6), components.translation_m, "m"),
+    for verb, part, usual, unit, factor in (
+        ("tilted", slice(0, 2), components.tilt_rad, "degrees", 180 / np.pi),
+        ("rotated", slice(2, 3), components.heading_rad, "degrees", 180 / np.pi),
+        ("shifted", slice(3, 6), components.translation_m, "m", 1.0),
     ):
         size = float(np.linalg.norm(adjustment.estimate[part]))
-        if size > MOVED_SIGMAS * sigma:
-            reasons.append(f"scanner {name} by {size:.2g} {unit} against its SOP: moved?")
+        if size > MOVED_SIGMAS * np.hypot(usual, adjustment.sigma[part].max()):
+            reasons.append(f"scanner {verb} by {factor * size:.2g} {unit} against its SOP: moved?")
     return reasons
 
 

@@ -560,13 +560,15 @@ def test_inconsistent_stable_ground_gives_a_warning():
     ("index", "size", "word"), [(0, 0.0006, "tilted"), (2, 0.00011, "rotated"), (5, 0.013, "shifted")]
 )
 def test_a_moved_scanner_gives_a_warning(index, size, word):
+    """Beyond four sigma of the usual motion, and of the error of the estimate."""
     covariance, _ = dense_prior(PARAMS)
     at_rest = adjust_scan(random_sites(54, 400).patches(np.zeros(400)), NO_TILT, knot_prior(PARAMS), None)
     assert adjustment_warnings(at_rest, COMPONENTS) == []
-    for share, expected in ((0.5, []), (1.0, [word])):
+    for share, sigma, expected in ((0.5, 0.0, []), (1.0, 0.0, [word]), (1.0, 0.05, [word]), (1.0, 0.2, [])):
         moved = np.zeros(len(covariance))
         moved[index] = share * size
-        reasons = adjustment_warnings(replace(at_rest, estimate=moved), COMPONENTS)
+        uncertain = np.full(len(at_rest.sigma), sigma * size)
+        reasons = adjustment_warnings(replace(at_rest, estimate=moved, sigma=uncertain), COMPONENTS)
         assert [word for reason in reasons if word in reason] == expected
         assert len(reasons) == len(expected)
 

@@ -103,6 +103,7 @@ def make_adjustment(estimate, covariance, log):
         (1.0, 1.0),
         0.0,
         redundancy,
+        redundancy,
         log,
         predicted_rad,
         np.zeros(3),
