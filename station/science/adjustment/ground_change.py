@@ -32,7 +32,8 @@ KINDS = 2  # of moving ground: ice and snow, bare ground
 STABLE = KINDS  # kind of all other ground
 KIND_SPACING = 10_000  # of the azimuth knots of two kinds, so that they are not correlated
 MIN_SHARE = 1e-6  # of a kind of ground in a patch; less is rounding
-TREND_RATIO = 0.6  # of a trend's size to that of the mean: melt or settling from zero to twice the mean
+# Of a trend's size to that of the mean: melt or settling from zero to twice the mean, or snow all over.
+TREND_RATIOS = (0.6, 0.15)
 # Sigma of the change that neighbouring knots share, in sigmas of one knot: no, some or strong correlation.
 CORRELATED_CHANGE_RATIOS = (0.0, 3.0, 10.0)
 # Log prior odds against each. Smooth errors of the air look like correlated change too, but raise its log
@@ -51,15 +52,17 @@ MIN_HEAVE_M = 1e-5
 
 
 class ChangeModel(NamedTuple):
-    """Indices into `CORRELATED_CHANGE_RATIOS`, `CHANGE_STEPS_M` and `TREND_SIZES_M`.
+    """Indices into `CORRELATED_CHANGE_RATIOS`, `CHANGE_STEPS_M`, `TREND_SIZES_M` and `TREND_RATIOS`.
 
-    `bare` is 1 if bare ground has trends of the same size as ice and snow, 0 if it has none.
+    `bare` is 1 if bare ground has trends of the same size as ice and snow, 0 if it has none. `even` is 1 if
+    trends are small against the mean.
     """
 
     ratio: int
     step: int
     trend: int
     bare: int = 0
+    even: int = 0
 
     @property
     def step_m(self) -> float:
@@ -84,7 +87,7 @@ class ChangeModel(NamedTuple):
 
     def neighbours(self, *, bare: bool, ratios: bool = False) -> list[ChangeModel]:
         """Return the models that differ by one index: step, trend, with `bare` and `ratios` also these."""
-        sizes = {"step": len(CHANGE_STEPS_M), "trend": len(TREND_SIZES_M)}
+        sizes = {"step": len(CHANGE_STEPS_M), "trend": len(TREND_SIZES_M), "even": len(TREND_RATIOS)}
         if bare:
             sizes["bare"] = 2
         if ratios:
@@ -126,7 +129,7 @@ class GroundChange:
     def precision_at(self, model: ChangeModel) -> tuple[Floats, float]:
         """Return the precision (k, k) of a model, and log |precision⁻¹|."""
         snow_m = min(model.size_m, THIN_SNOW_M) if self.surface_rises else NO_CHANGE_M
-        trend_m = TREND_SIZES_M[model.trend] * np.array([1.0] + [TREND_RATIO] * (TRENDS - 1))
+        trend_m = TREND_SIZES_M[model.trend] * np.array([1.0] + [TREND_RATIOS[model.even]] * (TRENDS - 1))
         bare_m = trend_m if model.bare else np.full(TRENDS, NO_CHANGE_M)
         knots, step_m = len(self.knot_precisions[model.ratio]), CHANGE_STEPS_M[model.step]
         first, last = self.trend_columns, self.trend_columns + knots

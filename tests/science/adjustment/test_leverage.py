@@ -152,7 +152,7 @@ def test_changing_ground_has_little_leverage():
         adjust_scan(make_patches(noise_m + change_m, ground_class), NO_TILT, PRIOR, None).leverage_m2
         for change_m in (0.0, snow_m)
     )
-    assert max(unchanged) < 5 * SIGMA_M**2  # the trends of moving ground absorb some
+    assert max(unchanged) < 8 * SIGMA_M**2  # the trends of moving ground absorb some
     assert changed[0] > 10 * max(changed[1], SIGMA_M**2)
 
 

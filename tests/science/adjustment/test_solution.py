@@ -85,9 +85,9 @@ def test_mixture_has_the_moments_of_all_models(moderate):
     """Moments by the law of total variance, from one dense inverse per model."""
     _, change, size, solved = moderate
     reduced, moments = solved._reduced, []
+    sizes = len(ground_change.CHANGE_STEPS_M), len(ground_change.TREND_SIZES_M)
     models = [
-        ChangeModel(*index)
-        for index in np.ndindex(3, len(ground_change.CHANGE_STEPS_M), len(ground_change.TREND_SIZES_M))
+        ChangeModel(ratio, step, trend, even=even) for ratio, step, trend, even in np.ndindex(3, *sizes, 2)
     ]
     odds = np.array([solved.log_odds(model) for model in models])
     weight = np.exp(odds - odds.max())
