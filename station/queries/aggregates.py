@@ -23,6 +23,7 @@ from station.archive.small_variables import read_number
 from station.quantities import Bools, Floats, Grid, Quality, Reals, SharedParameters
 from station.queries.epoch_cells import (
     EpochCells,
+    EpochMean,
     EpochReader,
     bounding_box,
     observed_in_all,
@@ -117,11 +118,16 @@ class Aggregates(EpochReader):
         )
 
     def observe(
-        self, cells: Bools, epoch: EpochRef, other: EpochRef | None = None, surface_m: Floats | None = None
+        self,
+        cells: Bools,
+        epoch: EpochRef,
+        other: EpochRef | EpochMean | None = None,
+        surface_m: Floats | None = None,
     ) -> ObservedArea | None:
         """Return the cells (ny, nx) that an epoch observed, or both of two; None if there are none.
 
-        With `surface_m` (ny, nx), the values are heights above it where it is known.
+        The other may be the mean of several. With `surface_m` (ny, nx), the values are heights above it where
+        it is known.
         """
         epochs = self._read_epochs(cells, epoch, other)
         common_cells = observed_in_all(epochs, cells)
@@ -212,7 +218,9 @@ class Aggregates(EpochReader):
             variance_m2 += jacobian.variance(shared)
         return variance_m2
 
-    def _read_epochs(self, cells: Bools, epoch: EpochRef, other: EpochRef | None) -> list[EpochCells]:
+    def _read_epochs(
+        self, cells: Bools, epoch: EpochRef, other: EpochRef | EpochMean | None
+    ) -> list[EpochCells]:
         return [
             self.read_cells(epoch_ref, cells) for epoch_ref in ([epoch] if other is None else [epoch, other])
         ]
@@ -262,7 +270,10 @@ class Aggregates(EpochReader):
                 )
                 continue
             jacobian = self.jacobian(epoch_cells, common_cells)
-            aggregated.append(jacobian.aggregate(weights))
+            factor = epoch_cells.jacobian_factor
+            aggregated.append(
+                jacobian.aggregate(weights if factor is None else weights / factor[common_cells])
+            )
             noise_leverage = (
                 self.leverage(epoch_cells, common_cells, jacobian, independent_m2)
                 if len(epochs) > 1
@@ -282,9 +293,13 @@ class Aggregates(EpochReader):
     ) -> Floats | None:
         """Return the leverage (n,) of the noise of the cells on the adjustment of an epoch; None if unknown.
 
-        Used for differences only. Relative to the reference, it would remove about as much as the error of
-        the reference itself, a tenth of a millimetre for an area, which is counted nowhere else.
+        That of a mean of epochs is not counted, which makes sigma slightly too large.
+        Used for differences only.
+        Relative to the reference, it would remove about as much as the error of the reference itself, a tenth
+        of a millimetre for an area, which is counted nowhere else.
         """
+        if epoch_cells.members:
+            return None
         index = epoch_cells.epoch.index
         with h5py.File(epoch_cells.epoch.path, "r") as file:
             if not epoch_cells.adjusted or not set(LEVERAGE_VARIABLES) <= set(file):
@@ -366,7 +381,10 @@ class Aggregates(EpochReader):
         jacobian = cell_jacobian(
             params, window_grid, position_m, window_m, gradient, cells[rows, columns], rock
         )
-        return _scaled_to_cells(jacobian, epoch_cells, cells) if epoch_cells.has_positions else jacobian
+        if epoch_cells.has_positions:
+            jacobian = _scaled_to_cells(jacobian, epoch_cells, cells)
+        factor = epoch_cells.jacobian_factor
+        return jacobian if factor is None else jacobian.scaled(factor[cells])
 
 
 LEVERAGE_VARIABLES = ("adjustment_leverage_moving", "adjustment_leverage_stable")
@@ -391,11 +409,12 @@ def _scaled_to_cells(jacobian: HeightJacobian, epoch_cells: EpochCells, cells: B
 
     The covariance of an epoch of several positions is that of a mean cell. Source: equations.md, 6.13.
     """
-    if epoch_cells.shared is None:
+    shared = epoch_cells.members[0] if epoch_cells.members else epoch_cells.shared
+    if shared is None:
         return jacobian
     with h5py.File(epoch_cells.epoch.path, "r") as file:
         systematic_m = read_cells_of(file, SYSTEMATIC, epoch_cells.epoch.index, cells)
-    sigma_m = np.sqrt(np.asarray(jacobian.variance(epoch_cells.shared), np.float64))
+    sigma_m = np.sqrt(np.asarray(jacobian.variance(shared), np.float64))
     known = np.isfinite(systematic_m) & (sigma_m > 0)
     return jacobian.scaled(np.divide(systematic_m, sigma_m, out=np.ones(len(sigma_m)), where=known))
 
@@ -412,7 +431,14 @@ def common_error_covariance(epochs: list[EpochCells]) -> Floats | None:
         return None
     if first.reference.version != second.reference.version:
         return None
-    return cross_covariance(first.shared, second.shared)
+    covariances = [
+        covariance
+        for covariance in (
+            cross_covariance(first.shared, shared) for shared in second.members or (second.shared,)
+        )
+        if covariance is not None
+    ]
+    return np.mean(covariances, axis=0) if covariances else None
 
 
 def _has_quality(epoch: EpochRef, cells: Bools, flags: Quality) -> Bools:

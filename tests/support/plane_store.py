@@ -135,9 +135,20 @@ def dense_variance(ds, weights, index, *, random_m2=None, reference=None):
     if reference is not None:
         covariance = covariance + reference.covariance
         line_tilt = line_tilt + reference.line_tilt_variance
-    by_line = line_tilt[10 + np.arange(line_design.shape[1]) // 5]
-    shared_m2 = design @ covariance @ design.T + (line_design * by_line) @ line_design.T
+    shared_m2 = design @ covariance @ design.T + _line_covariance(line_design, line_tilt)
     return np.nansum(a**2 * random_m2.ravel()) + a @ shared_m2 @ a
+
+
+def _line_covariance(line_design, line_tilt):
+    by_line = line_tilt[10 + np.arange(line_design.shape[1]) // 5]
+    return (line_design * by_line) @ line_design.T
+
+
+def line_variance(ds, weights, index):
+    """Return the part aᵀ J_δ D J_δᵀ a of the line tilts in the variance of one epoch."""
+    line_tilt = ds.shared_parameter_line_tilt_variance[index].values
+    a = weights.ravel()
+    return a @ _line_covariance(dense_jacobian(ds, index)[1], line_tilt) @ a
 
 
 def reference_random_m2(series):
