@@ -88,16 +88,16 @@ def load_products(site: Site) -> tuple[list[Product], list[str]]:
 def _load_product(site: Site, section: ProductSection, areas: dict[str, Bools]) -> Product:
     """Return a product; raise ConfigError if a raster, an area or a place of it cannot be used."""
     grid = site.grid_cells
+    rasters = {key: read_geotiff(path, grid, site.grid_crs) for key, path in section.rasters.items()}
+    files = tuple(sha256_file(path) for path in section.rasters.values())
     if section.line is not None:
         line = sample_line(section.line, grid)
-        return Product(section, {section.name: line.cells}, line)
+        return Product(section, {section.name: line.cells}, line, rasters, files)
     places = _areas_of(section, areas) if section.needs_areas else {section.name: _cells_at(section, grid)}
-    rasters = {key: read_geotiff(path, grid, site.grid_crs) for key, path in section.rasters.items()}
     for key in {"low", "high"} & rasters.keys():
         places = {name: cells & np.isfinite(rasters[key]) for name, cells in places.items()}
     if empty := [name for name, cells in places.items() if not cells.any()]:
         raise ConfigError(f"no cell of the grid in {', '.join(empty)}: are the coordinates those of the map?")
-    files = tuple(sha256_file(path) for path in section.rasters.values())
     return Product(section, places, rasters=rasters, files=files)
 
 

@@ -139,7 +139,7 @@ class Aggregates(EpochReader):
             return None
         value_m = epochs[0].change_m[observed] - (0.0 if other is None else epochs[1].change_m[observed])
         if surface_m is not None:
-            value_m += self._mean_elevation(epochs[0], common_cells) - surface_m[common_cells]
+            value_m += self.mean_elevation(epochs[0], common_cells) - surface_m[common_cells]
         above_surface = surface_m is not None
         random_m2 = self._random_variances(epochs, common_cells, observed, above_surface=above_surface)
         value_map_m, noise_map_m2 = np.full(cells[bounds].shape, np.nan), np.zeros(cells[bounds].shape)
@@ -179,7 +179,7 @@ class Aggregates(EpochReader):
         shared_m2 = self.jacobian(epoch_cells, area.cells).variance(shared)
         return random_m2, np.maximum(shared_m2, 0.0, dtype=np.float64)
 
-    def _mean_elevation(self, epoch_cells: EpochCells, cells: Bools) -> Floats:
+    def mean_elevation(self, epoch_cells: EpochCells, cells: Bools) -> Floats:
         """Return the heights (n,) that the change of an epoch is counted from [m]."""
         rows, columns = bounding_box(cells, 0)
         height_m = self._surfaces.height_m(epoch_cells.reference.version, rows, columns)

@@ -30,7 +30,7 @@ KEYS: dict[str, tuple[set[str], set[str]]] = {  # required and optional, of each
     "volume_budget": (set(), {"areas"} | _BASE),
     "volume_between": ({"low"}, {"areas", "high"}),
     "profile": ({"line"}, set()),
-    "contour": ({"line", "height_m"}, {"observations"}),
+    "contour": ({"line", "height_m"}, _BASE | {"observations"}),
 }
 
 UPWARD_KINDS = ("snow_depth", "surface_mass_balance", "melt")  # counted from below

@@ -127,7 +127,6 @@ def dense_jacobian(ds, index):
 def dense_variance(ds, weights, index, *, random_m2=None, reference=None):
     """Return Σ a² σ² + aᵀ (J C Jᵀ + J_δ D J_δᵀ) a of one epoch with dense matrices."""
     a = weights.ravel()
-    design, line_design = dense_jacobian(ds, index)
     covariance = ds.shared_parameter_covariance[index].values.astype(float)
     line_tilt = ds.shared_parameter_line_tilt_variance[index].values
     if random_m2 is None:
@@ -135,20 +134,15 @@ def dense_variance(ds, weights, index, *, random_m2=None, reference=None):
     if reference is not None:
         covariance = covariance + reference.covariance
         line_tilt = line_tilt + reference.line_tilt_variance
-    shared_m2 = design @ covariance @ design.T + _line_covariance(line_design, line_tilt)
-    return np.nansum(a**2 * random_m2.ravel()) + a @ shared_m2 @ a
+    return np.nansum(a**2 * random_m2.ravel()) + shared_variance(ds, weights, index, covariance, line_tilt)
 
 
-def _line_covariance(line_design, line_tilt):
+def shared_variance(ds, weights, index, covariance, line_tilt):
+    """Return aᵀ (J C Jᵀ + J_δ D J_δᵀ) a with the Jacobian of an epoch."""
+    a, (design, line_design) = weights.ravel(), dense_jacobian(ds, index)
     by_line = line_tilt[10 + np.arange(line_design.shape[1]) // 5]
-    return (line_design * by_line) @ line_design.T
-
-
-def line_variance(ds, weights, index):
-    """Return the part aᵀ J_δ D J_δᵀ a of the line tilts in the variance of one epoch."""
-    line_tilt = ds.shared_parameter_line_tilt_variance[index].values
-    a = weights.ravel()
-    return a @ _line_covariance(dense_jacobian(ds, index)[1], line_tilt) @ a
+    shared_m2 = design @ covariance @ design.T + (line_design * by_line) @ line_design.T
+    return a @ shared_m2 @ a
 
 
 def reference_random_m2(series):

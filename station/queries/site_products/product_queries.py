@@ -204,12 +204,13 @@ class ProductQueries(Aggregates):
         self, product: Product, epoch: EpochRef, scans: SurfaceScans | None, earlier: list[EpochRef | None]
     ) -> Row:
         section, line = product.section, product.line
+        base = CountedFrom(scans, product.rasters.get("surface"))
         if section.kind == "profile" and line is not None:
             parts = profile(self, line, epoch)
             return {name: v for of, values in parts.items() for name, v in _parts(of, *values).items()}
         if section.kind == "contour" and line is not None:
-            return _columns({"distance": [contour(self, line, epoch, section.height_m)]}, np.empty(0))
-        base = CountedFrom(scans, product.rasters.get("surface"))
+            estimates = contour(self, line, epoch, section.height_m, base)
+            return _columns({name: [estimate] for name, estimate in estimates.items()}, np.empty(0))
         values: dict[str, list[Estimate]] = {}
         coverage = []
         for cells in product.places.values():
