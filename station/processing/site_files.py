@@ -18,7 +18,7 @@ from station.queries.site_products.profile_lines import sample_line
 from station.readers.flags import read_flags, reasons_for
 from station.readers.polygons import cells_inside, read_polygons
 from station.readers.raster import read_geotiff
-from station.sections.product import ProductSection
+from station.sections.product import ProductSection, product_key
 
 
 def series_for(site: Site) -> Series:
@@ -83,6 +83,18 @@ def load_products(site: Site) -> tuple[list[Product], list[str]]:
         except (StationError, OSError) as error:
             faults.append(f"product {section.name}: {error}")
     return products, faults
+
+
+def load_product(site: Site, name: str) -> Product:
+    """Return a product of a site by its name or that of its file.
+
+    Raises StationError if there is none, ConfigError if a raster, an area or a place of it cannot be used.
+    """
+    for section in site.product:
+        if section.key == product_key(name):
+            return _load_product(site, section, load_areas(site) if section.needs_areas else {})
+    known = ", ".join(section.name for section in site.product) or "none"
+    raise StationError(f"no product {name!r} in the site file; products: {known}")
 
 
 def _load_product(site: Site, section: ProductSection, areas: dict[str, Bools]) -> Product:

@@ -36,7 +36,11 @@ from station.science.analysis.voids import area_weights, void_variance
 from station.science.geometry.terrain import smooth_gradient
 from station.science.uncertainty.common_mode import cross_covariance
 from station.science.uncertainty.jacobian import HeightJacobian, cell_jacobian
-from station.science.uncertainty.propagation import aggregate_variance, difference_to_reference
+from station.science.uncertainty.propagation import (
+    aggregate_variance,
+    cell_covariances,
+    difference_to_reference,
+)
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -170,14 +174,35 @@ class Aggregates(EpochReader):
         return min(float(weights**2 @ np.sum(area.random_m2, axis=0)), total), total
 
     def cell_variances(self, area: ObservedArea) -> tuple[Floats, Floats]:
-        """Return the random and the systematic variance (n,) of each cell of an area in one epoch [m²]."""
-        epoch_cells = area.epochs[0]
-        shared = shared_of(area.epochs, epoch_cells, above_surface=area.above_surface)
-        random_m2 = area.random_m2[0]
-        if shared is None:
-            return random_m2, np.zeros(len(random_m2))
-        shared_m2 = self.jacobian(epoch_cells, area.cells).variance(shared)
-        return random_m2, np.maximum(shared_m2, 0.0, dtype=np.float64)
+        """Return the random and the systematic variance (n,) of each cell of an area [m²].
+
+        They are those of `sum_variance` for a weight of one in one cell.
+        """
+        random_m2 = np.asarray(np.sum(area.random_m2, axis=0, dtype=np.float64))
+        total_m2, lower_m2, jacobians = np.zeros(len(random_m2)), np.zeros(len(random_m2)), []
+        for epoch_cells, independent_m2 in zip(area.epochs, area.random_m2, strict=True):
+            shared = shared_of(area.epochs, epoch_cells, above_surface=area.above_surface)
+            if shared is None:
+                total_m2, lower_m2 = total_m2 + independent_m2, lower_m2 + independent_m2
+                continue
+            jacobian = self.jacobian(epoch_cells, area.cells)
+            absorbed = (
+                self.leverage(epoch_cells, area.cells, jacobian, independent_m2)
+                if len(area.epochs) > 1
+                else None
+            )
+            independent = 1.0 if absorbed is None else 1 - absorbed
+            shared_m2 = jacobian.variance(shared) * (2 * independent - 1)
+            total_m2 += np.maximum(independent_m2 + shared_m2, independent_m2 * independent)
+            lower_m2 += independent_m2 * independent
+            factor = epoch_cells.jacobian_factor
+            jacobians.append(jacobian if factor is None else jacobian.scaled(1 / factor[area.cells]))
+        covariance = common_error_covariance(area.epochs)
+        if covariance is not None:
+            total_m2 -= 2 * cell_covariances(jacobians[0], jacobians[1], covariance)
+        total_m2 = np.maximum(total_m2, lower_m2)
+        random_m2 = np.minimum(random_m2, total_m2)
+        return random_m2, total_m2 - random_m2
 
     def mean_elevation(self, epoch_cells: EpochCells, cells: Bools) -> Floats:
         """Return the heights (n,) that the change of an epoch is counted from [m]."""

@@ -31,6 +31,7 @@ from station.archive.netcdf_layout import Series
 from station.archive.read_errors import read_errors
 from station.archive.schema import TEXT_LENGTH, VERDICTS
 from station.archive.series.index import SeriesIndex
+from station.errors import StationError
 from station.quantities import Bools, Floats, Ints
 from station.queries.aggregates import Aggregates
 from station.queries.site_products.profile_lines import Line
@@ -108,12 +109,10 @@ class ProductQueries(Aggregates):
     def update(self, product: Product, progress: Callable[[], None]) -> Path | None:
         """Bring the file of a product up to date; None if there is nothing to write yet."""
         epochs, partners = self._measured, self._partners(product)
-        base: list[EpochRef] = []
-        if isinstance(product.section.surface, SurfaceTime):
-            base = [self._epochs[index] for index in self._surface_epochs(product.section.surface).tolist()]
-            if not base:
-                delete_products(self.series, [product.section.key])  # its surface has not been measured yet
-                return None
+        base = self._base(product)
+        if base is None:
+            delete_products(self.series, [product.section.key])
+            return None
         names = [epoch.epoch_file.encode() for epoch in base]
         sources = [
             self._sources(index, names, others)
@@ -138,6 +137,26 @@ class ProductQueries(Aggregates):
 
         file, verdict = self._file(product), self._verdict[epochs]
         return update_product(self.series, file, entries, verdict, compute, progress)
+
+    def _base(self, product: Product) -> list[EpochRef] | None:
+        """Return the epochs of the surface of a product, none if it has no time; None if not measured yet."""
+        if not isinstance(product.section.surface, SurfaceTime):
+            return []
+        return [
+            self._epochs[index] for index in self._surface_epochs(product.section.surface).tolist()
+        ] or None
+
+    def surface_scans(self, product: Product, cells: Bools) -> SurfaceScans | None:
+        """Return the scans that a product counts from at cells (ny, nx); None if it counts from none.
+
+        Raises StationError if they have not been measured yet.
+        """
+        base = self._base(product)
+        if base is None:
+            raise StationError(
+                f"product {product.section.name}: the time of its surface is not over, or has no usable scan"
+            )
+        return SurfaceScans(self, base, cells) if base else None
 
     def _file(self, product: Product) -> ProductFile:
         section, line = product.section, product.line
@@ -206,8 +225,8 @@ class ProductQueries(Aggregates):
         section, line = product.section, product.line
         base = CountedFrom(scans, product.rasters.get("surface"))
         if section.kind == "profile" and line is not None:
-            parts = profile(self, line, epoch)
-            return {name: v for of, values in parts.items() for name, v in _parts(of, *values).items()}
+            along = profile(self, line, epoch)
+            return {name: v for of, estimate in along.items() for name, v in parts_of(of, estimate).items()}
         if section.kind == "contour" and line is not None:
             estimates = contour(self, line, epoch, section.height_m, base)
             return _columns({name: [estimate] for name, estimate in estimates.items()}, np.empty(0))
@@ -227,16 +246,16 @@ def _columns(values: dict[str, list[Estimate]], coverage: Floats) -> Row:
     """Return the variables of quantities in all places (n,)."""
     columns: Row = {"coverage": coverage} if len(coverage) else {}
     for name, estimates in values.items():
-        columns |= _parts(
-            name,
-            np.array([estimate.value for estimate in estimates]),
-            np.array([estimate.random_variance for estimate in estimates]),
-            np.array([estimate.systematic_variance for estimate in estimates]),
+        parts = ("value", "random_variance", "systematic_variance")
+        columns |= parts_of(
+            name, Estimate(*(np.array([getattr(estimate, part) for estimate in estimates]) for part in parts))
         )
     return columns
 
 
-def _parts(name: str, value: Floats, random: Floats, systematic: Floats) -> Row:
-    """Return the variables of a quantity: value, and one sigma of everything and of its two parts."""
-    sigmas = (np.sqrt(np.maximum(variance, 0)) for variance in (random + systematic, random, systematic))
-    return {name: value, **{f"{name}_{part}": sigma for part, sigma in zip(SIGMAS, sigmas, strict=True)}}
+def parts_of(name: str, estimate: Estimate) -> Row:
+    """Return the variables of a quantity (n,): value, and one sigma of everything and of its two parts."""
+    variances = estimate.variance, estimate.random_variance, estimate.systematic_variance
+    sigmas = (np.sqrt(np.maximum(variance, 0)) for variance in variances)
+    parts = zip(SIGMAS, sigmas, strict=True)
+    return {name: np.asarray(estimate.value), **{f"{name}_{part}": sigma for part, sigma in parts}}

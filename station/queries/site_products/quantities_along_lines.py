@@ -16,11 +16,10 @@ from station.science.analysis.product_estimates import Estimate, LinePosition, c
 from station.science.uncertainty.jacobian import HeightJacobian
 from station.science.uncertainty.propagation import aggregate_variance
 
-Parts = tuple[Floats, Floats, Floats]  # value (k,), random and systematic variance of each sample
 HeightOrCrest = float | str | None
 
 
-def profile(aggregates: Aggregates, line: Line, epoch: EpochRef) -> dict[str, Parts]:
+def profile(aggregates: Aggregates, line: Line, epoch: EpochRef) -> dict[str, Estimate]:
     """Return elevation and change of the samples (k,) of a line by name; NaN where not observed."""
     columns = {}
     for name, surface_m in (("elevation", datum_of(aggregates)), ("elevation_change", None)):
@@ -32,7 +31,7 @@ def profile(aggregates: Aggregates, line: Line, epoch: EpochRef) -> dict[str, Pa
             value[complete] = (weights @ area.value_m)[complete]
             random_m2[complete] = (weights.power(2) @ cell_random_m2)[complete]
             systematic_m2[complete] = (weights @ np.sqrt(cell_systematic_m2))[complete] ** 2
-        columns[name] = value, random_m2, systematic_m2
+        columns[name] = Estimate(value, random_m2, systematic_m2)
     return columns
 
 

@@ -48,13 +48,19 @@ def place_quantities(
     if section.kind == "point":
         datum = CountedFrom(raster_m=datum_of(aggregates))
         return {"elevation": _mean(aggregates, cells, epoch, datum)[0], "elevation_change": change}, coverage
+    quantities: dict[str, Estimate] = {section.kind: mapped_quantity(section, change)}
     if section.kind == "snow_depth":
-        depths = {"snow_depth": change.with_offset(section.offset_m, section.offset_sigma_m)}
         for hours, before in zip(NEW_SNOW_H, earlier, strict=True):
-            depths[f"new_snow_{hours}h"] = _new_snow(aggregates, cells, epoch, before)
-        return depths, coverage
+            quantities[f"new_snow_{hours}h"] = _new_snow(aggregates, cells, epoch, before)
+    return quantities, coverage
+
+
+def mapped_quantity(section: ProductSection, change: Estimate) -> Estimate:
+    """Return snow depth, melt or surface mass balance from a change, of a place or of cells (n,)."""
+    if section.kind == "snow_depth":
+        return change.with_offset(section.offset_m, section.offset_sigma_m)
     mass = water_equivalent(change, section.density_kg_m3 or 0.0, section.density_sigma_kg_m3)
-    return {section.kind: mass if section.kind == "surface_mass_balance" else mass.scaled(-1.0)}, coverage
+    return mass if section.kind == "surface_mass_balance" else mass.scaled(-1.0)
 
 
 def datum_of(aggregates: Aggregates) -> Floats:
@@ -62,7 +68,7 @@ def datum_of(aggregates: Aggregates) -> Floats:
     return np.broadcast_to(0.0, aggregates.grid.shape)
 
 
-def _observe(
+def observe_change(
     aggregates: Aggregates, cells: Bools, epoch: EpochRef, base: CountedFrom
 ) -> tuple[ObservedArea | None, Floats | float]:
     """Return the change of the observed cells (n,) of a place, and the factors by which it counts."""
@@ -80,7 +86,7 @@ def _new_snow(aggregates: Aggregates, cells: Bools, epoch: EpochRef, before: Epo
 
 def _mean(aggregates: Aggregates, cells: Bools, epoch: EpochRef, base: CountedFrom) -> tuple[Estimate, float]:
     """Return the mean change or height of a place with its voids interpolated, and its coverage."""
-    area, share = _observe(aggregates, cells, epoch, base)
+    area, share = observe_change(aggregates, cells, epoch, base)
     if area is None:
         return Estimate(), 0.0
     return _sum(aggregates, area, area.weights * share, area.value_m, area.void_m2), area.coverage
@@ -119,7 +125,7 @@ def _volume_budget(
     aggregates: Aggregates, cells: Bools, epoch: EpochRef, base: CountedFrom
 ) -> tuple[dict[str, Estimate], float]:
     """Return gain, loss and net of an area; each cell counts in one class, so they close exactly."""
-    area, counted = _observe(aggregates, cells, epoch, base)
+    area, counted = observe_change(aggregates, cells, epoch, base)
     if area is None:
         return dict.fromkeys(BUDGET, Estimate()), 0.0
     bounds = bounding_box(cells, 0)
