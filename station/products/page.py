@@ -47,7 +47,7 @@ from station.products.web.page_health import (
     summary_of_sigma,
     timeline,
 )
-from station.products.web.page_products import product_curves, product_values
+from station.products.web.page_products import product_curves, product_profiles, product_values
 from station.products.web.page_text import PAGE_TEXT, VIEWER_TEXT, format_number, format_utc, script_text
 from station.quantities import Floats
 from station.science.geometry.robust_statistics import NORMAL_95
@@ -150,6 +150,10 @@ def write_page(
         "products": [
             _product_curve(curve)
             for curve in product_curves(products, PAGE_TEXT[context.language])[:MAX_AREAS]
+        ],
+        "profiles": [
+            _product_profile(profile)
+            for profile in product_profiles(products, PAGE_TEXT[context.language])[:MAX_AREAS]
         ],
         "health": _health_curves(table, context) if table is not None else None,
     }
@@ -298,6 +302,12 @@ def _product_curve(curve: dict[str, Any]) -> dict[str, Any]:
     return curve | {key: _json_numbers(curve[key][kept], places) for key, places in digits.items()}
 
 
+def _product_profile(profile: dict[str, Any]) -> dict[str, Any]:
+    step = slice(None, None, math.ceil(len(profile["distance_m"]) / MAX_CURVE_POINTS))
+    digits = {"distance_m": 2, "values": profile["digits"], "sigma": profile["digits"] + 1}
+    return profile | {key: _json_numbers(profile[key][step], places) for key, places in digits.items()}
+
+
 def _health_curves(table: EpochTable, context: PageContext) -> dict[str, Any]:
     kept = _decimate(len(table))
     digits = {"platform_roll": 4, "platform_pitch": 4, "air_temperature": 1, "air_pressure": 1}
@@ -332,6 +342,7 @@ def _render(
         scans=[_scan_row(table, context, index) for index in recent] if table is not None else [],
         areas=[newest_value(area) for area in areas],
         products=product_values(products, text),
+        has_profiles=any(product.kind == "profile" for product in products),
         t=text,
         viewer=VIEWER_TEXT[context.language],
         language=context.language,
