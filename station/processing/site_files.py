@@ -103,8 +103,8 @@ def _load_product(site: Site, section: ProductSection, areas: dict[str, Bools]) 
     rasters = {key: read_geotiff(path, grid, site.grid_crs) for key, path in section.rasters.items()}
     files = tuple(sha256_file(path) for path in section.rasters.values())
     if section.line is not None:
-        line = sample_line(section.line, grid)
-        return Product(section, {section.name: line.cells}, line, rasters, files)
+        lines = {name: sample_line(points, grid) for name, points in section.lines.items()}
+        return Product(section, {name: line.cells for name, line in lines.items()}, lines, rasters, files)
     places = _areas_of(section, areas) if section.needs_areas else {section.name: _cells_at(section, grid)}
     for key in {"low", "high"} & rasters.keys():
         places = {name: cells & np.isfinite(rasters[key]) for name, cells in places.items()}

@@ -330,7 +330,9 @@ def test_profiles_are_drawn_along_their_line(write, context, series, small):
     line = sample_line(section.line, small.GRID)
     epochs.write_epoch(series, replace(small.make_epoch(6), verdict="unusable"))
     build_series(series)
-    update_products(series, [Product(section, {"across": line.cells}, line)], ["across"], lambda: None)
+    update_products(
+        series, [Product(section, {"across": line.cells}, {"across": line})], ["across"], lambda: None
+    )
     folder = write(replace(context, language="de"))
     height, change = page_data(folder)["profiles"]
     assert [height["quantity"], change["quantity"]] == ["Höhe", "Änderung seit der Referenz"]

@@ -56,7 +56,7 @@ class Product:
 
     section: ProductSection
     places: dict[str, Bools]  # cells (ny, nx) by name
-    line: Line | None = None
+    lines: Mapping[str, Line] = field(default_factory=dict)  # of the same names
     rasters: Mapping[str, Floats] = field(default_factory=dict)  # (ny, nx) given surfaces by key
     files: tuple[str, ...] = ()  # SHA-256 of these
 
@@ -159,8 +159,9 @@ class ProductQueries(Aggregates):
         return SurfaceScans(self, base, cells) if base else None
 
     def _file(self, product: Product) -> ProductFile:
-        section, line = product.section, product.line
-        if section.kind == "profile" and line is not None:
+        section = product.section
+        if section.kind == "profile":
+            (line,) = product.lines.values()
             return ProductFile(
                 section.key, section.name, section.kind, product.recipe, DISTANCE,
                 line.x_m, line.y_m, (), line.distance_m,
@@ -222,21 +223,22 @@ class ProductQueries(Aggregates):
     def _compute(
         self, product: Product, epoch: EpochRef, scans: SurfaceScans | None, earlier: list[EpochRef | None]
     ) -> Row:
-        section, line = product.section, product.line
+        section = product.section
         base = CountedFrom(scans, product.rasters.get("surface"))
-        if section.kind == "profile" and line is not None:
+        if section.kind == "profile":
+            (line,) = product.lines.values()
             along = profile(self, line, epoch)
             return {name: v for of, estimate in along.items() for name, v in parts_of(of, estimate).items()}
-        if section.kind == "contour" and line is not None:
-            estimates = contour(self, line, epoch, section.height_m, base)
-            return _columns({name: [estimate] for name, estimate in estimates.items()}, np.empty(0))
         values: dict[str, list[Estimate]] = {}
         coverage = []
-        for cells in product.places.values():
-            estimates, observed = place_quantities(
-                self, section, product.rasters, cells, epoch, base, earlier
-            )
-            coverage.append(observed)
+        for place, cells in product.places.items():
+            if section.kind == "contour":
+                estimates = contour(self, product.lines[place], epoch, section.height_m, base)
+            else:
+                estimates, observed = place_quantities(
+                    self, section, product.rasters, cells, epoch, base, earlier
+                )
+                coverage.append(observed)
             for name, estimate in estimates.items():
                 values.setdefault(name, []).append(estimate)
         return _columns(values, np.array(coverage))

@@ -33,7 +33,7 @@ def movement(series, index, surface=None, raster_m=None):
     )
     line = sample_line(section.line, GRID)
     rasters, files = ({}, ()) if raster_m is None else ({"surface": raster_m}, (surface,))
-    product = Product(section, {"test": line.cells}, line, rasters, files)
+    product = Product(section, {"test": line.cells}, {"test": line}, rasters, files)
     update_products(series, [product], [section.key], lambda: None)
     return station.product(series.folder, "test").isel(time=index, place=0)
 
@@ -147,6 +147,26 @@ def test_a_given_surface_has_no_errors(series, stored):
     systematic = epoch_m2(stored, LAST, here[1]) + reference_m2(stored, here[1])
     product = movement(series, LAST, "before.tif", raster_m)
     assert_movement(product, here, there, noise_m2(series, stored, LAST, here[1]), systematic)
+
+
+def test_transects_are_places_of_one_product(series):
+    """Each has the values of a product of its own; the mean of the surface is that of the cells of all."""
+    settings = {"name": "test", "kind": "contour", "height_m": LEVEL_M, "surface": SPAN}
+
+    def measured(line, **more):
+        section = ProductSection.model_validate(settings | {"line": line} | more)
+        lines = {name: sample_line(points, GRID) for name, points in section.lines.items()}
+        product = Product(section, {name: line.cells for name, line in lines.items()}, lines)
+        update_products(series, [product], [section.key], lambda: None)
+        return station.product(series.folder, "test")
+
+    transects = measured(ENDS, count=3, spacing_m=10.0)
+    assert transects.place.values.tolist() == ["0 m", "10 m", "20 m"]
+    assert transects.place_y.values.tolist() == pytest.approx([GRID.y_m[ROW + k] for k in range(3)])
+    for number in range(3):
+        alone = measured([(x_m, y_m - 10.0 * number) for x_m, y_m in ENDS])
+        for name in ("distance", "distance_change", "distance_uncertainty", "distance_change_uncertainty"):
+            np.testing.assert_allclose(transects[name][:, number], alone[name][:, 0], rtol=1e-9)
 
 
 def test_a_contour_that_the_surface_lacks_has_not_moved_a_known_distance(series):
