@@ -43,10 +43,11 @@ def write_store(folder):
     return series
 
 
-def mean_errors(stored, base):
-    """Return covariance of the parameters and variance of the line tilts of a mean of epochs."""
+def mean_errors(stored, base, index):
+    """Return covariance of the parameters and variance of the line tilts of a mean, against an epoch."""
     hours, common = np.array(HOURS)[list(base)], np.outer(common_mode(), common_mode())
     lasting = np.exp(-np.abs(np.subtract.outer(hours, hours)) / 6).mean()
+    lasting -= 2 * np.exp(-np.abs(HOURS[index] - hours) / 6).mean()  # what the epoch has of them
     single = stored.shared_parameter_covariance.values[list(base)].astype(float).mean(axis=0)
     line = stored.shared_parameter_line_tilt_variance.values[list(base)].mean(axis=0) / len(base)
-    return common + lasting * (single - common), line
+    return common + max(lasting, 1 / len(base)) * (single - common), line

@@ -24,6 +24,8 @@ class SurfaceScans:
         self._aggregates, self._cells = aggregates, cells
         kind = _kind(aggregates.read_shared(epochs[-1]))
         self._scans = [scan for scan in map(aggregates.read_shared, epochs) if _kind(scan) == kind]
+        self._parameters: tuple[SharedParameters, SharedParameters] | None = None  # of the mean of all
+        self._last: tuple[EpochRef, EpochRef | EpochMean] | None = None  # places of an epoch share it
         self._seen = np.zeros((len(self._scans), np.count_nonzero(cells)), np.bool_)  # (k, n)
         self._sums = np.zeros((2, self._seen.shape[1]))  # of change [m] and random variance [m²]
         for number, scan in enumerate(self._scans):
@@ -53,9 +55,15 @@ class SurfaceScans:
     def others(self, epoch: EpochRef) -> EpochRef | EpochMean:
         """Return the mean of all scans but that of an epoch, or the epoch of a single one.
 
-        Every scan has the same weight. What is common to their systematic errors does not average out; the
-        rest is taken to last for hours. Source: equations.md, 6.19.
+        Every scan has the same weight. Its covariance is for the difference of that epoch to it: what is
+        common to systematic errors does not average out, and the rest may last for hours. Source:
+        equations.md, 6.19.
         """
+        if self._last is None or self._last[0] != epoch:
+            self._last = epoch, self._others(epoch)
+        return self._last[1]
+
+    def _others(self, epoch: EpochRef) -> EpochRef | EpochMean:
         chosen = np.array([scan.epoch != epoch for scan in self._scans])
         scans = [scan for scan in self._scans if scan.epoch != epoch]
         if len(scans) < 2:
@@ -75,11 +83,15 @@ class SurfaceScans:
         if mean.shared is None:
             return EpochMean(cells, mean, number)
         members = [scan.shared for scan in scans if scan.shared is not None]
-        lasting = _lasting([scan.epoch.time_s for scan in scans])
-        single, common = _mean_parameters(scans, members)
+        lasting = _lasting([epoch.time_s, *(scan.epoch.time_s for scan in scans)])
+        if len(scans) < len(self._scans):
+            single, common = _mean_parameters(scans, members)
+        else:
+            single, common = self._parameters = self._parameters or _mean_parameters(scans, members)
+        share = float(_own_share(lasting, np.ones((len(scans), 1), np.bool_))[0])
         mean = replace(
             mean,
-            shared=_mean_of(single, common, float(lasting.mean()), 1 / len(scans)),
+            shared=_mean_of(single, common, share, 1 / len(scans)),
             members=(mean.shared, *(shared for shared in members if shared is not mean.shared)),
         )
         if (count == len(scans)).all():
@@ -100,7 +112,6 @@ class SurfaceScans:
         cells = np.zeros_like(self._cells)
         cells[self._cells] = partly
         seen, count = seen[:, partly], seen[:, partly].sum(axis=0)
-        share = sum(inside * (row @ seen) for inside, row in zip(seen, lasting, strict=True)) / count**2
         jacobian = self._aggregates.jacobian(mean, cells)
         own_m2, common_m2, line_m2 = (
             np.asarray(jacobian.variance(shared), np.float64)
@@ -111,7 +122,9 @@ class SurfaceScans:
             )
         )
         all_m2 = np.asarray(jacobian.variance(mean.shared), np.float64) if mean.shared else own_m2
-        variance_m2 = common_m2 + share * np.maximum(own_m2 - common_m2, 0.0) + line_m2 / count
+        variance_m2 = (
+            common_m2 + _own_share(lasting, seen) * np.maximum(own_m2 - common_m2, 0.0) + line_m2 / count
+        )
         ratio = np.divide(variance_m2, all_m2, out=np.ones(len(count)), where=all_m2 > 0)
         factor[partly] = np.sqrt(np.maximum(ratio, 1.0))
         return factor
@@ -126,6 +139,18 @@ def _kind(scan: EpochCells) -> tuple[str, bool, tuple[str, ...]]:
 def _lasting(times_s: list[float]) -> Floats:
     """Return the correlation (k, k) of errors of scans that last for hours."""
     return np.asarray(np.exp(-np.abs(np.subtract.outer(times_s, times_s)) / REFRACTION_CORRELATION_S))
+
+
+def _own_share(lasting: Floats, seen: Bools) -> Floats:
+    """Return the share (n,) of the variance of one scan that the mean of several adds to a difference.
+
+    Of what is not common to scans. It is the larger of that of errors that differ from scan to scan and of
+    those that last for hours, with the correlation (1 + k, 1 + k) of the other scan and those of the mean,
+    of which each cell has the ones `seen` (k, n). Source: equations.md, 6.19.
+    """
+    count = seen.sum(axis=0)
+    among = sum(inside * (row @ seen) for inside, row in zip(seen, lasting[1:, 1:], strict=True))
+    return np.asarray(np.maximum(1 / count, among / count**2 - 2 * (lasting[0, 1:] @ seen) / count))
 
 
 def _mean_parameters(

@@ -121,7 +121,7 @@ def test_a_contour_moved_since_the_mean_of_scans(series, stored):
     noise = noise_m2(series, stored, LAST, here[1])
     noise += sum(noise_m2(series, stored, index, there[1] / 3) for index in BASE)
     systematic = epoch_m2(stored, LAST, here[1]) + shared_m2(
-        stored, LAST, there[1], *mean_errors(stored, BASE)
+        stored, LAST, there[1], *mean_errors(stored, BASE, LAST)
     )
     systematic += reference_m2(stored, here[1] - there[1])
     systematic -= 2 * mode_effect(stored, here[1]) * mode_effect(stored, there[1])
@@ -134,7 +134,7 @@ def test_the_movement_in_a_scan_of_the_surface_has_its_error_once(series, stored
     own, others = here[1] - there[1] / 3, 2 / 3 * there[1]
     noise = noise_m2(series, stored, 0, own)
     noise += sum(noise_m2(series, stored, index, others / 2) for index in (1, 2))
-    systematic = epoch_m2(stored, 0, own) + shared_m2(stored, LAST, others, *mean_errors(stored, (1, 2)))
+    systematic = epoch_m2(stored, 0, own) + shared_m2(stored, LAST, others, *mean_errors(stored, (1, 2), 0))
     systematic += reference_m2(stored, here[1] - there[1])
     systematic -= 2 * mode_effect(stored, own) * mode_effect(stored, others)
     assert_movement(movement(series, 0, SPAN), here, there, noise, systematic)

@@ -33,7 +33,7 @@ def dense_sigmas(series, stored, weights, last, base):
         random += np.nansum((weights / count) ** 2 * independent_m2(stored, index, reference_m2))
     covariances = stored.shared_parameter_covariance.values.astype(float)
     lines = stored.shared_parameter_line_tilt_variance.values
-    mean, line = mean_errors(stored, base)
+    mean, line = mean_errors(stored, base, last)
     covariance = covariances[last] + mean - 2 * np.outer(common_mode(), common_mode())
     return random, random + shared_variance(stored, weights, last, covariance, lines[last] + line)
 
