@@ -70,7 +70,7 @@ STATIC = {  # the parts of each file; what the first words do not need is loaded
     "uplot.js": ("uplot.js",),
     "icon.svg": ("icon.svg",),
 }
-MAX_CURVE_POINTS = 250  # of a curve; of a longer series every nth, the newest included
+MAX_CURVE_POINTS = 240  # of a curve; of a longer series every nth, the newest included
 MAX_AREAS = 8  # with a curve, so that the page stays small
 TABLE_ROWS = 24
 MAX_EVENTS = 20  # newest events in the table

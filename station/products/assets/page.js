@@ -104,6 +104,8 @@
 
   const cell = (row, tag, text) => row.appendChild(document.createElement(tag)).textContent = text;
 
+  const half = (sigma) => sigma.map((s) => s == null ? null : 1.959964 * s);  // of the 95 % interval
+
   // What a curve is drawn over: time, or the distance from the start of a line.
   const TIME = { isTime: true, head: text.js_time, csv: "start_utc", word: utc, code: (s) => new Date(s * 1000).toISOString() };
   const DISTANCE = { isTime: false, head: text.js_distance_m, csv: "distance_m", word: (m) => `${formatNumber(m, 1)} m`, code: (m) => m };
@@ -222,15 +224,11 @@
     health.replaceChildren();
     for (const area of data.areas) {
       curve(areas, fill(text.js_area_curve, { area: area.name }), data.area_time_s, [
-        { values: area.mean_m, half: area.sigma_m.map((s) => s == null ? null : 1.959964 * s), digits: 3 }]);
+        { values: area.mean_m, half: half(area.sigma_m), digits: 3 }]);
     }
-    for (const product of data.products) {
-      curve(products, fill(text.js_product_curve, product), product.time_s, [
-        { values: product.values, half: product.sigma.map((s) => s == null ? null : 1.959964 * s), digits: product.digits }]);
-    }
-    for (const profile of data.profiles) {
-      curve(products, fill(text.js_product_profile, { ...profile, time: utc(profile.time_s) }), profile.distance_m, [
-        { values: profile.values, half: profile.sigma.map((s) => s == null ? null : 1.959964 * s), digits: profile.digits }], null, DISTANCE);
+    for (const p of [...data.products, ...data.profiles]) {
+      const x = p.distance_m, title = fill(x ? text.js_product_profile : text.js_product_curve, { ...p, time: x && utc(p.time_s) });
+      curve(products, title, x || p.time_s, [{ values: p.values, half: half(p.sigma), digits: p.digits }], null, x ? DISTANCE : TIME);
     }
     if (data.health) drawHealth(health, data.health);
     flush();
