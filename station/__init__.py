@@ -122,16 +122,27 @@ def levels(
     return filter_levels(series, to_mask(area, series), lambda: None, monthly=every == "1M")
 
 
-def product(site_or_folder: str | Path, name: str) -> xr.Dataset:
+def product(site_or_folder: str | Path, name: str, epoch: Epoch | None = None) -> xr.Dataset:
     """Return a product of the site file over time, with one sigma and its random and systematic part.
 
     Also from a copy of the store: it is the content of `products/NAME.nc`. Places are selected by name, as in
     `station.product(folder, "snow depth").sel(place="bowl").snow_depth`. Scans whose `verdict` is 2 must not
-    be used. Raises StationError if there is no product of this name.
+    be used. With an epoch, as that of `station.variance`, the snow depth, melt or mass balance of each cell
+    (y, x) is computed, with the sigma of a cell; that needs the site file. Raises StationError if there is no
+    product of this name, no such epoch or no map of it.
     """
     from station.archive.derived.product_files import open_product
     from station.archive.series.index import data_folder
 
+    if epoch is not None:
+        from station.config import read_site
+        from station.processing.site_files import load_product, series_for
+        from station.queries.site_products.product_maps import map_dataset
+        from station.queries.site_products.product_queries import ProductQueries
+
+        site = read_site(site_or_folder)
+        queries = ProductQueries(series_for(site))
+        return map_dataset(queries, load_product(site, name), queries.find_epoch(epoch))
     return open_product(data_folder(site_or_folder), name)
 
 

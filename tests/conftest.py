@@ -12,7 +12,7 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 pytest_plugins = ["support.epochs", "support.site"]
 LONGEST = (  # files whose integration tests take longest, which begin first
     "test_truth", "test_kills", "test_large", "test_simulated_world", "test_earlier_findings",
-    "test_docs_snippets", "test_reprocessing", "test_world", "test_pose_stability",
+    "test_products_truth", "test_docs_snippets", "test_reprocessing", "test_world", "test_pose_stability",
 )  # fmt: skip
 PROJECT = Path(__file__).resolve().parents[1]
 

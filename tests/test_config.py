@@ -351,6 +351,7 @@ def test_a_scanner_of_its_own_counts_for_its_sop_alone(tmp_path):
 
 POINT = '[[product]]\nname = "stake 1"\nkind = "point"\nat = [5, 5]\n'
 BACKWARDS = "surface = { from = 2026-05-02T00:00:00Z, to = 2026-05-01T00:00:00Z }\n"
+SHORELINE = '[[product]]\nname = "shore"\nkind = "contour"\nheight_m = 0.5\nline = [[1, 2], [3, 4]]\n'
 ALARM = '[[alarms.product]]\nproduct = "{}"\nquantity = "elevation_change"\n'
 
 
@@ -368,6 +369,8 @@ ALARM = '[[alarms.product]]\nproduct = "{}"\nquantity = "elevation_change"\n'
             "to must be after from",
         ),
         ('[[product]]\nname = "a"\nkind = "profile"\nline = [[1, 2]]\n', "product.0.line: "),
+        (f"{SHORELINE}count = 3\n", "count and spacing_m belong together"),
+        (f"{SHORELINE.replace('[3, 4]', '[1, 2]')}count = 3\nspacing_m = 5\n", "line ends where it begins"),
         (
             POINT + ALARM.format("stake") + "above = 1\n",
             "alarms.product: no [[product]] has the name 'stake'",
@@ -378,6 +381,17 @@ ALARM = '[[alarms.product]]\nproduct = "{}"\nquantity = "elevation_change"\n'
 def test_products_that_contradict_themselves_are_refused(tmp_path, more, message):
     with pytest.raises(ConfigError, match=re.escape(message)):
         read(tmp_path, GOOD + more)
+
+
+def test_parallel_lines_lie_to_the_right_of_the_first(tmp_path):
+    """Of one that goes north they lie to the east."""
+    north = SHORELINE.replace("[[1, 2], [3, 4]]", "[[1, 2], [1, 8], [1, 12]]")
+    (product,) = read(tmp_path, GOOD + f"{north}count = 3\nspacing_m = 2.5\n").product
+    assert product.lines == {
+        f"{k:g} m": ((1 + k, 2), (1 + k, 8), (1 + k, 12)) for k in (0.0, 2.5, 5.0)
+    }  # fmt: skip
+    (single,) = read(tmp_path, GOOD + north).product
+    assert single.lines == {"shore": ((1, 2), (1, 8), (1, 12))}
 
 
 def test_products_have_the_paths_of_their_files(tmp_path):

@@ -9,99 +9,23 @@ import laspy
 import numpy as np
 import pytest
 import xarray as xr
-from support.series import open_with_processing
+from support.processed_station import BOX, REFERENCE, ProcessedStation, product_of, rms
 
-import station
-from station.config import read_site
-from station.inbox.listing import ScanFile
 from station.monitoring.log_clock import log_clock_offset
-from station.processing import reference_tasks, scan_tasks, store_tasks
 from station.products.area_tables import Span
 from station.products.trend_tables import trend_records
 from station.quantities import Quality
-from station.queries.aggregates import Aggregates
-from station.queries.site_products.product_queries import Product, update_products
 from station.science.analysis.inclination_check import MAX_OFFSET_S
-from station.sections.product import ProductSection
 from station.simulation.instrument.motion import sensor_faults
 from station.simulation.scenario import named
 from station.simulation.station import simulate
 
 pytestmark = pytest.mark.integration
-REFERENCE = 3  # scans
 CALM = replace(named("quiet", hours=6), reference_scans=REFERENCE)
 PERFECT = CALM.without_errors()
 SHOTS_ONLY = {"range_noise_m": 0.01, "beam_divergence_mrad": 0.12, "line_jitter_deg": 0.0008}
-BOX = 10  # cells of 10 m
 SEEDS = (1, 2, 3, 4, 5)
 FILTERED = ('method = "joint"', 'method = "none"')
-
-
-class ProcessedStation:
-    """A simulated station, processed, optionally with changes of its site file."""
-
-    def __init__(self, folder, *changes, first=REFERENCE):
-        self.folder, name = folder, "site"
-        if changes:
-            name = f"other-{len(list(folder.glob('*.toml')))}"
-            text = (folder / "site.toml").read_text()
-            for old, new in (*changes, ('data = "data"', f'data = "{name}"')):
-                assert old in text
-                text = text.replace(old, new)
-            (folder / f"{name}.toml").write_text(text)
-        self.site = read_site(folder / f"{name}.toml")
-        scans = []
-        for path in sorted(self.site.scans.inbox.glob("*.laz")):
-            log = path.with_name(f"{path.stem}-incl.txt")
-            log = log if self.site.inclination and log.is_file() else None
-            status = path.stat()
-            scans.append(ScanFile(path.name, path, log, status.st_size, status.st_mtime_ns))
-        reference_tasks.build_reference_version(self.site, scans[:REFERENCE], "1", lambda: None)
-        self.results = [scan_tasks.process(self.site, scan, lambda: None) for scan in scans[first:]]
-        store_tasks.update_series(self.site, lambda: None)
-        with open_with_processing(self.site.station.data) as series:
-            self.series = series.load()
-        truth = xr.open_dataset(folder / "truth.nc").load()
-        before = truth.change[:REFERENCE].mean("time")
-        self.true_change = (truth.change[first:] - before).values
-        self.true_elevation = truth.elevation[first:].values
-        self.stable = truth.stable_polygons.values.astype(bool)
-        self.aggregates = Aggregates(scan_tasks.series_for(self.site))
-        x, y = self.series.scanner_east.values[0], self.series.scanner_north.values[0]
-        self.distance_m = np.hypot(self.series.x.values - x, self.series.y.values[:, None] - y)
-
-    def error(self):
-        return self.series.elevation_change.values - self.true_change
-
-    def boxes(self, errors=None, *, everywhere=False):
-        """Return error [m], sigma [m] and distance [m] of every 100 m box, by default off stable ground."""
-        rows = []
-        for scan, error in enumerate(self.error() if errors is None else errors):
-            epoch = self.aggregates.find_epoch(scan)
-            for top in range(0, error.shape[0] - BOX, 2 * BOX):
-                for left in range(0, error.shape[1] - BOX, 2 * BOX):
-                    box = np.s_[top : top + BOX, left : left + BOX]
-                    observed = np.isfinite(error[box])
-                    if observed.mean() < 0.6 or (self.stable[box].any() and not everywhere):
-                        continue
-                    weights = np.zeros(error.shape)
-                    weights[box] = observed / observed.sum()
-                    sigma = np.sqrt(self.aggregates.variance(weights, epoch))
-                    rows.append((error[box][observed].mean(), sigma, self.distance_m[box].mean()))
-        return np.array(rows).T
-
-    def area_z(self):
-        """Return the mean error of all cells off stable ground over its sigma, by scan."""
-        z = []
-        for scan, error in enumerate(self.error()):
-            observed = np.isfinite(error) & ~self.stable
-            variance = self.aggregates.variance(observed / observed.sum(), self.aggregates.find_epoch(scan))
-            z.append(error[observed].mean() / np.sqrt(variance))
-        return np.array(z)
-
-
-def rms(values):
-    return np.sqrt(np.mean(np.square(values)))
 
 
 def test_random_sigma_is_calibrated(tmp_path):
@@ -250,13 +174,6 @@ def test_area_changes_are_stored_with_every_epoch(calm):
         assert (areas.mean_change_uncertainty < 0.02).all()
 
 
-def product_of(calm, places, **settings):
-    section = ProductSection.model_validate({"name": "product", **settings})
-    series = scan_tasks.series_for(calm.site)
-    update_products(series, [Product(section, places)], [section.key], lambda: None)
-    return station.product(series.folder, "product")
-
-
 def test_products_are_calibrated(calm):
     """Depth above the first scan, and gain and loss where nothing changed, in boxes with their voids."""
     error_m, boxes = calm.error(), {}
@@ -279,35 +196,6 @@ def test_products_are_calibrated(calm):
         z = budget[name].values / budget[f"{name}_uncertainty"].values
         assert 0.8 < rms(z[np.isfinite(z)]) < 1.25
         assert abs(float(budget[name].mean())) < 0.1 * positive_m3  # the sum of positive cells is no gain
-
-
-@pytest.mark.slow
-def test_products_of_melt_are_calibrated(tmp_path):
-    """Melt, mass balance and height of places on the ice, of exactly known density, on two stations."""
-    z = defaultdict(list)
-    for seed in (1, 2):
-        melting = {"reference_scans": REFERENCE, "melt_m_per_h": 0.01}
-        simulate(tmp_path / f"{seed}", replace(named("melt", hours=6, seed=seed), **melting))
-        processed = ProcessedStation(tmp_path / f"{seed}")
-        melts = (processed.true_change[-1] < -0.005) & np.isfinite(processed.error()).all(axis=0)
-        places = {}
-        for top, left in np.ndindex(*(size // BOX for size in melts.shape)):
-            cells = np.zeros(melts.shape, bool)
-            cells[BOX * top :, BOX * left :][:3, :3] = True
-            if melts[cells].all():
-                places[f"{top} {left}"] = cells
-        places = dict(list(places.items())[:: len(places) // 20])
-        assert len(places) >= 20
-        true_m = np.array([[m[cells].mean() for cells in places.values()] for m in processed.true_change])
-        for kind, density, true in (
-            ("melt", {"density_kg_m3": 900.0}, -0.9 * true_m),
-            ("surface_mass_balance", {"density_kg_m3": 400.0}, 0.4 * true_m),
-        ):
-            product = product_of(processed, places, kind=kind, **density)
-            z[kind] += [(product[kind].values - true) / product[f"{kind}_uncertainty"].values]
-        point = product_of(processed, places, kind="point", at=(0.0, 0.0))
-        z["point"] += [(point.elevation_change.values - true_m) / point.elevation_change_uncertainty.values]
-    assert all(0.8 < rms(np.hstack(values)) < 1.25 for values in z.values())
 
 
 @pytest.fixture(scope="module")

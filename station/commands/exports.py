@@ -114,6 +114,14 @@ def export(
             metavar="URL", help="References: address of the data folder; default here.", show_default=False
         ),
     ] = None,
+    product: Annotated[
+        str | None,
+        typer.Option(
+            metavar="NAME",
+            help="GeoTIFF, NetCDF: the map of this product (snow depth, melt, mass balance) instead.",
+            show_default=False,
+        ),
+    ] = None,
     file_format: Annotated[
         FileFormat | None,
         typer.Option(
@@ -134,6 +142,8 @@ def export(
     quality of its cell. transformations: how the scanner had moved at these epochs, as 4 x 4 matrices, and
     their covariance. levels: level and rate of each cell as GeoTIFF, or as NetCDF with all days in one file,
     of the newest day that is over, or of the days and months of a span.
+    geotiff and netcdf with --product: its value in each cell with one sigma and its two parts, of the newest
+    epoch or those of a span.
     """
     from station.config import read_site
     from station.products.area_tables import Span
@@ -141,15 +151,17 @@ def export(
 
     settings, span = read_site(site), Span.parse(first, last)
     chosen_format = _file_format(kind, file_format)
+    options = SeriesOptions(every and every.value, area, variables, chunks, url)
+    if product is not None:
+        _refuse(options, "a map")
+        for path in _export_maps(settings, kind, product, out, span if first or last else None):
+            print(path)
+        return
     if kind not in OF_EPOCHS:
-        options = SeriesOptions(every and every.value, area, variables, chunks, url)
         for path in _export_series(settings, kind.value, out, span, options):
             print(path)
         return
-    if given := [name for name, value in (
-        ("--every", every), ("--area", area), ("--variables", variables), ("--chunks", chunks), ("--url", url)
-    ) if value is not None]:  # fmt: skip
-        raise typer.BadParameter(f"{given[0]} is for the series, not for {kind.value}")
+    _refuse(options, kind.value)
     if kind is ExportFormat.points:
         from station.operations.point_export import export_points
 
@@ -174,6 +186,23 @@ def export(
         settings, kind.value, span if first or last else None, out, progress_bar("writing")
     ):
         print(path)
+
+
+def _export_maps(settings: Site, kind: ExportFormat, name: str, out: Path, span: Span | None) -> list[Path]:
+    """Write the maps of a product and return the files."""
+    from station.processing.site_files import load_product, series_for
+    from station.products.exports.product_maps import export_maps
+
+    if kind not in {ExportFormat.geotiff, ExportFormat.netcdf}:
+        raise typer.BadParameter(f"--product: a map is geotiff or netcdf, not {kind.value}")
+    product = load_product(settings, name)
+    return export_maps(series_for(settings), product, span, out, kind.value, progress_bar("computing"))
+
+
+def _refuse(options: SeriesOptions, kind: str) -> None:
+    """Raise BadParameter if an option of the series is given."""
+    if given := [name for name, value in vars(options).items() if value is not None]:
+        raise typer.BadParameter(f"--{given[0]} is for the series, not for {kind}")
 
 
 def _file_format(kind: ExportFormat, file_format: FileFormat | None) -> str:

@@ -180,7 +180,9 @@ def events(
 
         write_geoparquet(series_in(settings.station.data), found, geoparquet)
         return
-    print_or_write(as_text(found) if table is None else as_csv(found), table)
+    print_or_write(
+        as_text(found, on_map=settings.grid.plane is None) if table is None else as_csv(found), table
+    )
 
 
 def _print_epochs(settings: Site, *texts: str) -> None:

@@ -188,6 +188,7 @@ def _area_changes(site: Site, rule: ChangeAlarm, assessed_until_utc_s: float | N
             f"alarms.change names areas that are not in areas.file: {', '.join(sorted(unknown_areas))}",
         )
     watched = [curve for curve in curves if not rule.areas or curve.name in rule.areas]
+    verbs = ("fell", "rose") if site.grid.plane is None else ("moved in", "moved out")
     for curve in watched:
         detections = change_alarms(
             curve, rule, areas=len(watched), expected_every_s=site.scans.expected_every_s
@@ -197,7 +198,7 @@ def _area_changes(site: Site, rule: ChangeAlarm, assessed_until_utc_s: float | N
         )
         is_new[-1:] |= detections.detected[-1:]
         if is_new.any():
-            yield _change_alarm(curve, detections, rule, int(np.flatnonzero(is_new)[-1]))
+            yield _change_alarm(curve, detections, rule, int(np.flatnonzero(is_new)[-1]), verbs)
 
 
 def _events(site: Site, rule: EventAlarm, assessed_until_utc_s: float | None) -> Iterator[Alarm]:
@@ -211,9 +212,12 @@ def _events(site: Site, rule: EventAlarm, assessed_until_utc_s: float | None) ->
             continue
         if is_new or event.state == "active":
             half_m3 = NORMAL_95 * event.volume_sigma_m3
+            where = f"{event.east_m:.0f} {event.north_m:.0f}"
+            if site.grid.plane is not None:
+                where = f"{event.east_m:.0f} m along, {event.north_m:.0f} m up the face"
             text = (
                 f"{event.kind} of {event.volume_m3:+z.0f} m³ (± {half_m3:.0f} m³ at 95 %) on"
-                f" {event.area_m2:.0f} m² at {event.east_m:.0f} {event.north_m:.0f},"
+                f" {event.area_m2:.0f} m² at {where},"
                 f" {event.begin[:16].replace('T', ' ')} UTC"
             )
             yield Alarm(f"event {event.id}", text, size=abs(event.volume_m3))
@@ -235,11 +239,13 @@ def change_alarms(
     )
 
 
-def _change_alarm(curve: AreaCurve, detections: ChangeDetections, rule: ChangeAlarm, index: int) -> Alarm:
+def _change_alarm(
+    curve: AreaCurve, detections: ChangeDetections, rule: ChangeAlarm, index: int, verbs: tuple[str, str]
+) -> Alarm:
     size_m, sigma_m = float(detections.change_m[index]), float(detections.sigma_m[index])
     when = f"{datetime.fromtimestamp(curve.time_s[index], UTC):%Y-%m-%d %H:%M}"
     text = (
-        f"{curve.name} {'rose' if size_m > 0 else 'fell'} by {abs(size_m):.3g} m"
+        f"{curve.name} {verbs[int(size_m > 0)]} by {abs(size_m):.3g} m"
         f" (± {SIGNIFICANT_SIGMAS * sigma_m:.2g} m at 95 %) in the {rule.within_h:g} h before {when} UTC"
     )
     return Alarm(f"change in {curve.name}", text, size=abs(size_m))

@@ -18,7 +18,7 @@ from station.queries.site_products.profile_lines import sample_line
 from station.readers.flags import read_flags, reasons_for
 from station.readers.polygons import cells_inside, read_polygons
 from station.readers.raster import read_geotiff
-from station.sections.product import ProductSection
+from station.sections.product import ProductSection, product_key
 
 
 def series_for(site: Site) -> Series:
@@ -85,19 +85,31 @@ def load_products(site: Site) -> tuple[list[Product], list[str]]:
     return products, faults
 
 
+def load_product(site: Site, name: str) -> Product:
+    """Return a product of a site by its name or that of its file.
+
+    Raises StationError if there is none, ConfigError if a raster, an area or a place of it cannot be used.
+    """
+    for section in site.product:
+        if section.key == product_key(name):
+            return _load_product(site, section, load_areas(site) if section.needs_areas else {})
+    known = ", ".join(section.name for section in site.product) or "none"
+    raise StationError(f"no product {name!r} in the site file; products: {known}")
+
+
 def _load_product(site: Site, section: ProductSection, areas: dict[str, Bools]) -> Product:
     """Return a product; raise ConfigError if a raster, an area or a place of it cannot be used."""
     grid = site.grid_cells
-    if section.line is not None:
-        line = sample_line(section.line, grid)
-        return Product(section, {section.name: line.cells}, line)
-    places = _areas_of(section, areas) if section.needs_areas else {section.name: _cells_at(section, grid)}
     rasters = {key: read_geotiff(path, grid, site.grid_crs) for key, path in section.rasters.items()}
+    files = tuple(sha256_file(path) for path in section.rasters.values())
+    if section.line is not None:
+        lines = {name: sample_line(points, grid) for name, points in section.lines.items()}
+        return Product(section, {name: line.cells for name, line in lines.items()}, lines, rasters, files)
+    places = _areas_of(section, areas) if section.needs_areas else {section.name: _cells_at(section, grid)}
     for key in {"low", "high"} & rasters.keys():
         places = {name: cells & np.isfinite(rasters[key]) for name, cells in places.items()}
     if empty := [name for name, cells in places.items() if not cells.any()]:
         raise ConfigError(f"no cell of the grid in {', '.join(empty)}: are the coordinates those of the map?")
-    files = tuple(sha256_file(path) for path in section.rasters.values())
     return Product(section, places, rasters=rasters, files=files)
 
 

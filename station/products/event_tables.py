@@ -83,10 +83,11 @@ def write_geoparquet(series: Series, events: Iterable[Event], path: Path) -> Non
         parquet.write_table(pa.table(columns).replace_schema_metadata({"geo": json.dumps(geo)}), tmp_path)
 
 
-def as_text(events: Iterable[Event]) -> str:
+def as_text(events: Iterable[Event], *, on_map: bool) -> str:
     """Return a text table with 95 % intervals."""
+    axes = ("east, m", "north, m") if on_map else ("along, m", "up, m")
     header = (
-        "begin, UTC", "end, UTC", "kind", "state", "east, m", "north, m", "area, m²", "depth, m",
+        "begin, UTC", "end, UTC", "kind", "state", *axes, "area, m²", "depth, m",
         "volume, m³", "95 %", "balance, m³",
     )  # fmt: skip
     body = [

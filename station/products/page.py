@@ -47,8 +47,8 @@ from station.products.web.page_health import (
     summary_of_sigma,
     timeline,
 )
-from station.products.web.page_products import product_curves, product_values
-from station.products.web.page_text import PAGE_TEXT, VIEWER_TEXT, format_number, format_utc, script_text
+from station.products.web.page_products import product_curves, product_profiles, product_values
+from station.products.web.page_text import PAGE_TEXT, PageText, format_number, format_utc
 from station.quantities import Floats
 from station.science.geometry.robust_statistics import NORMAL_95
 
@@ -70,7 +70,7 @@ STATIC = {  # the parts of each file; what the first words do not need is loaded
     "uplot.js": ("uplot.js",),
     "icon.svg": ("icon.svg",),
 }
-MAX_CURVE_POINTS = 250  # of a curve; of a longer series every nth, the newest included
+MAX_CURVE_POINTS = 240  # of a curve; of a longer series every nth, the newest included
 MAX_AREAS = 8  # with a curve, so that the page stays small
 TABLE_ROWS = 24
 MAX_EVENTS = 20  # newest events in the table
@@ -111,6 +111,7 @@ def write_page(
     table = read_epoch_table(series) if series.path.is_file() else None
     all_areas = usable_area_series(series, table) if table is not None else []
     areas, products = all_areas[:MAX_AREAS], read_products(series.folder)
+    text = PageText.of(context.language, on_map=series.grid.plane.is_map)
     gallery, curves = Gallery([], LevelMaps(), None, (0, 0), {}), None
     if table is not None:
         style = Style(context.name or series.station_id, width_px, limit_m)
@@ -126,7 +127,7 @@ def write_page(
         "written_s": context.written_s,
         "expected_every_s": context.expected_every_s,
         "station": series.station_id,
-        "text": script_text(context.language),
+        "text": text.script,
         "maps": [
             {
                 "time_s": image.start.timestamp(),
@@ -147,9 +148,9 @@ def write_page(
         "curves": curves,
         "area_time_s": _json_numbers(areas[0].start_s[_decimate(len(areas[0].start_s))], 0) if areas else [],
         "areas": [_area_curve(area) for area in areas],
-        "products": [
-            _product_curve(curve)
-            for curve in product_curves(products, PAGE_TEXT[context.language])[:MAX_AREAS]
+        "products": [_product_curve(curve) for curve in product_curves(products, text.page)[:MAX_AREAS]],
+        "profiles": [
+            _product_profile(profile) for profile in product_profiles(products, text.page)[:MAX_AREAS]
         ],
         "health": _health_curves(table, context) if table is not None else None,
     }
@@ -298,6 +299,12 @@ def _product_curve(curve: dict[str, Any]) -> dict[str, Any]:
     return curve | {key: _json_numbers(curve[key][kept], places) for key, places in digits.items()}
 
 
+def _product_profile(profile: dict[str, Any]) -> dict[str, Any]:
+    step = slice(None, None, math.ceil(len(profile["distance_m"]) / MAX_CURVE_POINTS))
+    digits = {"distance_m": 2, "values": profile["digits"], "sigma": profile["digits"] + 1}
+    return profile | {key: _json_numbers(profile[key][step], places) for key, places in digits.items()}
+
+
 def _health_curves(table: EpochTable, context: PageContext) -> dict[str, Any]:
     kept = _decimate(len(table))
     digits = {"platform_roll": 4, "platform_pitch": 4, "air_temperature": 1, "air_pressure": 1}
@@ -321,7 +328,8 @@ def _render(
     area_count: int,
     products: list[ProductSeries],
 ) -> str:
-    events, text = read_events(series.folder), PAGE_TEXT[context.language]
+    events, texts = read_events(series.folder), PageText.of(context.language, on_map=series.grid.plane.is_map)
+    text = texts.page
     by_range = calibration_by_range(series, table, folder, text) if table is not None else []
     recent = range(max(0, len(table) - TABLE_ROWS), len(table))[::-1] if table is not None else []
     return PAGE.render(
@@ -332,8 +340,9 @@ def _render(
         scans=[_scan_row(table, context, index) for index in recent] if table is not None else [],
         areas=[newest_value(area) for area in areas],
         products=product_values(products, text),
+        has_profiles=any(product.kind == "profile" for product in products),
         t=text,
-        viewer=VIEWER_TEXT[context.language],
+        viewer=texts.viewer,
         language=context.language,
         calibration=summary_of_sigma(table, by_range),
         by_range=by_range,

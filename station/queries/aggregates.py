@@ -23,6 +23,7 @@ from station.archive.small_variables import read_number
 from station.quantities import Bools, Floats, Grid, Quality, Reals, SharedParameters
 from station.queries.epoch_cells import (
     EpochCells,
+    EpochMean,
     EpochReader,
     bounding_box,
     observed_in_all,
@@ -35,7 +36,11 @@ from station.science.analysis.voids import area_weights, void_variance
 from station.science.geometry.terrain import smooth_gradient
 from station.science.uncertainty.common_mode import cross_covariance
 from station.science.uncertainty.jacobian import HeightJacobian, cell_jacobian
-from station.science.uncertainty.propagation import aggregate_variance, difference_to_reference
+from station.science.uncertainty.propagation import (
+    aggregate_variance,
+    cell_covariances,
+    difference_to_reference,
+)
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -117,11 +122,16 @@ class Aggregates(EpochReader):
         )
 
     def observe(
-        self, cells: Bools, epoch: EpochRef, other: EpochRef | None = None, surface_m: Floats | None = None
+        self,
+        cells: Bools,
+        epoch: EpochRef,
+        other: EpochRef | EpochMean | None = None,
+        surface_m: Floats | None = None,
     ) -> ObservedArea | None:
         """Return the cells (ny, nx) that an epoch observed, or both of two; None if there are none.
 
-        With `surface_m` (ny, nx), the values are heights above it where it is known.
+        The other may be the mean of several. With `surface_m` (ny, nx), the values are heights above it where
+        it is known.
         """
         epochs = self._read_epochs(cells, epoch, other)
         common_cells = observed_in_all(epochs, cells)
@@ -133,7 +143,7 @@ class Aggregates(EpochReader):
             return None
         value_m = epochs[0].change_m[observed] - (0.0 if other is None else epochs[1].change_m[observed])
         if surface_m is not None:
-            value_m += self._mean_elevation(epochs[0], common_cells) - surface_m[common_cells]
+            value_m += self.mean_elevation(epochs[0], common_cells) - surface_m[common_cells]
         above_surface = surface_m is not None
         random_m2 = self._random_variances(epochs, common_cells, observed, above_surface=above_surface)
         value_map_m, noise_map_m2 = np.full(cells[bounds].shape, np.nan), np.zeros(cells[bounds].shape)
@@ -164,16 +174,37 @@ class Aggregates(EpochReader):
         return min(float(weights**2 @ np.sum(area.random_m2, axis=0)), total), total
 
     def cell_variances(self, area: ObservedArea) -> tuple[Floats, Floats]:
-        """Return the random and the systematic variance (n,) of each cell of an area in one epoch [m²]."""
-        epoch_cells = area.epochs[0]
-        shared = shared_of(area.epochs, epoch_cells, above_surface=area.above_surface)
-        random_m2 = area.random_m2[0]
-        if shared is None:
-            return random_m2, np.zeros(len(random_m2))
-        shared_m2 = self.jacobian(epoch_cells, area.cells).variance(shared)
-        return random_m2, np.maximum(shared_m2, 0.0, dtype=np.float64)
+        """Return the random and the systematic variance (n,) of each cell of an area [m²].
 
-    def _mean_elevation(self, epoch_cells: EpochCells, cells: Bools) -> Floats:
+        They are those of `sum_variance` for a weight of one in one cell.
+        """
+        random_m2 = np.asarray(np.sum(area.random_m2, axis=0, dtype=np.float64))
+        total_m2, lower_m2, jacobians = np.zeros(len(random_m2)), np.zeros(len(random_m2)), []
+        for epoch_cells, independent_m2 in zip(area.epochs, area.random_m2, strict=True):
+            shared = shared_of(area.epochs, epoch_cells, above_surface=area.above_surface)
+            if shared is None:
+                total_m2, lower_m2 = total_m2 + independent_m2, lower_m2 + independent_m2
+                continue
+            jacobian = self.jacobian(epoch_cells, area.cells)
+            absorbed = (
+                self.leverage(epoch_cells, area.cells, jacobian, independent_m2)
+                if len(area.epochs) > 1
+                else None
+            )
+            independent = 1.0 if absorbed is None else 1 - absorbed
+            shared_m2 = jacobian.variance(shared) * (2 * independent - 1)
+            total_m2 += np.maximum(independent_m2 + shared_m2, independent_m2 * independent)
+            lower_m2 += independent_m2 * independent
+            factor = epoch_cells.jacobian_factor
+            jacobians.append(jacobian if factor is None else jacobian.scaled(1 / factor[area.cells]))
+        covariance = common_error_covariance(area.epochs)
+        if covariance is not None:
+            total_m2 -= 2 * cell_covariances(jacobians[0], jacobians[1], covariance)
+        total_m2 = np.maximum(total_m2, lower_m2)
+        random_m2 = np.minimum(random_m2, total_m2)
+        return random_m2, total_m2 - random_m2
+
+    def mean_elevation(self, epoch_cells: EpochCells, cells: Bools) -> Floats:
         """Return the heights (n,) that the change of an epoch is counted from [m]."""
         rows, columns = bounding_box(cells, 0)
         height_m = self._surfaces.height_m(epoch_cells.reference.version, rows, columns)
@@ -212,7 +243,9 @@ class Aggregates(EpochReader):
             variance_m2 += jacobian.variance(shared)
         return variance_m2
 
-    def _read_epochs(self, cells: Bools, epoch: EpochRef, other: EpochRef | None) -> list[EpochCells]:
+    def _read_epochs(
+        self, cells: Bools, epoch: EpochRef, other: EpochRef | EpochMean | None
+    ) -> list[EpochCells]:
         return [
             self.read_cells(epoch_ref, cells) for epoch_ref in ([epoch] if other is None else [epoch, other])
         ]
@@ -262,7 +295,10 @@ class Aggregates(EpochReader):
                 )
                 continue
             jacobian = self.jacobian(epoch_cells, common_cells)
-            aggregated.append(jacobian.aggregate(weights))
+            factor = epoch_cells.jacobian_factor
+            aggregated.append(
+                jacobian.aggregate(weights if factor is None else weights / factor[common_cells])
+            )
             noise_leverage = (
                 self.leverage(epoch_cells, common_cells, jacobian, independent_m2)
                 if len(epochs) > 1
@@ -282,9 +318,13 @@ class Aggregates(EpochReader):
     ) -> Floats | None:
         """Return the leverage (n,) of the noise of the cells on the adjustment of an epoch; None if unknown.
 
-        Used for differences only. Relative to the reference, it would remove about as much as the error of
-        the reference itself, a tenth of a millimetre for an area, which is counted nowhere else.
+        That of a mean of epochs is not counted, which makes sigma slightly too large.
+        Used for differences only.
+        Relative to the reference, it would remove about as much as the error of the reference itself, a tenth
+        of a millimetre for an area, which is counted nowhere else.
         """
+        if epoch_cells.members:
+            return None
         index = epoch_cells.epoch.index
         with h5py.File(epoch_cells.epoch.path, "r") as file:
             if not epoch_cells.adjusted or not set(LEVERAGE_VARIABLES) <= set(file):
@@ -366,7 +406,10 @@ class Aggregates(EpochReader):
         jacobian = cell_jacobian(
             params, window_grid, position_m, window_m, gradient, cells[rows, columns], rock
         )
-        return _scaled_to_cells(jacobian, epoch_cells, cells) if epoch_cells.has_positions else jacobian
+        if epoch_cells.has_positions:
+            jacobian = _scaled_to_cells(jacobian, epoch_cells, cells)
+        factor = epoch_cells.jacobian_factor
+        return jacobian if factor is None else jacobian.scaled(factor[cells])
 
 
 LEVERAGE_VARIABLES = ("adjustment_leverage_moving", "adjustment_leverage_stable")
@@ -391,11 +434,12 @@ def _scaled_to_cells(jacobian: HeightJacobian, epoch_cells: EpochCells, cells: B
 
     The covariance of an epoch of several positions is that of a mean cell. Source: equations.md, 6.13.
     """
-    if epoch_cells.shared is None:
+    shared = epoch_cells.members[0] if epoch_cells.members else epoch_cells.shared
+    if shared is None:
         return jacobian
     with h5py.File(epoch_cells.epoch.path, "r") as file:
         systematic_m = read_cells_of(file, SYSTEMATIC, epoch_cells.epoch.index, cells)
-    sigma_m = np.sqrt(np.asarray(jacobian.variance(epoch_cells.shared), np.float64))
+    sigma_m = np.sqrt(np.asarray(jacobian.variance(shared), np.float64))
     known = np.isfinite(systematic_m) & (sigma_m > 0)
     return jacobian.scaled(np.divide(systematic_m, sigma_m, out=np.ones(len(sigma_m)), where=known))
 
@@ -412,7 +456,14 @@ def common_error_covariance(epochs: list[EpochCells]) -> Floats | None:
         return None
     if first.reference.version != second.reference.version:
         return None
-    return cross_covariance(first.shared, second.shared)
+    covariances = [
+        covariance
+        for covariance in (
+            cross_covariance(first.shared, shared) for shared in second.members or (second.shared,)
+        )
+        if covariance is not None
+    ]
+    return np.mean(covariances, axis=0) if covariances else None
 
 
 def _has_quality(epoch: EpochRef, cells: Bools, flags: Quality) -> Bools:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import h5py
@@ -16,7 +16,7 @@ from station.archive.reference_files import open_reference
 from station.archive.series.index import list_epochs, nearest_epoch
 from station.archive.small_variables import read_epochs, read_number, read_text, read_variable
 from station.errors import StationError, StoreError
-from station.quantities import Bools, ChangeErrors, Floats, Grid, Reference, SharedParameters
+from station.quantities import Bools, ChangeErrors, Floats, Floats32, Grid, Reference, SharedParameters
 from station.queries.grid_arrays import to_index_or_time
 from station.science.uncertainty.parameters import ParameterLayout, parameter_layout
 from station.science.uncertainty.propagation import align_to
@@ -50,6 +50,28 @@ class EpochCells:
     adjusted: bool  # to the reference; `shared` is then relative to it
     has_positions: bool  # several, against each other in error
     epoch: EpochRef
+    members: tuple[SharedParameters, ...] = ()  # of a mean of epochs, those of each; the first is of `epoch`
+    jacobian_factor: Floats32 | None = None  # (ny, nx) of a mean, where some epochs lack a cell
+
+
+@dataclass(frozen=True)
+class EpochMean:
+    """Mean change of several epochs at the selected cells (ny, nx), from which that of others is counted.
+
+    It has the reference, the scanner and the ground classes of one of them. A cell is the mean of the epochs
+    that observed it, of which `count` (ny, nx) is the number.
+    """
+
+    cells: Bools
+    values: EpochCells
+    count: Floats32
+
+    def at(self, cells: Bools) -> EpochCells:
+        """Return the mean at some of its cells (ny, nx)."""
+        inside = cells[self.cells]
+        return replace(
+            self.values, change_m=self.values.change_m[inside], random_m=self.values.random_m[inside]
+        )
 
 
 class EpochReader:
@@ -84,11 +106,11 @@ class EpochReader:
             raise StationError(f"no epoch {wanted}: the series has {len(epochs)}")
         return epochs[wanted]
 
-    def read_cells(self, epoch: EpochRef, cells: Bools) -> EpochCells:
+    def read_cells(self, epoch: EpochRef | EpochMean, cells: Bools) -> EpochCells:
         """Return the data of an epoch at the selected cells (ny, nx); raise ValueError on another grid."""
         if cells.shape != self.grid.shape:
             raise ValueError(f"the array has shape {cells.shape}, the grid {self.grid.shape}")
-        return self._read(epoch, cells)
+        return epoch.at(cells) if isinstance(epoch, EpochMean) else self._read(epoch, cells)
 
     def read_shared(self, epoch: EpochRef) -> EpochCells:
         """Return the data of an epoch without any cell."""

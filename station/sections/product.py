@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 from pathlib import Path
 from typing import Annotated, Literal
@@ -30,7 +31,7 @@ KEYS: dict[str, tuple[set[str], set[str]]] = {  # required and optional, of each
     "volume_budget": (set(), {"areas"} | _BASE),
     "volume_between": ({"low"}, {"areas", "high"}),
     "profile": ({"line"}, set()),
-    "contour": ({"line", "height_m"}, {"observations"}),
+    "contour": ({"line", "height_m"}, _BASE | {"count", "spacing_m", "observations"}),
 }
 
 UPWARD_KINDS = ("snow_depth", "surface_mass_balance", "melt")  # counted from below
@@ -57,6 +58,8 @@ class ProductSection(Section):
     at: tuple[Place, Place] | None = None
     radius_m: NotNegative = 0.0
     line: Annotated[tuple[tuple[Place, Place], ...], Field(min_length=2)] | None = None
+    count: Annotated[int, Field(ge=2, le=200)] | None = None  # of parallel lines
+    spacing_m: Positive | None = None  # between them, to the right of the first
     height_m: float | Literal["crest"] | None = None
     low: float | Path | None = None
     high: float | Path | None = None
@@ -80,6 +83,10 @@ class ProductSection(Section):
             raise ValueError("areas and at both say where: keep one")
         if isinstance(self.surface, SurfaceTime) and self.surface.to <= self.surface.from_:
             raise ValueError("surface: to must be after from")
+        if (self.count is None) != (self.spacing_m is None):
+            raise ValueError("count and spacing_m belong together: give both")
+        if self.count is not None and self.line is not None and self.line[0] == self.line[-1]:
+            raise ValueError("line ends where it begins: it has no right side for parallel lines")
         if self.radius_m and self.at is None:
             raise ValueError("radius_m is that around at: give at = [easting, northing]")
         return self
@@ -88,6 +95,19 @@ class ProductSection(Section):
     def key(self) -> str:
         """The name of the product's file."""
         return product_key(self.name)
+
+    @property
+    def lines(self) -> dict[str, tuple[tuple[float, float], ...]]:
+        """The line, or with `count` the parallel lines to its right by their distance from it."""
+        if self.line is None or self.count is None or self.spacing_m is None:
+            return {} if self.line is None else {self.name: self.line}
+        (first_m, *_, last_m), offsets_m = self.line, [k * self.spacing_m for k in range(self.count)]
+        length_m = math.dist(first_m, last_m)
+        right = (last_m[1] - first_m[1]) / length_m, (first_m[0] - last_m[0]) / length_m
+        return {
+            f"{offset_m:g} m": tuple((x + offset_m * right[0], y + offset_m * right[1]) for x, y in self.line)
+            for offset_m in offsets_m
+        }
 
     @property
     def needs_areas(self) -> bool:

@@ -28,8 +28,11 @@ from station.archive.derived.boxes import Entries
 from station.archive.derived.product_files import ProductFile, update_product
 from station.archive.series.compaction import compact
 from station.archive.series.virtual import build_series
+from station.products.exports.product_maps import export_maps
 from station.quantities import Reference
 from station.queries.blocks import BlockQueries, update_boxes
+from station.queries.site_products.product_queries import Product
+from station.sections.product import ProductSection
 
 pytestmark = pytest.mark.integration
 
@@ -143,6 +146,14 @@ def test_compliance_checker_accepts_products_of_places_and_along_lines(series, t
         entries = Entries(START_S + np.zeros(1), START_S + np.full(1, 900), *[np.array([b"1"])] * 2)
         compute = {0: row}.__getitem__
         paths.append(update_product(series, product, entries, np.zeros(1, int), compute, lambda: None))
+    assert findings(tmp_path / "report.json", *paths) == []
+
+
+@pytest.mark.usefixtures("built")
+def test_compliance_checker_accepts_maps_of_products(series, tmp_path):
+    melt = ProductSection.model_validate({"name": "melt", "kind": "melt", "density_kg_m3": 870.0})
+    places = {"everywhere": np.ones(series.grid.shape, bool)}
+    paths = export_maps(series, Product(melt, places), None, tmp_path, "netcdf")
     assert findings(tmp_path / "report.json", *paths) == []
 
 

@@ -19,6 +19,7 @@ from station.monitoring import alarm_rules, alarms, status
 from station.monitoring.alarm_rules import evaluate_rules
 from station.monitoring.alarm_state import Alarm, AlarmState, due_messages, load, save
 from station.monitoring.notifiers import send
+from station.sections.results import PlaneSection
 
 HOUR_S, DAY_S = 3600.0, 86400.0
 NOW_S = 1_795_000_000.0
@@ -355,6 +356,10 @@ def test_change_is_assessed_once_per_epoch_and_always_at_the_newest(make_site, t
     text = "tongue fell by 0.5 m (± 0.028 m at 95 %) in the 6 h before 1970-01-02 00:00 UTC"
     # The text names the last epoch that shows the step.
     assert (alarm.key, alarm.text, alarm.size) == ("change in tongue", text, 0.5)
+    plane = PlaneSection(origin_m=(0.0, 0.0, 0.0), facing_deg=200.0)
+    face = site.model_copy(update={"grid": site.grid.model_copy(update={"plane": plane})})
+    (alarm,) = evaluate_rules(face, since_utc_s=0.0, assessed_until_utc_s=15 * 3600.0, now_s=NOW_S)
+    assert alarm.text == text.replace("fell", "moved in")
     assert active(25) == []
     assert active(None) == []  # steps before the first evaluation raise no alarm
     write_series(3600.0 * hours[:23], change_m[:23], np.full((23, 2), 0.01), ["tongue", "rock"])

@@ -50,11 +50,13 @@ def test_csv_has_all_columns_and_text_has_intervals():
     first, second = csv.DictReader(io.StringIO(as_csv([SLIDE, SNOW])))
     assert tuple(first) == EVENT_COLUMNS
     assert (float(first["volume_m3"]), first["partner"], second["balance_m3"]) == (1234.5, SLIDE.partner, "")
-    header, line, _ = as_text([SLIDE, SNOW]).splitlines()
+    header, line, _ = as_text([SLIDE, SNOW], on_map=True).splitlines()
     assert header.split()[:2] == ["begin,", "UTC"]
     assert "+1234" in line
     assert "±196" in line  # 1.96 times 100
-    assert as_text([]) == "no events"
+    assert as_text([], on_map=True) == "no events"
+    for on_map, axes in ((True, "east, m  north, m"), (False, "along, m  up, m")):
+        assert axes.split() == as_text([SLIDE], on_map=on_map).splitlines()[0].split()[6:10]
 
 
 def test_geoparquet_has_outlines_times_and_the_coordinate_system(tmp_path):

@@ -11,6 +11,7 @@ from html.parser import HTMLParser
 import numpy as np
 import pytest
 from PIL import Image
+from support.series import open_with_processing
 
 from station.archive import epochs
 from station.archive.reference_files import write_reference
@@ -24,6 +25,7 @@ from station.products.maps import MAX_BYTES
 from station.products.overview import base_map
 from station.products.web.page_areas import mask_unusable
 from station.queries.site_products.product_queries import Product, update_products
+from station.queries.site_products.profile_lines import sample_line
 from station.sections.product import ProductSection
 
 NOW_S = 1_763_710_000.0
@@ -318,3 +320,27 @@ def test_products_have_values_and_curves(write, context, site, series, small):
     assert curve["values"] == pytest.approx([0.025 * (hour + 1) for hour in range(6)], abs=0.003)
     html = Elements((folder / "index.html").read_text()).text
     assert re.search(r"Massenbilanz, Wasseräquivalent\s*2025-11-21 05:00\s*0\.15\d ± 0\.00\d m", html)
+
+
+def test_profiles_are_drawn_along_their_line(write, context, series, small):
+    """Across the box that rises by 5 cm an hour; the last scan may not be used."""
+    x_m, y_m = small.GRID.x_m, small.GRID.y_m
+    line_m = [(float(x_m[2]), float(y_m[20])), (float(x_m[-3]), float(y_m[20]))]
+    section = ProductSection.model_validate({"name": "across", "kind": "profile", "line": line_m})
+    line = sample_line(section.line, small.GRID)
+    epochs.write_epoch(series, replace(small.make_epoch(6), verdict="unusable"))
+    build_series(series)
+    update_products(
+        series, [Product(section, {"across": line.cells}, {"across": line})], ["across"], lambda: None
+    )
+    folder = write(replace(context, language="de"))
+    height, change = page_data(folder)["profiles"]
+    assert [height["quantity"], change["quantity"]] == ["Höhe", "Änderung seit der Referenz"]
+    assert (change["title"], change["time_s"]) == ("across", small.START_S + 5 * 3600)
+    assert change["distance_m"] == pytest.approx(line.distance_m, abs=0.01)
+    known = [k for k, value in enumerate(change["values"]) if value is not None]
+    with open_with_processing(series.folder) as ds:
+        expected = ds.elevation_change.values[5, 20, 2:-2]
+    assert [change["values"][k] for k in known] == pytest.approx([expected[k] for k in known], abs=2e-3)
+    assert all(change["sigma"][k] > 0 for k in known)
+    assert 'id="product-curves"' in (folder / "index.html").read_text()

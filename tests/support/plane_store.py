@@ -127,7 +127,6 @@ def dense_jacobian(ds, index):
 def dense_variance(ds, weights, index, *, random_m2=None, reference=None):
     """Return Σ a² σ² + aᵀ (J C Jᵀ + J_δ D J_δᵀ) a of one epoch with dense matrices."""
     a = weights.ravel()
-    design, line_design = dense_jacobian(ds, index)
     covariance = ds.shared_parameter_covariance[index].values.astype(float)
     line_tilt = ds.shared_parameter_line_tilt_variance[index].values
     if random_m2 is None:
@@ -135,9 +134,15 @@ def dense_variance(ds, weights, index, *, random_m2=None, reference=None):
     if reference is not None:
         covariance = covariance + reference.covariance
         line_tilt = line_tilt + reference.line_tilt_variance
+    return np.nansum(a**2 * random_m2.ravel()) + shared_variance(ds, weights, index, covariance, line_tilt)
+
+
+def shared_variance(ds, weights, index, covariance, line_tilt):
+    """Return aᵀ (J C Jᵀ + J_δ D J_δᵀ) a with the Jacobian of an epoch."""
+    a, (design, line_design) = weights.ravel(), dense_jacobian(ds, index)
     by_line = line_tilt[10 + np.arange(line_design.shape[1]) // 5]
     shared_m2 = design @ covariance @ design.T + (line_design * by_line) @ line_design.T
-    return np.nansum(a**2 * random_m2.ravel()) + a @ shared_m2 @ a
+    return a @ shared_m2 @ a
 
 
 def reference_random_m2(series):

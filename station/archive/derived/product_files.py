@@ -120,6 +120,7 @@ QUANTITIES: dict[str, tuple[Variable, ...]] = {
     "contour": (
         *_quantity("distance", "distance from the start of the line to the height or the crest",
                    "m", None, _MAP, cell_methods=None),
+        *_quantity("distance_change", "movement away from the start of the line", "m", cell_methods=None),
     ),
 }  # fmt: skip
 

@@ -104,8 +104,14 @@
 
   const cell = (row, tag, text) => row.appendChild(document.createElement(tag)).textContent = text;
 
+  const half = (sigma) => sigma.map((s) => s == null ? null : 1.959964 * s);  // of the 95 % interval
+
+  // What a curve is drawn over: time, or the distance from the start of a line.
+  const TIME = { isTime: true, head: text.js_time, csv: "start_utc", word: utc, code: (s) => new Date(s * 1000).toISOString() };
+  const DISTANCE = { isTime: false, head: text.js_distance_m, csv: "distance_m", word: (m) => `${formatNumber(m, 1)} m`, code: (m) => m };
+
   // The values of a curve as a table, newest first; created when opened.
-  function table(heading, time_s, lines) {
+  function table(heading, x, lines, over) {
     const fold = document.createElement("details");
     fold.appendChild(document.createElement("summary")).textContent = text.js_as_table;
     fold.addEventListener("toggle", () => {
@@ -116,56 +122,56 @@
       const element = wide.appendChild(document.createElement("table"));
       element.createCaption().textContent = heading;
       const top = element.createTHead().insertRow(), body = element.createTBody();
-      cell(top, "th", text.js_time);
+      cell(top, "th", over.head);
       for (const line of lines) {
         cell(top, "th", line.label || text.js_value);
         if (line.half) cell(top, "th", "± (95 %)");
       }
-      for (let i = time_s.length - 1; i >= 0; i--) {
+      for (const i of over.isTime ? [...x.keys()].reverse() : x.keys()) {
         const row = body.insertRow();
-        cell(row, "th", utc(time_s[i]));
+        cell(row, "th", over.word(x[i]));
         for (const line of lines) {
           cell(row, "td", formatNumber(line.values[i], line.digits));
           if (line.half) cell(row, "td", formatNumber(line.half[i], line.digits));
         }
       }
       for (const header of element.querySelectorAll("th")) header.scope = header.closest("thead") ? "col" : "row";
-      fold.append(make("a", { textContent: text.js_csv, download: "curve.csv", href: csvOf(time_s, lines) }));
+      fold.append(make("a", { textContent: text.js_csv, download: "curve.csv", href: csvOf(x, lines, over) }));
     });
     return fold;
   }
 
   // The values of a curve as a file, oldest first; those that are missing are empty.
-  function csvOf(time_s, lines) {
+  function csvOf(x, lines, over) {
     const columns = lines.flatMap((line) => [
       [line.label || text.js_value, line.values, line.digits], ...(line.half ? [["± 95 %", line.half, line.digits + 1]] : [])]);
-    const rows = time_s.map((s, i) => [new Date(s * 1000).toISOString(),
+    const rows = x.map((value, i) => [over.code(value),
       ...columns.map(([, values, digits]) => values[i] == null ? "" : values[i].toFixed(digits))]);
-    return `data:text/csv;charset=utf-8,${encodeURIComponent([["start_utc", ...columns.map(([name]) => name)], ...rows, ""].join("\n"))}`;
+    return `data:text/csv;charset=utf-8,${encodeURIComponent([[over.csv, ...columns.map(([name]) => name)], ...rows, ""].join("\n"))}`;
   }
 
-  function curve(parent, heading, time_s, lines, band) {
-    if (!time_s.length || !lines.some((line) => line.values.some((v) => v != null))) return;
+  function curve(parent, heading, x, lines, band, over = TIME) {
+    if (!x.length || !lines.some((line) => line.values.some((v) => v != null))) return;
     const card = document.createElement("div"), head = document.createElement("h3");
     const reading = document.createElement("p"), plotBox = document.createElement("div");
     card.className = "curve";
     head.textContent = heading;
-    card.append(head, reading, plotBox, table(heading, time_s, lines));
+    card.append(head, reading, plotBox, table(heading, x, lines, over));
     plotBox.setAttribute("role", "img");
     parent.append(card);
-    const last = time_s.length - 1;
+    const last = over.isTime ? x.length - 1 : lines[0].values.findIndex((v) => v != null);
     const showReading = (index) => {
       const i = index == null ? last : index;
-      reading.textContent = `${utc(time_s[i])}: ` + lines.map((line) =>
+      reading.textContent = `${over.word(x[i])}: ` + lines.map((line) =>
         (line.label ? `${line.label} ` : "") + formatNumber(line.values[i], line.digits) +
         (line.half && line.half[i] != null ? ` ± ${formatNumber(line.half[i], line.digits)}` : "")).join(", ");
     };
     showReading(null);
-    plotBox.setAttribute("aria-label", `${heading}. ${text.js_newest}, ${reading.textContent}`);
-    const rows = [time_s], series = [{}], bands = [];
+    plotBox.setAttribute("aria-label", `${heading}. ${over.isTime ? `${text.js_newest}, ` : ""}${reading.textContent}`);
+    const rows = [x], series = [{}], bands = [];
     for (const line of lines) {
       const colour = cssColour(line.colour || "--accent");
-      const points = { show: time_s.length < 60, size: 4 };
+      const points = { show: x.length < 60, size: 4 };
       if (line.half) {
         const edge = (sign) => line.values.map((v, i) => v == null || line.half[i] == null ? null : v + sign * line.half[i]);
         rows.push(edge(1), edge(-1));
@@ -178,11 +184,11 @@
     }
     if (band) {
       for (const edge of band) {
-        rows.push(time_s.map(() => edge));
+        rows.push(x.map(() => edge));
         series.push({ stroke: cssColour("--faint"), width: 1, dash: [4, 4], points: { show: false } });
       }
     }
-    pendingPlots.push(() => plot(plotBox, showReading, rows, series, bands));
+    pendingPlots.push(() => plot(plotBox, showReading, rows, series, bands, over));
   }
 
   const TICKS = [  // uPlot's table: step, label, then the additions where year, month, day … change
@@ -194,13 +200,13 @@
     [1, "{mm}:{ss}", "\n{D} {MMM} {HH}:{mm}", null, "\n{D} {MMM} {HH}:{mm}", null, "\n{HH}:{mm}", null, 1],
   ];
 
-  function plot(plotBox, showReading, rows, series, bands) {
+  function plot(plotBox, showReading, rows, series, bands, over) {
     const axis = { stroke: cssColour("--faint"), grid: { stroke: cssColour("--line"), width: 1 }, ticks: { show: false }, font: "12px system-ui, sans-serif" };
     const chart = new uPlot({
       width: Math.max(200, plotBox.clientWidth), height: 190, legend: { show: false }, series, bands,
-      scales: { x: { time: true } },
+      scales: { x: { time: over.isTime } },
       tzDate: (s) => uPlot.tzDate(new Date(s * 1000), "Etc/UTC"),
-      axes: [{ ...axis, values: TICKS, space: 70 }, { ...axis, size: 62 }],
+      axes: [over.isTime ? { ...axis, values: TICKS, space: 70 } : { ...axis, values: (_, ticks) => ticks.map((m) => `${m} m`) }, { ...axis, size: 62 }],
       cursor: { drag: { x: true, y: false } },
       hooks: { setCursor: [(u) => showReading(u.cursor.idx)] },
     }, rows, plotBox);
@@ -218,11 +224,11 @@
     health.replaceChildren();
     for (const area of data.areas) {
       curve(areas, fill(text.js_area_curve, { area: area.name }), data.area_time_s, [
-        { values: area.mean_m, half: area.sigma_m.map((s) => s == null ? null : 1.959964 * s), digits: 3 }]);
+        { values: area.mean_m, half: half(area.sigma_m), digits: 3 }]);
     }
-    for (const product of data.products) {
-      curve(products, fill(text.js_product_curve, product), product.time_s, [
-        { values: product.values, half: product.sigma.map((s) => s == null ? null : 1.959964 * s), digits: product.digits }]);
+    for (const p of [...data.products, ...data.profiles]) {
+      const x = p.distance_m, title = fill(x ? text.js_product_profile : text.js_product_curve, { ...p, time: x && utc(p.time_s) });
+      curve(products, title, x || p.time_s, [{ values: p.values, half: half(p.sigma), digits: p.digits }], null, x ? DISTANCE : TIME);
     }
     if (data.health) drawHealth(health, data.health);
     flush();

@@ -1,4 +1,4 @@
-"""Products on the page: the newest value of each quantity, and a curve of the first one in each place."""
+"""Products on the page: the newest value of each quantity, a curve of the first one, and newest profiles."""
 
 from __future__ import annotations
 
@@ -47,3 +47,26 @@ def product_curves(products: list[ProductSeries], text: dict[str, str]) -> list[
                 }
             )
     return curves
+
+
+def product_profiles(products: list[ProductSeries], text: dict[str, str]) -> list[dict[str, Any]]:
+    """Return each quantity along the line of each profile, of the newest usable scan with a value."""
+    profiles = []
+    for product in (product.usable for product in products if product.kind == "profile"):
+        for name, unit in product.units.items():
+            observed = np.flatnonzero(np.isfinite(product.columns[name]).any(axis=1))
+            if not len(observed):
+                continue
+            profiles.append(
+                {
+                    "title": product.name,
+                    "quantity": text[f"quantity_{name}"],
+                    "unit": unit,
+                    "digits": DIGITS[unit],
+                    "time_s": float(product.start_s[observed[-1]]),
+                    "distance_m": np.array(product.labels, np.float64),
+                    "values": product.columns[name][observed[-1]],
+                    "sigma": product.columns[f"{name}_uncertainty"][observed[-1]],
+                }
+            )
+    return profiles

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from dataclasses import dataclass
 from datetime import UTC, datetime
 from typing import get_args
 
@@ -22,12 +23,29 @@ def _read(name: str) -> dict[str, str]:
 
 PAGE_TEXT = {language: _read(f"page.{language}.json") for language in LANGUAGES}
 VIEWER_TEXT = {language: _read("text.en.json") | _read(f"text.{language}.json") for language in LANGUAGES}
+_PLANE_TEXT = {language: _read(f"plane.{language}.json") for language in LANGUAGES}
 
 
-def script_text(language: str) -> dict[str, str]:
-    """Return the texts that the scripts of the page need, by key."""
-    own = {key: text for key, text in PAGE_TEXT[language].items() if key.startswith("js_")}
-    return VIEWER_TEXT[language] | own
+@dataclass(frozen=True)
+class PageText:
+    """Texts of a page by key: of the page itself, and of the map in it."""
+
+    page: dict[str, str]
+    viewer: dict[str, str]
+
+    @classmethod
+    def of(cls, language: str, *, on_map: bool) -> PageText:
+        """Return the texts in a language, in other words where the grid does not lie on the map."""
+        texts, others = (PAGE_TEXT[language], VIEWER_TEXT[language]), _PLANE_TEXT[language]
+        if on_map:
+            return cls(*texts)
+        page, viewer = ({key: others.get(key, text) for key, text in own.items()} for own in texts)
+        return cls(page, viewer)
+
+    @property
+    def script(self) -> dict[str, str]:
+        """The texts that the scripts of the page need."""
+        return self.viewer | {key: text for key, text in self.page.items() if key.startswith("js_")}
 
 
 def format_number(value: float | None, digits: int, sign: bool = False) -> str:  # noqa: FBT001, FBT002 - a filter

@@ -31,25 +31,21 @@ from station.archive.netcdf_layout import Series
 from station.archive.read_errors import read_errors
 from station.archive.schema import TEXT_LENGTH, VERDICTS
 from station.archive.series.index import SeriesIndex
+from station.errors import StationError
 from station.quantities import Bools, Floats, Ints
-from station.queries.aggregates import Aggregates, ObservedArea
-from station.queries.epoch_cells import bounding_box
+from station.queries.aggregates import Aggregates
 from station.queries.site_products.profile_lines import Line
-from station.science.analysis.product_estimates import (
-    Estimate,
-    crest,
-    crossing,
-    gained,
-    thickness_between,
-    water_equivalent,
-)
+from station.queries.site_products.quantities_along_lines import contour, profile
+from station.queries.site_products.quantities_of_places import NEW_SNOW_H, CountedFrom, place_quantities
+from station.queries.site_products.surface_scans import SurfaceScans
+from station.science.analysis.product_estimates import Estimate
 from station.sections.product import ProductSection, SurfaceTime
 
 HOUR_S = 3600.0
-NEW_SNOW_H = (24, 72)
 TIME_TOLERANCE = 1 / 12  # of the hours of new snow: 2 h of 24 h
+SURFACE_SCANS = 24  # of a time span at most: more of them make a mean hardly better
 NONE = -1  # no such epoch
-FORMAT = "1"  # of the computation, part of the recipe
+FORMAT = "2"  # of the computation, part of the recipe
 
 Row = dict[str, Floats]
 
@@ -60,7 +56,7 @@ class Product:
 
     section: ProductSection
     places: dict[str, Bools]  # cells (ny, nx) by name
-    line: Line | None = None
+    lines: Mapping[str, Line] = field(default_factory=dict)  # of the same names
     rasters: Mapping[str, Floats] = field(default_factory=dict)  # (ny, nx) given surfaces by key
     files: tuple[str, ...] = ()  # SHA-256 of these
 
@@ -98,7 +94,6 @@ class ProductQueries(Aggregates):
     def __init__(self, series: Series) -> None:
         """Read the index of the series; raise StoreError if it cannot be read."""
         super().__init__(series)
-        self._datum = np.broadcast_to(0.0, series.grid.shape)  # heights count from it
         self._epochs = SeriesIndex(series)
         self._end_s, self._verdict = np.empty(0), np.empty(0, np.int64)
         self._versions = np.empty(0, f"S{TEXT_LENGTH['text']}")
@@ -114,11 +109,14 @@ class ProductQueries(Aggregates):
     def update(self, product: Product, progress: Callable[[], None]) -> Path | None:
         """Bring the file of a product up to date; None if there is nothing to write yet."""
         epochs, partners = self._measured, self._partners(product)
-        if isinstance(product.section.surface, SurfaceTime) and NONE in partners[:, 0]:
-            delete_products(self.series, [product.section.key])  # its surface has not been measured yet
+        base = self._base(product)
+        if base is None:
+            delete_products(self.series, [product.section.key])
             return None
+        names = [epoch.epoch_file.encode() for epoch in base]
         sources = [
-            self._sources(*indices) for indices in zip(epochs.tolist(), partners.tolist(), strict=True)
+            self._sources(index, names, others)
+            for index, others in zip(epochs.tolist(), partners.tolist(), strict=True)
         ]
         entries = Entries(
             self._epochs.start_s[epochs],
@@ -126,17 +124,44 @@ class ProductQueries(Aggregates):
             np.array(sources, f"S{TEXT_LENGTH['text']}"),
             self._versions[epochs],
         )
+        surface: list[SurfaceScans] = []  # read when the first entry is computed
 
         def compute(row: int) -> Row:
+            if base and not surface:
+                cells = np.logical_or.reduce(list(product.places.values()))
+                surface.append(SurfaceScans(self, base, cells))
             others = [None if index == NONE else self._epochs[index] for index in partners[row].tolist()]
-            return self._compute(product, self._epochs[int(epochs[row])], others)
+            return self._compute(
+                product, self._epochs[int(epochs[row])], surface[0] if surface else None, others
+            )
 
         file, verdict = self._file(product), self._verdict[epochs]
         return update_product(self.series, file, entries, verdict, compute, progress)
 
+    def _base(self, product: Product) -> list[EpochRef] | None:
+        """Return the epochs of the surface of a product, none if it has no time; None if not measured yet."""
+        if not isinstance(product.section.surface, SurfaceTime):
+            return []
+        return [
+            self._epochs[index] for index in self._surface_epochs(product.section.surface).tolist()
+        ] or None
+
+    def surface_scans(self, product: Product, cells: Bools) -> SurfaceScans | None:
+        """Return the scans that a product counts from at cells (ny, nx); None if it counts from none.
+
+        Raises StationError if they have not been measured yet.
+        """
+        base = self._base(product)
+        if base is None:
+            raise StationError(
+                f"product {product.section.name}: the time of its surface is not over, or has no usable scan"
+            )
+        return SurfaceScans(self, base, cells) if base else None
+
     def _file(self, product: Product) -> ProductFile:
-        section, line = product.section, product.line
-        if section.kind == "profile" and line is not None:
+        section = product.section
+        if section.kind == "profile":
+            (line,) = product.lines.values()
             return ProductFile(
                 section.key, section.name, section.kind, product.recipe, DISTANCE,
                 line.x_m, line.y_m, (), line.distance_m,
@@ -150,29 +175,26 @@ class ProductQueries(Aggregates):
         )  # fmt: skip
 
     def _partners(self, product: Product) -> Ints:
-        """Return the epochs that the values of each epoch (n,) depend on, NONE where there is none.
+        """Return the epochs 24 and 72 h before each epoch (n, 2), NONE where there is none; for snow only."""
+        if product.section.kind != "snow_depth":
+            return np.empty((len(self._measured), 0), np.int64)
+        return np.stack([self._earlier(hours) for hours in NEW_SNOW_H], axis=-1)
 
-        That of the surface (n, 1), of snow also those 24 and 72 h before (n, 3).
-        """
-        surface = product.section.surface
-        base = self._surface_epoch(surface) if isinstance(surface, SurfaceTime) else NONE
-        columns = [np.full(len(self._measured), base)]
-        if product.section.kind == "snow_depth":
-            columns += [self._earlier(hours) for hours in NEW_SNOW_H]
-        return np.stack(columns, axis=-1)
+    def _surface_epochs(self, span: SurfaceTime) -> Ints:
+        """Return the usable epochs of a time span that make its surface, good ones if there are any.
 
-    def _surface_epoch(self, span: SurfaceTime) -> int:
-        """Return the usable epoch nearest to the middle of a time span, a good one if there is any.
-
-        NONE until the span is over: as long as it grows, each scan would change all values.
+        They have the reference of the last one. None until the span is over: as long as it grows, each scan
+        would change all values.
         """
         from_s, to_s = span.from_.timestamp(), span.to.timestamp()
         time_s = self._epochs.time_s[self._usable]
         within = self._usable[(time_s >= from_s) & (time_s <= to_s)]
         if not len(within) or self._epochs.time_s[-1] <= to_s:
-            return NONE
-        distance_s = np.abs(self._epochs.time_s[within] - (from_s + to_s) / 2)
-        return int(within[np.lexsort([distance_s, self._verdict[within]])[0]])
+            return np.empty(0, np.int64)
+        within = within[self._verdict[within] == self._verdict[within].min()]
+        within = within[self._versions[within] == self._versions[within[-1]]]
+        spread = np.linspace(0, len(within) - 1, min(len(within), SURFACE_SCANS))
+        return np.asarray(within[np.round(spread).astype(np.int64)])
 
     def _earlier(self, hours: float) -> Ints:
         """Return the usable epoch about as many hours before each epoch (n,)."""
@@ -187,164 +209,55 @@ class ProductQueries(Aggregates):
         is_near = distance_s.min(axis=0) <= TIME_TOLERANCE * hours * HOUR_S
         return np.where(is_near, self._usable[nearest], NONE)
 
-    def _sources(self, index: int, partners: list[int]) -> bytes:
-        """Return the name of the epoch file, or the hash of those of an epoch and its partners."""
-        names = [b"" if other == NONE else bytes(self._epochs.epoch_file[other]) for other in partners]
+    def _sources(self, index: int, base: list[bytes], partners: list[int]) -> bytes:
+        """Return the name of the epoch file, or the hash of those of all epochs that its values depend on."""
         own = bytes(self._epochs.epoch_file[index])
+        names = [
+            *base,
+            *(b"" if other == NONE else bytes(self._epochs.epoch_file[other]) for other in partners),
+        ]
         if not any(names):
             return own
         return hashlib.sha256(b"|".join([own, *names])).hexdigest().encode()
 
-    def _compute(self, product: Product, epoch: EpochRef, partners: list[EpochRef | None]) -> Row:
-        kind, line = product.section.kind, product.line
-        if kind == "profile" and line is not None:
-            return self._profile(line, epoch)
-        if kind == "contour" and line is not None:
-            return _columns({"distance": [self._contour(line, epoch, product.section.height_m)]}, np.empty(0))
+    def _compute(
+        self, product: Product, epoch: EpochRef, scans: SurfaceScans | None, earlier: list[EpochRef | None]
+    ) -> Row:
+        section = product.section
+        base = CountedFrom(scans, product.rasters.get("surface"))
+        if section.kind == "profile":
+            (line,) = product.lines.values()
+            along = profile(self, line, epoch)
+            return {name: v for of, estimate in along.items() for name, v in parts_of(of, estimate).items()}
         values: dict[str, list[Estimate]] = {}
         coverage = []
-        for cells in product.places.values():
-            estimates, observed = self._place(product, cells, epoch, partners)
-            coverage.append(observed)
+        for place, cells in product.places.items():
+            if section.kind == "contour":
+                estimates = contour(self, product.lines[place], epoch, section.height_m, base)
+            else:
+                estimates, observed = place_quantities(
+                    self, section, product.rasters, cells, epoch, base, earlier
+                )
+                coverage.append(observed)
             for name, estimate in estimates.items():
                 values.setdefault(name, []).append(estimate)
         return _columns(values, np.array(coverage))
-
-    def _place(
-        self, product: Product, cells: Bools, epoch: EpochRef, partners: list[EpochRef | None]
-    ) -> tuple[dict[str, Estimate], float]:
-        """Return the quantities of one place by name, and the share of it that was observed."""
-        section, base = product.section, partners[0]
-        if section.kind == "volume_between":
-            return self._volume_between(product, cells, epoch)
-        if section.kind == "volume_budget":
-            return self._volume_budget(product, cells, epoch, base)
-        if section.kind == "point":
-            change, coverage = self._mean(cells, epoch)
-            return {
-                "elevation": self._mean(cells, epoch, surface_m=self._datum)[0],
-                "elevation_change": change,
-            }, coverage
-        change, coverage = self._mean(cells, epoch, base, product.rasters.get("surface"))
-        if section.kind == "snow_depth":
-            depths = {"snow_depth": change.with_offset(section.offset_m, section.offset_sigma_m)}
-            for hours, earlier in zip(NEW_SNOW_H, partners[1:], strict=True):
-                name = f"new_snow_{hours}h"
-                depths[name] = self._mean(cells, epoch, earlier)[0] if earlier else Estimate()
-            return depths, coverage
-        mass = water_equivalent(change, section.density_kg_m3 or 0.0, section.density_sigma_kg_m3)
-        return {section.kind: mass if section.kind == "surface_mass_balance" else mass.scaled(-1.0)}, coverage
-
-    def _mean(
-        self, cells: Bools, epoch: EpochRef, other: EpochRef | None = None, surface_m: Floats | None = None
-    ) -> tuple[Estimate, float]:
-        """Return the mean change or height of a place with its voids interpolated, and its coverage."""
-        area = self.observe(cells, epoch, other, surface_m)
-        if area is None:
-            return Estimate(), 0.0
-        if epoch == other:
-            return Estimate(0.0, 0.0, 0.0), area.coverage
-        return self._sum(area, area.weights, area.value_m, area.void_m2), area.coverage
-
-    def _sum(
-        self, area: ObservedArea, weights: Floats, value_m: Floats, void_variance: float,
-        derivative: Floats | float = 1.0,
-    ) -> Estimate:  # fmt: skip
-        random, total = self.sum_variance(area, weights * derivative)
-        return Estimate(float(weights @ value_m), random, total - random + void_variance)
-
-    def _volume_between(
-        self, product: Product, cells: Bools, epoch: EpochRef
-    ) -> tuple[dict[str, Estimate], float]:
-        area = self.observe(cells, epoch, surface_m=self._datum)
-        if area is None:
-            return {"volume": Estimate()}, 0.0
-        levels = {"low": -np.inf, "high": np.inf} | product.section.levels
-        low_m, high_m = (
-            product.rasters[key][area.cells] if key in product.rasters else np.array(levels[key])
-            for key in ("low", "high")
-        )
-        thickness_m, derivative = thickness_between(area.value_m, low_m, high_m)
-        size_m2 = np.count_nonzero(cells) * self.grid.cell_m**2
-        volume = self._sum(area, size_m2 * area.weights, thickness_m, size_m2**2 * area.void_m2, derivative)
-        return {"volume": volume}, area.coverage
-
-    def _volume_budget(
-        self, product: Product, cells: Bools, epoch: EpochRef, base: EpochRef | None
-    ) -> tuple[dict[str, Estimate], float]:
-        """Return gain, loss and net of an area; each cell counts in one class, so they close exactly."""
-        area = self.observe(cells, epoch, base, product.rasters.get("surface"))
-        if area is None:
-            return dict.fromkeys(("deposition", "erosion", "net_change"), Estimate()), 0.0
-        if epoch == base:
-            return (
-                dict.fromkeys(("deposition", "erosion", "net_change"), Estimate(0.0, 0.0, 0.0)),
-                area.coverage,
-            )
-        bounds = bounding_box(cells, 0)
-        observed = area.cells[bounds]
-        change_m, random_m = np.full((2, *observed.shape), np.nan)
-        change_m[observed], random_m[observed] = area.value_m, np.sqrt(np.sum(area.random_m2, axis=0))
-        is_gain = gained(change_m, random_m)[observed]
-        count = np.count_nonzero(cells)
-        size_m2, in_voids = count * self.grid.cell_m**2, area.weights - 1 / count
-        budget = {}
-        for name, chosen in (
-            ("deposition", is_gain),
-            ("erosion", ~is_gain),
-            ("net_change", np.ones_like(is_gain)),
-        ):
-            share = in_voids[chosen].sum() / in_voids.sum() if area.void_m2 else 0.0  # of the voids
-            weights = size_m2 * np.where(chosen, area.weights, 0.0)
-            budget[name] = self._sum(area, weights, area.value_m, (share * size_m2) ** 2 * area.void_m2)
-        return budget, area.coverage
-
-    def _profile(self, line: Line, epoch: EpochRef) -> Row:
-        columns: Row = {}
-        for name, surface_m in (("elevation", self._datum), ("elevation_change", None)):
-            area = self.observe(line.cells, epoch, surface_m=surface_m)
-            value, random_m2, systematic_m2 = np.full((3, len(line.distance_m)), np.nan)
-            if area is not None:
-                weights, complete = line.weights(area.cells)
-                cell_random_m2, cell_systematic_m2 = self.cell_variances(area)
-                value[complete] = (weights @ area.value_m)[complete]
-                random_m2[complete] = (weights.power(2) @ cell_random_m2)[complete]
-                systematic_m2[complete] = (weights @ np.sqrt(cell_systematic_m2))[complete] ** 2
-            columns |= _parts(name, value, random_m2, systematic_m2)
-        return columns
-
-    def _contour(self, line: Line, epoch: EpochRef, height_m: float | str | None) -> Estimate:
-        """Return the distance along a line at which the surface crosses a height, or of its crest [m]."""
-        area = self.observe(line.cells, epoch, surface_m=self._datum)
-        if area is None:
-            return Estimate()
-        interpolation, complete = line.weights(area.cells)
-        profile_m = np.where(complete, interpolation @ area.value_m, np.nan)
-        found = (
-            crossing(line.distance_m, profile_m, height_m)
-            if isinstance(height_m, float)
-            else crest(line.distance_m, profile_m)
-        )
-        if found is None:
-            return Estimate()
-        random, total = self.sum_variance(area, found.sensitivity @ interpolation[found.samples])
-        return Estimate(found.distance_m, max(random, found.scatter_variance), total - random)
 
 
 def _columns(values: dict[str, list[Estimate]], coverage: Floats) -> Row:
     """Return the variables of quantities in all places (n,)."""
     columns: Row = {"coverage": coverage} if len(coverage) else {}
     for name, estimates in values.items():
-        columns |= _parts(
-            name,
-            np.array([estimate.value for estimate in estimates]),
-            np.array([estimate.random_variance for estimate in estimates]),
-            np.array([estimate.systematic_variance for estimate in estimates]),
+        parts = ("value", "random_variance", "systematic_variance")
+        columns |= parts_of(
+            name, Estimate(*(np.array([getattr(estimate, part) for estimate in estimates]) for part in parts))
         )
     return columns
 
 
-def _parts(name: str, value: Floats, random: Floats, systematic: Floats) -> Row:
-    """Return the variables of a quantity: value, and one sigma of everything and of its two parts."""
-    sigmas = (np.sqrt(np.maximum(variance, 0)) for variance in (random + systematic, random, systematic))
-    return {name: value, **{f"{name}_{part}": sigma for part, sigma in zip(SIGMAS, sigmas, strict=True)}}
+def parts_of(name: str, estimate: Estimate) -> Row:
+    """Return the variables of a quantity (n,): value, and one sigma of everything and of its two parts."""
+    variances = estimate.variance, estimate.random_variance, estimate.systematic_variance
+    sigmas = (np.sqrt(np.maximum(variance, 0)) for variance in variances)
+    parts = zip(SIGMAS, sigmas, strict=True)
+    return {name: np.asarray(estimate.value), **{f"{name}_{part}": sigma for part, sigma in parts}}

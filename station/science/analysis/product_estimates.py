@@ -23,14 +23,14 @@ SCATTER_SAMPLES = 10  # on either side, which show how the ground scatters about
 
 @dataclass(frozen=True)
 class Estimate:
-    """A value with the random and the systematic part of its variance; NaN if unknown."""
+    """Values with the random and the systematic part of their variance; NaN if unknown."""
 
-    value: float = np.nan
-    random_variance: float = np.nan
-    systematic_variance: float = np.nan
+    value: float | Floats = np.nan
+    random_variance: float | Floats = np.nan
+    systematic_variance: float | Floats = np.nan
 
     @property
-    def variance(self) -> float:
+    def variance(self) -> float | Floats:
         """The variance of all errors together."""
         return self.random_variance + self.systematic_variance
 

@@ -20,6 +20,8 @@ from station.science.uncertainty.parameters import (
     knot_interpolation,
 )
 
+BLOCK_CELLS = 8192  # at once: 34 MB
+
 
 def aggregate_variance(
     weights: Floats,
@@ -46,6 +48,14 @@ def aggregate_variance(
         @ (jacobian.aggregate_by_line(adjusted_weights) @ projector)
     )
     return max(float(np.sum(random_m2)) + shared_m2, float(np.sum(random_m2 * independent)))
+
+
+def cell_covariances(first: HeightJacobian, second: HeightJacobian, covariance: Floats) -> Floats:
+    """Return J₁ X J₂ᵀ of each cell (n,) for the covariance X (p, p) of the parameters of two epochs [m²]."""
+    rows, columns = first.to_sparse(), second.to_sparse()
+    blocks = [slice(top, top + BLOCK_CELLS) for top in range(0, len(first), BLOCK_CELLS)]
+    sums = [(columns[block].multiply(rows[block] @ covariance)).sum(axis=1) for block in blocks]
+    return np.concatenate([np.empty(0), *(np.asarray(values).ravel() for values in sums)])
 
 
 def difference_to_reference(shared: SharedParameters, reference: SharedParameters | None) -> SharedParameters:

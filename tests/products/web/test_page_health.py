@@ -13,7 +13,7 @@ from station.archive.series import index
 from station.archive.series.virtual import build_series
 from station.products.epoch_table import EpochTable, read_epoch_table
 from station.products.web import page_health
-from station.products.web.page_text import LANGUAGES, PAGE_TEXT, format_number
+from station.products.web.page_text import LANGUAGES, PAGE_TEXT, PageText, format_number
 from station.quantities import Measurement, Quality
 from station.queries.stable_ground import z_by_range
 from station.science.adjustment.ground_classes import is_holdout
@@ -173,6 +173,21 @@ def test_languages_have_the_same_texts_and_fields():
             fields = re.findall(r"\{\w+\}", text)
             assert sorted(fields) == sorted(re.findall(r"\{\w+\}", ENGLISH[key])), key
     assert json.dumps(PAGE_TEXT["de"]) != json.dumps(ENGLISH)
+
+
+@pytest.mark.parametrize("language", LANGUAGES)
+def test_a_grid_on_a_plane_has_words_of_its_own(language):
+    """Nothing sinks on a rock face, and its axes are not those of the map."""
+    of_map, of_plane = (PageText.of(language, on_map=on_map) for on_map in (True, False))
+    for usual, other in ((of_map.page, of_plane.page), (of_map.viewer, of_plane.viewer)):
+        assert other.keys() == usual.keys()
+        for key, text in other.items():
+            fields = re.findall(r"\{\w+\}", text)
+            assert sorted(fields) == sorted(re.findall(r"\{\w+\}", usual[key])), key
+    words = " ".join([of_plane.page["map_alt"], *of_plane.viewer.values(), of_plane.page["easting"]])
+    upward = ("sank", "stieg", "rose", "Höhe", "easting", "Easting", "Ostwert", "levation")
+    assert [word for word in upward if word in words] == []
+    assert "key_change" in of_plane.script
 
 
 @pytest.mark.parametrize(

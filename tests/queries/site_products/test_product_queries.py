@@ -62,7 +62,7 @@ def computed(series, places=None, *, rasters=None, **settings):
     """Return a product of the series, and how many epochs were computed."""
     section = ProductSection.model_validate({"name": "test", **settings})
     line = sample_line(section.line, GRID) if section.line else None
-    product = Product(section, places or {"test": line.cells}, line, rasters or {})
+    product = Product(section, places or {"test": line.cells}, {"test": line} if line else {}, rasters or {})
     steps = []
     update_products(series, [product], [section.key], lambda: steps.append(1))
     return station.product(series.folder, "test"), len(steps)
