@@ -1,6 +1,6 @@
 """Events on simulated stations, one disturbance each: deposits found, their volumes, and false alarms.
 
-python -m benchmarks.event_stations [--cases NAME …] [--seeds N] [--first SEED] [--folder DIR]
+python -m benchmarks.event_stations [--cases NAME …] [--quiet] [--seeds N] [--first SEED] [--folder DIR]
 
 The stations have the real scanner's points in a sector of 25°, and cells of 5 m. On each, debris of 0.3 m
 comes to rest on 500 m² at four places 2 km away, one after another; at the first of them as much again three
@@ -32,7 +32,7 @@ from station.simulation.scenario import Deposit, Scenario, full_resolution, name
 from station.simulation.station import Station
 from station.simulation.truth import map_from_enu
 
-HOURS = 33
+HOURS, QUIET_HOURS = 33, 57
 DEPOSIT_SCANS = (18, 24, 27, 30)  # that show a new deposit
 GROWTH_SCAN = 21  # that shows the first deposit twice as deep
 AREA_M2, DEPTH_M = 500.0, 0.3
@@ -78,13 +78,14 @@ class Score:
         )
 
 
-def scenario_of(case: str, seed: int) -> Scenario:
-    """Return the scenario of a case with its deposits."""
+def scenario_of(case: str, seed: int, *, quiet: bool = False) -> Scenario:
+    """Return the scenario of a case with its deposits, or a longer one without them."""
     name, overrides = CASES[case]
-    full = full_resolution(named(name, HOURS, seed))
+    full = full_resolution(named(name, QUIET_HOURS if quiet else HOURS, seed))
     share = (AZIMUTH_DEG[1] - AZIMUTH_DEG[0]) / (full.azimuth_deg[1] - full.azimuth_deg[0])
     sector = replace(full, azimuth_deg=AZIMUTH_DEG, lines=round(full.lines * share), extent_m=EXTENT_M)
-    return with_deposits(replace(sector, **overrides), DEPOSIT_SCANS, GROWTH_SCAN)
+    scenario = replace(sector, **overrides)
+    return scenario if quiet else with_deposits(scenario, DEPOSIT_SCANS, GROWTH_SCAN)
 
 
 def with_deposits(scenario: Scenario, scans: Sequence[int], growth_scan: int | None = None) -> Scenario:
@@ -193,6 +194,7 @@ def main() -> None:
     """Print a row for each case, and a line for each deposit and each other event."""
     parser = argparse.ArgumentParser(description="Events on simulated stations with disturbances.")
     parser.add_argument("--cases", nargs="+", choices=list(CASES), default=list(CASES), metavar="NAME")
+    parser.add_argument("--quiet", action="store_true", help="57 scans without deposits: false alarms only")
     parser.add_argument("--seeds", type=int, default=1, help="number of stations of each case")
     parser.add_argument("--first", type=int, default=1, help="the first seed")
     parser.add_argument("--folder", type=Path, help="folder that keeps the simulated and processed stations")
@@ -202,8 +204,8 @@ def main() -> None:
             total = Score()
             for seed in range(options.first, options.first + options.seeds):
                 print(f"  {case}-{seed}", flush=True)
-                scenario = scenario_of(case, seed)
-                home = (options.folder or Path(temporary)) / f"{case}-{seed}"
+                scenario = scenario_of(case, seed, quiet=options.quiet)
+                home = (options.folder or Path(temporary)) / f"{case}{'-quiet' * options.quiet}-{seed}"
                 score(total, events_of(home, scenario), scenario)
             print(f"{case}: {total}", flush=True)
 

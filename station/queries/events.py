@@ -37,21 +37,19 @@ from station.science.analysis.voids import area_weights, void_variance
 from station.science.time_series import event_errors
 from station.science.time_series.event_tracks import Track, pair_tracks, track_events
 from station.science.time_series.events import (
+    BEFORE,
     BlockLevels,
     Region,
     before_level,
     detect_regions,
     event_thresholds,
-    surrounding_weights,
 )
+from station.science.time_series.surroundings import NEIGHBOURS, surrounding_weights
 
 HISTORY = 24  # scans before the two newest, which show how a block scatters
 LEAST_HISTORY = 8
-BEFORE = 6  # the last of them, with which the two newest are compared
-LEAST_BEFORE = 3  # of them must have seen a block
 YEAR_S = 365.25 * 86_400
 CACHED_EPOCHS = 4  # whose shared parameters are in memory
-NEIGHBOURS = np.ones((3, 3), np.bool_)  # of a block, itself included
 RETAINED_SIGMA = 0.02  # of the share of a change that cells with few points retain (accuracy.md)
 EDGE_BLOCKS = 2  # around what was detected: an event covers them in part
 SEARCHES_KEPT = 200  # at once: a long search of a whole series can be interrupted
@@ -212,20 +210,16 @@ class EventQueries:
     def _search(self, window: range, progress: Callable[[], None]) -> list[list[Any]]:
         """Return the regions that the two newest scans of a window show: encoded blocks, and the rest."""
         *history, first, second = window
-        before = history[-BEFORE:]
         newest = self._queries.read(self._epoch(second))
         errors = _systematic_errors(newest)
-        differences = [_difference(self._shared(scan), self._shared(before[-1])) for scan in (first, second)]
+        differences = [_difference(self._shared(scan), self._shared(history[-1])) for scan in (first, second)]
         known = self._queries.reference_blocks(self._version(second))["known"] > 0
         regions = detect_regions(
-            [self._levels(scan) for scan in before],
-            (self._levels(first), self._levels(second)),
-            [errors.of_blocks(difference) for difference in differences],
-            [errors.against_surroundings(difference) for difference in differences],
-            np.stack([self._levels(scan).change_m for scan in history]),
+            [self._levels(scan) for scan in history],
+            [self._levels(scan) for scan in (first, second)],
+            [errors.of_scan(difference) for difference in differences],
             newest.rock > 0.5,
             event_thresholds(int(np.count_nonzero(known)), self._scans_per_year),
-            LEAST_BEFORE,
         )
         progress()
         return [
@@ -319,7 +313,7 @@ class EventQueries:
         were not observed are interpolated.
         """
         newest = self._queries.read(self._epoch(after[-1]))
-        base = before_level([self._levels(scan) for scan in before], LEAST_BEFORE)
+        base = before_level([self._levels(scan) for scan in before])
         level = _mean_level(self._levels(after[0]), self._levels(after[1]))
         change_m, random_m2 = level.change_m - base.change_m, level.random_m2 + base.random_m2
         known = np.isfinite(change_m) & newest.observed

@@ -7,17 +7,16 @@ import pytest
 from scipy import ndimage
 
 from station.science.time_series.events import (
+    BlockErrors,
     BlockLevels,
     before_level,
     detect_regions,
     distance_blocks,
     event_thresholds,
     overlaps,
-    scan_differences,
-    surrounding_weights,
-    surroundings,
-    window_scatter,
 )
+from station.science.time_series.surroundings import surrounding_weights, surroundings
+from station.science.time_series.window_scores import scan_differences, window_scatter
 
 SHAPE = 60, 80
 HOURS_PER_YEAR = 8766
@@ -53,17 +52,8 @@ class Valley:
         return (2 * self.systematic_rad * RANGE_M) ** 2
 
     def regions(self, scans):
-        shared_m2 = self.systematic_m2
-        history_m = np.stack([scan.change_m for scan in scans[:-2]])
-        return detect_regions(
-            scans[-8:-2],
-            (scans[-2], scans[-1]),
-            (shared_m2,) * 2,
-            (shared_m2,) * 2,
-            history_m,
-            ROCK,
-            THRESHOLDS,
-        )
+        errors = BlockErrors(self.systematic_m2, self.systematic_m2)
+        return detect_regions(scans[:-2], scans[-2:], (errors, errors), ROCK, THRESHOLDS)
 
 
 def disc(row, column, area_m2, depth_m):
@@ -141,9 +131,9 @@ def test_snowfall_is_widespread_and_hides_no_avalanche():
 def test_a_level_has_the_variance_of_a_median():
     rng = np.random.default_rng(0)
     levels = [BlockLevels(0.02 * rng.normal(size=SHAPE), np.full(SHAPE, 4e-4)) for _ in range(7)]
-    level = before_level(levels, 3)
+    level = before_level(levels)
     assert np.std(level.change_m / np.sqrt(level.random_m2)) == pytest.approx(0.95, abs=0.07)
-    assert np.isnan(before_level(levels[:2], 3).change_m).all()
+    assert np.isnan(before_level(levels[:2]).change_m).all()
 
 
 def test_scatter_of_windows_is_that_of_consecutive_scans_whatever_the_trend():
