@@ -96,14 +96,14 @@ def station_objects(series: Series) -> list[tuple[int, Bools]]:
     """Return hour of confirmation and blocks of the local events."""
     levels = [BlockLevels(change_m.astype(float), series.random_m**2) for change_m in series.change_m]
     thresholds = event_thresholds(series.rock.size, HOURS_PER_YEAR)
-    errors = BlockErrors(series.systematic_m2, series.systematic_m2)
+    errors = BlockErrors(*[series.systematic_m2] * 3)
 
     def regions(hour: int) -> list[Region]:
         history, pair = levels[max(hour - HISTORY - 1, 0) : hour - 1], levels[hour - 1 : hour + 1]
         return detect_regions(history, pair, (errors, errors), series.rock, thresholds)
 
     detected = ((hour, regions(hour)) for hour in range(LEAST_HISTORY + 1, len(levels)))
-    tracks: list[Track] = track_events(detected)
+    tracks: list[Track] = track_events(detected, series.rock.size)
     return [(track.first, track.blocks) for track in tracks if not track.widespread]
 
 

@@ -49,7 +49,7 @@ from station.science.time_series.surroundings import NEIGHBOURS, surrounding_wei
 HISTORY = 24  # scans before the two newest, which show how a block scatters
 LEAST_HISTORY = 8
 YEAR_S = 365.25 * 86_400
-CACHED_EPOCHS = 4  # whose shared parameters are in memory
+CACHED_EPOCHS = 5  # whose shared parameters are in memory
 RETAINED_SIGMA = 0.02  # of the share of a change that cells with few points retain (accuracy.md)
 EDGE_BLOCKS = 2  # around what was detected: an event covers them in part
 SEARCHES_KEPT = 200  # at once: a long search of a whole series can be interrupted
@@ -122,7 +122,8 @@ class EventQueries:
 
     def _update(self, progress: Callable[[], None]) -> set[str]:
         keys = self._unchanged_keys()
-        tracks = track_events(self._detections(keys, progress))
+        known = self._queries.reference_blocks(self._version(-1))["known"] > 0
+        tracks = track_events(self._detections(keys, progress), int(np.count_nonzero(known)))
         write_events(self._series, self._events(tracks))
         self._keep(keys)
         newest = len(self._names) - 1
@@ -212,12 +213,15 @@ class EventQueries:
         *history, first, second = window
         newest = self._queries.read(self._epoch(second))
         errors = _systematic_errors(newest)
-        differences = [_difference(self._shared(scan), self._shared(history[-1])) for scan in (first, second)]
+        old, new = self._shared(history[min(BEFORE, len(history)) - 1]), self._shared(history[-1])
         known = self._queries.reference_blocks(self._version(second))["known"] > 0
         regions = detect_regions(
             [self._levels(scan) for scan in history],
             [self._levels(scan) for scan in (first, second)],
-            [errors.of_scan(difference) for difference in differences],
+            [
+                errors.of_scan(*(_difference(self._shared(scan), before) for before in (new, old)))
+                for scan in (first, second)
+            ],
             newest.rock > 0.5,
             event_thresholds(int(np.count_nonzero(known)), self._scans_per_year),
         )
@@ -229,6 +233,7 @@ class EventQueries:
                 region.widespread,
                 round(region.mean_m, 6),
                 round(region.sigmas, 3),
+                region.lag,
             ]
             for region in regions
         ]
@@ -239,7 +244,9 @@ class EventQueries:
             others = [
                 other.blocks
                 for other in tracks
-                if other is not track and abs(other.first - track.first) <= BEFORE
+                if other is not track
+                and not other.widespread  # it is what is taken off
+                and abs(other.first - track.first) <= BEFORE
             ]
             volumes.append(
                 self._volume_of(track, np.any(others, axis=0) if others else np.zeros_like(track.blocks))
@@ -280,7 +287,7 @@ class EventQueries:
             id=name,
             kind=kinds[0 if track.sign > 0 else 1],
             state="active" if track.is_open(newest) else "closed",
-            after=self._time(window[-3]),
+            after=self._time(window[-3 - track.lag]),
             begin=self._time(track.first - 1),
             confirmed=self._time(track.first),
             end=self._time(track.grew - 1 if track.grew == track.first else track.grew),
@@ -298,7 +305,8 @@ class EventQueries:
         return f"{datetime.fromtimestamp(self._index.time_s[self._positions[scan]], UTC):%Y-%m-%dT%H:%M:%SZ}"
 
     def _volume_of(self, track: Track, others: Bools) -> _Volume:
-        before = self._window(track.first)[:-2][-BEFORE:]
+        history = self._window(track.first)[: -2 - track.lag]
+        before = history[-BEFORE:]
         after = [track.last - 1, track.last]
         texts = encode_blocks(track.blocks), encode_blocks(others)
         key = self._key("volume", [*before, *after], *texts)

@@ -32,9 +32,9 @@ class SystematicErrors:
     def __init__(self, jacobian: HeightJacobian | None, observed: Bools, rock: Bools) -> None:
         self._jacobian, self._observed, self._rock = jacobian, observed, rock
 
-    def of_scan(self, difference: SharedParameters | None) -> BlockErrors:
-        """Return the variances of each block (by, bx), and of each less its surroundings [m²]."""
-        return BlockErrors(self.of_blocks(difference), self.against_surroundings(difference))
+    def of_scan(self, newest: SharedParameters | None, oldest: SharedParameters | None) -> BlockErrors:
+        """Return the variances of a scan less the newest, and less the oldest, of the scans before it."""
+        return BlockErrors(self.of_blocks(newest), self.against_surroundings(newest), self.of_blocks(oldest))
 
     def of_blocks(self, difference: SharedParameters | None) -> Floats:
         """Return the variance of each block (by, bx) [m²]."""

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from station.quantities import Bools, Floats
-from station.science.time_series.events import Region, distance_blocks, overlaps
+from station.science.time_series.events import WIDESPREAD_SHARE, Region, distance_blocks, overlaps
 
 REST_SCANS = 3  # an event that so many scans no longer show has come to rest
 GROWN = 1.2  # factor of the volume by which an event has grown
@@ -27,6 +27,8 @@ class Track:
     widespread: bool
     sigmas: float  # of its most significant window
     largest: float  # sum over its blocks of the change, as detected [m]
+    lag: int  # scans between those it was compared with and its first
+    front: bool = False  # a local change that spread over much of the ground
 
     def is_open(self, scan: int) -> bool:
         """Return True if the event has not come to rest at a scan."""
@@ -34,25 +36,37 @@ class Track:
 
     def is_same(self, region: Region, scan: int) -> bool:
         """Return True if a region detected at a scan belongs to this event."""
-        if not self.is_open(scan) or (self.sign, self.widespread) != (region.sign, region.widespread):
+        if not self.is_open(scan) or self.sign != region.sign:
             return False
-        return self.widespread or overlaps(self.blocks, region.blocks)
+        if region.widespread:
+            return self.widespread
+        return self.front == self.widespread and overlaps(self.blocks, region.blocks)
 
-    def add(self, region: Region, scan: int) -> None:
-        """Add a region; the event has grown if its volume is a fifth above the largest so far."""
+    def has_reached(self, other: Track, scan: int) -> bool:
+        """Return True if this is a front, and the other is what widespread change it was part of."""
+        return self.front and other.widespread and other.sign == self.sign and other.is_open(scan)
+
+    def add(self, region: Region, scan: int, many: float) -> None:
+        """Add a region; the event has grown if its volume is a fifth above the largest so far.
+
+        With more than `many` blocks it is widespread: a front has passed over them.
+        """
         size = abs(region.mean_m) * float(np.count_nonzero(region.blocks))
         if size > GROWN * self.largest:
             self.grew = scan
         self.largest, self.last = max(self.largest, size), scan
         self.blocks = self.blocks | region.blocks
+        if not self.widespread and np.count_nonzero(self.blocks) > many:
+            self.widespread = self.front = True
         self.sigmas = max(self.sigmas, region.sigmas)
 
 
-def track_events(detections: Iterable[tuple[int, list[Region]]]) -> list[Track]:
+def track_events(detections: Iterable[tuple[int, list[Region]]], observed: int) -> list[Track]:
     """Return the events of the regions detected at each scan, in order of time, the oldest first.
 
-    A region that touches several events joins them to one.
+    A region that touches several events joins them to one. `observed` is the number of observed blocks.
     """
+    many = WIDESPREAD_SHARE * observed
     tracks: list[Track] = []
     for scan, regions in detections:
         for region in regions:
@@ -61,14 +75,17 @@ def track_events(detections: Iterable[tuple[int, list[Region]]]) -> list[Track]:
                 size = abs(region.mean_m) * float(np.count_nonzero(region.blocks))
                 tracks.append(
                     Track(
-                        scan, scan, scan, region.blocks, region.sign, region.widespread, region.sigmas, size
+                        scan, scan, scan, region.blocks, region.sign, region.widespread, region.sigmas, size,
+                        region.lag,
                     )
-                )
+                )  # fmt: skip
                 continue
-            for other in same[1:]:
-                same[0].blocks = same[0].blocks | other.blocks
-                tracks.remove(other)
-            same[0].add(region, scan)
+            track = same[0]
+            track.add(region, scan, many)
+            for other in tracks.copy():
+                if other is not track and (other in same or track.has_reached(other, scan)):
+                    track.blocks = track.blocks | other.blocks
+                    tracks.remove(other)
     return tracks
 
 

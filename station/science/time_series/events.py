@@ -8,7 +8,7 @@ sizes. Source: equations.md, 6.11.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy import ndimage
@@ -30,6 +30,7 @@ LEAST_BEFORE = 3  # of them must have seen a block
 WINDOWS = (2, 3, 5, 8, 13)  # edge of the windows [blocks]
 MIN_DEPTH_M = 0.05  # less is no event, however significant
 MIN_WIDESPREAD_M = 0.01
+ONGOING = 0.5  # of its mean rate: snowfall that is slower is over
 WIDESPREAD_SHARE = 0.25  # of the observed tiles: what changes them alike is snowfall or melt
 PATCH_BLOCKS = 9  # that change alike where melt or snow is patchy
 EXTENT_SIGMAS = 3.0  # of a block that belongs to an event
@@ -55,6 +56,7 @@ class BlockErrors:
 
     systematic_m2: Floats
     contrast_m2: Floats  # of a block less what surrounds it
+    oldest_m2: Floats  # of a block, against the oldest scans instead
 
 
 @dataclass(frozen=True)
@@ -66,6 +68,7 @@ class Region:
     widespread: bool
     mean_m: float  # of the change of the blocks, as detected
     sigmas: float  # of the most significant window
+    lag: int = 0  # scans between those compared with and the first of the two
 
 
 @dataclass(frozen=True)
@@ -113,19 +116,19 @@ def detect_regions(
 ) -> list[Region]:
     """Return the regions that two scans show to have changed since the scans before, the largest first.
 
-    `history` are the scans before, the oldest first: the last of them are what the two are compared with, and
-    all of them show how blocks scatter. `errors` are those of the two, `rock` marks blocks of bare ground.
-    Both scans must show the change with the same sign, beyond the thresholds.
+    `history` are the scans before, the oldest first: the two are compared with the last of them, and with the
+    first as well to recognise slow snowfall, and all show how blocks scatter. `errors` are those of the two,
+    `rock` marks blocks of bare ground. Both scans must show the change with the same sign, beyond the
+    thresholds.
     """
-    base = before_level(history[-BEFORE:])
+    newest = before_level(history[-BEFORE:])
+    scans = list(zip(after, errors, strict=True))
     absolute, relative = zip(
-        *(
-            _changes(base, levels, scan_errors, rock)
-            for levels, scan_errors in zip(after, errors, strict=True)
-        ),
-        strict=True,
+        *(_changes(newest, levels, block_errors, rock) for levels, block_errors in scans), strict=True
     )
     regions = list(_widespread_regions(absolute, thresholds.widespread))
+    if not any(region.sign > 0 for region in regions):
+        regions += _slow_rise(history, scans, rock, thresholds.widespread)
     history_m = np.stack([levels.change_m for levels in history])
     regions += _local_regions(relative, history_m, rock, thresholds.local)
     return sorted(regions, key=lambda region: (-int(region.blocks.sum()), -region.sign))
@@ -201,6 +204,31 @@ def _widespread_regions(changes: Sequence[BlockChange], sigmas: float) -> Iterat
         most = float(np.max(sign * tile_z))
         mean_change_m = float(smaller_of_both(first_m, second_m)[blocks].mean())
         yield Region(blocks, sign, widespread=True, mean_m=mean_change_m, sigmas=most)
+
+
+def _slow_rise(
+    history: Sequence[BlockLevels],
+    scans: Sequence[tuple[BlockLevels, BlockErrors]],
+    rock: Bools,
+    sigmas: float,
+) -> Iterator[Region]:
+    """Yield the tiles that rose since the oldest scans, if they are many and still rise: slow snowfall."""
+    lag = len(history) - BEFORE
+    oldest, newest = before_level(history[:BEFORE]), before_level(history[-BEFORE:])
+    rise_m = scans[0][0].change_m - oldest.change_m
+    if np.count_nonzero(rise_m > MIN_DEPTH_M) < WIDESPREAD_SHARE * np.count_nonzero(np.isfinite(rise_m)):
+        return  # most scans
+    changes = [
+        _changes(oldest, levels, replace(errors, systematic_m2=errors.oldest_m2), rock)[0]
+        for levels, errors in scans
+    ]
+    steady = (BEFORE + 1) / (2 * lag + BEFORE + 1)  # share since the newest of what rose since the oldest
+    for region in _widespread_regions(changes, sigmas):
+        recent_m = min(
+            float(np.nanmean((levels.change_m - newest.change_m)[region.blocks])) for levels, _ in scans
+        )
+        if region.mean_m > MIN_DEPTH_M and recent_m > ONGOING * steady * region.mean_m:
+            yield replace(region, lag=lag)
 
 
 def _tile_scores(change: BlockChange) -> tuple[Floats, Floats]:

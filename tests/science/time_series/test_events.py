@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from scipy import ndimage
 
+from station.science.time_series.event_tracks import track_events
 from station.science.time_series.events import (
     BlockErrors,
     BlockLevels,
@@ -52,7 +53,7 @@ class Valley:
         return (2 * self.systematic_rad * RANGE_M) ** 2
 
     def regions(self, scans):
-        errors = BlockErrors(self.systematic_m2, self.systematic_m2)
+        errors = BlockErrors(*[self.systematic_m2] * 3)
         return detect_regions(scans[:-2], scans[-2:], (errors, errors), ROCK, THRESHOLDS)
 
 
@@ -126,6 +127,48 @@ def test_snowfall_is_widespread_and_hides_no_avalanche():
     regions = valley.regions([*(valley.scan() for _ in range(10)), valley.scan(after), valley.scan(after)])
     assert [(region.widespread, region.sign) for region in regions] == [(True, 1), (False, 1)]
     assert np.count_nonzero(regions[1].blocks) == pytest.approx(60, abs=20)
+
+
+@pytest.mark.integration
+def test_slow_snowfall_is_widespread_while_it_lasts():
+    """2 cm an hour off steep ground, 2 to 4 cm of systematic σ: the hours just before do not show it."""
+    valley = Valley(7, systematic_rad=3e-5)
+    flat = ROW < 40
+    scans = [valley.scan(0.02 * max(0, min(hour - 10, 18)) * flat) for hour in range(38)]
+    found = {last: valley.regions(scans[max(last - 25, 0) : last + 1]) for last in range(9, 38)}
+    assert not any(found[last] for last in range(9, 12))
+    for last in range(20, 28):
+        (snow,) = found[last]
+        assert (snow.widespread, snow.sign) == (True, 1)
+        assert np.mean(flat[snow.blocks]) > 0.95
+    assert np.count_nonzero(snow.blocks) > 0.8 * np.count_nonzero(flat & ~valley.unseen)
+    assert snow.lag == 18
+    assert snow.mean_m == pytest.approx(0.02 * (26 - 10), abs=0.05)
+    assert not any(found[last] for last in range(34, 38))
+
+
+@pytest.mark.integration
+def test_quiet_hours_with_large_systematic_errors_are_no_snowfall():
+    for seed in range(4):
+        valley = Valley(40 + seed, systematic_rad=3e-5)
+        scans = [valley.scan() for _ in range(40)]
+        assert not any(valley.regions(scans[max(last - 25, 0) : last + 1]) for last in range(9, 40))
+
+
+@pytest.mark.integration
+@pytest.mark.parametrize("rows_per_h", [2, 3, 10, 20])
+def test_an_edge_of_melt_that_moves_over_hours_is_one_front(rows_per_h):
+    """Snow of 0.3 m goes behind an edge that climbs: too little at once, or nearly everything."""
+    valley = Valley(11)
+    scans = []
+    for hour in range(30):
+        behind = np.clip((ROW - SHAPE[0] + rows_per_h * max(hour - 10, 0)) / 3, 0, 1)
+        scans.append(valley.scan(np.where(ROCK, 0.0, -0.3 * behind)))
+    found = ((last, valley.regions(scans[max(last - 25, 0) : last + 1])) for last in range(9, 30))
+    front = max(track_events(found, ROCK.size), key=lambda track: np.count_nonzero(track.blocks))
+    assert (front.widespread, front.sign) == (True, -1)
+    passed = min(19 * rows_per_h, SHAPE[0]) / SHAPE[0]
+    assert np.count_nonzero(front.blocks) > 0.8 * passed * np.count_nonzero(~ROCK & ~valley.unseen)
 
 
 def test_a_level_has_the_variance_of_a_median():
