@@ -253,8 +253,9 @@ class EventQueries:
             )
         surface = self._queries.reference_blocks(self._version(-1))
         with np.errstate(invalid="ignore"):
-            elevation_m = surface["surface_m"] / surface["known"]
-        partners = pair_tracks(tracks, elevation_m)
+            surface_m = surface["surface_m"] / surface["known"]
+        place_m = self.grid.x_m[None, :], self.grid.y_m[:, None], surface_m
+        partners = pair_tracks(tracks, self.grid.plane.in_map_axes(place_m)[2])
         ids = self._ids(tracks)
         for number, (track, volume) in enumerate(zip(tracks, volumes, strict=True)):
             event = self._event(ids[number], track, volume)
