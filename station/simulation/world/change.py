@@ -119,6 +119,7 @@ def _thaw(scenario: Scenario, valley: Valley) -> tuple[SurfaceChange, ...]:
     """Return what melts in each hour: the snow between the heights that the edge passes."""
     height_m = valley.ground.node / valley.size
     edge_m = height_m[valley.ice.node > 0.5].min()
+    ice = np.where(valley.ice.node < 0.01, 0.0, valley.ice.node)  # its smooth edge lies on rock
 
     def amount(begin_hour: float) -> Callable[[float], float]:
         return lambda hours: scenario.thaw_m * min(max(hours - begin_hour, 0.0), 1.0)
@@ -126,7 +127,7 @@ def _thaw(scenario: Scenario, valley: Valley) -> tuple[SurfaceChange, ...]:
     bands = []
     for hour in range(int(scenario.hours - scenario.thaw_from_hour) + 1):
         passed = np.floor((height_m - edge_m) / scenario.thaw_climb_m_per_h) == hour
-        pattern = valley.ground.with_nodes(-1.0 * passed * valley.ice.node)
+        pattern = valley.ground.with_nodes(-1.0 * passed * ice)
         bands.append(SurfaceChange("thaw", pattern, amount(scenario.thaw_from_hour + hour)))
     return tuple(bands)
 
