@@ -6,14 +6,14 @@ python -m benchmarks.event_stations [--cases NAME …] [--quiet] [--seeds N] [--
 The stations have the real scanner's points in a sector of 25°, and cells of 5 m. On each, debris of 0.3 m
 comes to rest on 500 m² at four places 2 km away, one after another; at the first of them as much again three
 scans later. The places are drawn from what the first scan sees, on slopes below 40°. Quiet ones are
-longer and have no debris.
+longer and have no debris; a rock face with cells of 0.5 m and a snow field with cells of 1 m are among them.
 """
 
 from __future__ import annotations
 
 import argparse
 import tempfile
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from datetime import datetime
 from pathlib import Path
@@ -33,6 +33,7 @@ from station.processing.site_files import series_for
 from station.queries.blocks import BlockQueries
 from station.queries.events import LEAST_HISTORY, EventQueries
 from station.science.time_series.events import Thresholds
+from station.simulation.kinds import mammoth, rockfall
 from station.simulation.scenario import Deposit, Scenario, full_resolution, named
 from station.simulation.station import Station
 from station.simulation.truth import map_from_enu
@@ -55,7 +56,7 @@ class Case:
     """A station of the table: its scenario in `named`, and what else is changed."""
 
     title: str
-    scenario: str
+    scenario: str | Callable[[int, int], Scenario]  # of the valley; or of another kind, by hours and seed
     overrides: dict[str, Any] = field(default_factory=dict)
 
 
@@ -74,6 +75,10 @@ CASES = {
     "breathing": Case("rock heaves by 3 mm and creeps by 20 mm", "breathing"),
     "snow": Case("0.4 m of patchy snow in half of the hours", "snowfall"),
     "airborne": Case("0.1 % of the echoes from the air", "airborne"),
+}
+QUIET_CASES = CASES | {
+    "rock-face": Case("rock face, cells of 0.5 m", rockfall, {"rockfall_m": 0.0}),
+    "snow-field": Case("snow field, cells of 1 m", mammoth, {"snowfall_m": 0.0}),
 }
 HEADS = "station", "found by the second scan", "later", "volumes: rms of z, σ", "false alarms", "widespread"
 QUIET_HEADS = "station", "searched scans", "false alarms", "largest z", "widespread"
@@ -118,10 +123,14 @@ class Score:
 
 def scenario_of(case: str, seed: int, *, quiet: bool = False) -> Scenario:
     """Return the scenario of a case with its deposits, or a longer one without them."""
-    full = full_resolution(named(CASES[case].scenario, QUIET_HOURS if quiet else HOURS, seed))
+    its = QUIET_CASES[case]
+    if not isinstance(its.scenario, str):
+        scans_per_hour = 3600 / its.scenario(1, seed).interval_s
+        return replace(its.scenario(round(QUIET_HOURS / scans_per_hour), seed), **its.overrides)
+    full = full_resolution(named(its.scenario, QUIET_HOURS if quiet else HOURS, seed))
     share = (AZIMUTH_DEG[1] - AZIMUTH_DEG[0]) / (full.azimuth_deg[1] - full.azimuth_deg[0])
     sector = replace(full, azimuth_deg=AZIMUTH_DEG, lines=round(full.lines * share), extent_m=EXTENT_M)
-    scenario = replace(sector, **CASES[case].overrides)
+    scenario = replace(sector, **its.overrides)
     return scenario if quiet else with_deposits(scenario, DEPOSIT_SCANS, GROWTH_SCAN)
 
 
@@ -242,7 +251,7 @@ def scan_of(time: str, scenario: Scenario) -> int:
 def main() -> None:
     """Print a row for each case, and a line for each deposit and each other event."""
     parser = argparse.ArgumentParser(description="Events on simulated stations with disturbances.")
-    parser.add_argument("--cases", nargs="+", choices=list(CASES), default=list(CASES), metavar="NAME")
+    parser.add_argument("--cases", nargs="+", choices=list(QUIET_CASES), metavar="NAME")
     parser.add_argument("--quiet", action="store_true", help="57 scans without deposits: false alarms only")
     parser.add_argument("--seeds", type=int, default=1, help="number of stations of each case")
     parser.add_argument("--first", type=int, default=1, help="the first seed")
@@ -250,8 +259,11 @@ def main() -> None:
     parser.add_argument("--markdown", type=Path, help="page of the docs whose table is replaced")
     options = parser.parse_args()
     quiet, scores = options.quiet, {}
+    cases = QUIET_CASES if quiet else CASES
+    if unknown := set(options.cases or ()) - set(cases):
+        parser.error(f"only quiet: {', '.join(unknown)}")
     with tempfile.TemporaryDirectory() as temporary:
-        for case in options.cases:
+        for case in options.cases or cases:
             scores[case] = Score()
             for seed in range(options.first, options.first + options.seeds):
                 print(f"  {case}-{seed}", flush=True)
@@ -263,7 +275,7 @@ def main() -> None:
             print(f"{case}: {'; '.join(scores[case].cells(quiet=quiet))}", flush=True)
     if options.markdown:
         last = options.first + options.seeds - 1
-        rows = {CASES[case].title: its for case, its in scores.items()} | {
+        rows = {cases[case].title: its for case, its in scores.items()} | {
             "all": sum(scores.values(), Score())
         }
         write_tables(

@@ -222,6 +222,14 @@ def test_scores_of_event_stations_make_a_row_and_a_sum():
     assert event_stations.Score().cells(quiet=True) == ("0", "0", "below 3", "none")
 
 
+def test_quiet_stations_have_no_event():
+    for case in event_stations.QUIET_CASES:
+        scenario = event_stations.scenario_of(case, 3, quiet=True)
+        assert scenario.scans in {57, 56}
+        assert not scenario.deposits
+        assert scenario.rockfall_m == 0
+
+
 @pytest.mark.integration
 def test_filter_of_levels_is_as_good_as_a_plain_one_and_keeps_steps():
     quiet, avalanche = (

@@ -1,4 +1,4 @@
-"""Sums over the cells of each block of about 10 m: of an epoch, and of a reference surface.
+"""Sums over the cells of each block, of 10 m or less: of an epoch, and of a reference surface.
 
 They are formed while an epoch is written, because reading it back takes longer, and kept beside the store. A
 file that is missing, damaged or of another epoch is replaced by sums of what is stored, which are the same to

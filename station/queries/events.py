@@ -255,7 +255,8 @@ class EventQueries:
         with np.errstate(invalid="ignore"):
             surface_m = surface["surface_m"] / surface["known"]
         place_m = self.grid.x_m[None, :], self.grid.y_m[:, None], surface_m
-        partners = pair_tracks(tracks, self.grid.plane.in_map_axes(place_m)[2])
+        elevation_m = self.grid.plane.in_map_axes(place_m)[2]
+        partners = pair_tracks(tracks, elevation_m, self.grid.cell_m)
         ids = self._ids(tracks)
         for number, (track, volume) in enumerate(zip(tracks, volumes, strict=True)):
             event = self._event(ids[number], track, volume)

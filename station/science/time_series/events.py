@@ -19,6 +19,7 @@ from station.science.geometry.robust_statistics import MEDIAN_ABSOLUTE_NORMAL
 from station.science.time_series.surroundings import NEIGHBOURS, TILE, nanmedian, surroundings, tiles_of
 from station.science.time_series.window_scores import (
     BlockChange,
+    WindowScatter,
     may_exceed,
     scan_differences,
     smaller_of_both,
@@ -130,7 +131,12 @@ def detect_regions(
     if not any(region.sign > 0 for region in regions):
         regions += _slow_rise(history, scans, rock, thresholds.widespread)
     history_m = np.stack([levels.change_m for levels in history])
-    regions += _local_regions(relative, history_m, rock, thresholds.local)
+    change_m = smaller_of_both(*(change.change_m for change in absolute))
+    regions += [
+        region
+        for region in _local_regions(relative, history_m, rock, thresholds.local)
+        if region.sign * np.mean(change_m[region.blocks]) > abs(region.mean_m) / 2
+    ]  # where it did not change, its surroundings did
     return sorted(regions, key=lambda region: (-int(region.blocks.sum()), -region.sign))
 
 
@@ -158,23 +164,27 @@ def _local_regions(
     changes: Sequence[BlockChange], history_m: Floats, rock: Bools, sigmas: float
 ) -> Iterator[Region]:
     """Yield connected blocks whose change less that of their surroundings exceeds the threshold."""
-    shape = rock.shape
+    shape, scatter = rock.shape, WindowScatter(scan_differences(history_m))
     sizes = [
-        size for size in WINDOWS if size <= min(shape) and may_exceed(changes, size, sigmas, MIN_DEPTH_M)
+        size
+        for size in WINDOWS
+        if size <= min(shape) and may_exceed(changes, size, sigmas, MIN_DEPTH_M, scatter)
     ]
     if not sizes:
         return
-    differences_m = scan_differences(history_m)
-    score, depth_m = np.zeros(shape), np.zeros(shape)
+    score, depth_m, source = np.zeros(shape), np.zeros(shape), np.zeros(shape, np.int64)
+    windows: list[tuple[slice, slice]] = []
     for size in sizes:
-        mean_m, window_z = window_scores(changes, size, differences_m, rock)
+        mean_m, window_z = window_scores(changes, size, scatter, rock)
         hit = (np.abs(window_z) > sigmas) & (np.abs(mean_m) > MIN_DEPTH_M)
         for row, column in np.argwhere(hit).tolist():  # few
             window = slice(row, row + size), slice(column, column + size)
             higher = np.abs(score[window]) < abs(window_z[row, column])
             score[window][higher] = window_z[row, column]
             depth_m[window][higher] = mean_m[row, column]
-    excess_m, block_z = window_scores(changes, 1, differences_m, rock)
+            source[window][higher] = len(windows)
+            windows.append(window)
+    excess_m, block_z = window_scores(changes, 1, scatter, rock)
     for sign in (1, -1):
         inside = sign * score > 0
         member = inside & (sign * excess_m > sign * depth_m / 2)
@@ -182,10 +192,14 @@ def _local_regions(
         labels, _ = ndimage.label(ndimage.binary_dilation(member, NEIGHBOURS, GAP_BLOCKS // 2))
         for label in np.unique(labels[member & inside]).tolist():
             blocks = (labels == label) & member
-            if np.count_nonzero(blocks) >= MIN_BLOCKS:
-                most = float(np.max(sign * score[blocks]))
+            most = int(np.argmax(np.where(blocks, sign * score, 0.0)))
+            window = windows[source.flat[most]]
+            inside_m = sign * np.sum(excess_m[window] * blocks[window])
+            is_most = inside_m > sign * np.sum(excess_m[window]) / 2  # else it is beside another event
+            if np.count_nonzero(blocks) >= MIN_BLOCKS and is_most:
+                mean_change_m = float(excess_m[blocks].mean())
                 yield Region(
-                    blocks, sign, widespread=False, mean_m=float(excess_m[blocks].mean()), sigmas=most
+                    blocks, sign, widespread=False, mean_m=mean_change_m, sigmas=float(abs(score.flat[most]))
                 )
 
 

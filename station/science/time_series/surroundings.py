@@ -1,4 +1,4 @@
-"""What surrounds blocks of 10 m: tiles of blocks, and medians over them. Source: equations.md, 6.11."""
+"""What surrounds blocks: tiles of blocks, and medians over them. Source: equations.md, 6.11."""
 
 from __future__ import annotations
 

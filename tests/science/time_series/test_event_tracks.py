@@ -64,11 +64,25 @@ def test_a_loss_that_moves_over_a_quarter_of_the_ground_is_a_widespread_front():
     assert len(track_events([*found, (7, [far])], OBSERVED)) == 2
 
 
+def test_local_loss_at_the_edge_of_widespread_loss_is_part_of_it_unless_it_is_deeper():
+    edge, scar = (
+        region(slice(5, 8), slice(5, 9), sign=-1),
+        region(slice(5, 8), slice(20, 24), sign=-1, mean_m=2),
+    )
+    later = region(slice(36, 38), slice(0, 9), sign=-1)
+    melt = region(slice(4, 36), slice(0, 50), sign=-1, widespread=True)
+    tracks = track_events([(3, [edge, scar]), (4, [melt, scar]), (5, [later])], OBSERVED)
+    assert {(track.first, track.last, track.widespread) for track in tracks} == {(3, 5, True), (3, 4, False)}
+    snow = region(slice(4, 36), slice(0, 50), widespread=True)
+    assert len(track_events([(3, [region(slice(5, 8), slice(5, 9))]), (4, [snow])], OBSERVED)) == 2
+
+
 def test_a_deposit_is_paired_with_the_nearest_scar_above():
     elevation_m = np.repeat(3000.0 - 5 * np.arange(SHAPE[0]), SHAPE[1]).reshape(SHAPE)
     scar, deposit = region(slice(5, 8), slice(5, 8), sign=-1), region(slice(20, 23), slice(6, 9))
     far, below = region(slice(2, 4), slice(40, 44), sign=-1), region(slice(36, 38), slice(5, 8), sign=-1)
     tracks = track_events([(3, [scar, deposit, far, below])], OBSERVED)
-    assert pair_tracks(tracks, elevation_m) == {0: 1, 1: 0}
+    assert pair_tracks(tracks, elevation_m, 10.0) == {0: 1, 1: 0}
+    assert pair_tracks(tracks, elevation_m, 100.0) == {}  # more than 500 m apart
     late = track_events([(3, [scar]), (6, [deposit])], OBSERVED)
-    assert pair_tracks(late, elevation_m) == {}
+    assert pair_tracks(late, elevation_m, 10.0) == {}

@@ -17,7 +17,7 @@ from station.science.time_series.events import (
     overlaps,
 )
 from station.science.time_series.surroundings import surrounding_weights, surroundings
-from station.science.time_series.window_scores import scan_differences, window_scatter
+from station.science.time_series.window_scores import WindowScatter, scan_differences
 
 SHAPE = 60, 80
 HOURS_PER_YEAR = 8766
@@ -171,6 +171,18 @@ def test_an_edge_of_melt_that_moves_over_hours_is_one_front(rows_per_h):
     assert np.count_nonzero(front.blocks) > 0.8 * passed * np.count_nonzero(~ROCK & ~valley.unseen)
 
 
+def test_what_stays_while_its_surroundings_change_is_no_event():
+    """Ground that snow does not reach is no loss; of a scar beside it more than the snow is missing."""
+    valley = Valley(9)
+    for surface_m, signs in (
+        (np.where(disc(30, 45, 3000, 1.0) > 0, 0.0, 0.2), [1]),
+        (np.where(disc(30, 45, 3000, 1.0) > 0, -1.0, 0.2), [1, -1]),
+    ):
+        before = [valley.scan() for _ in range(10)]
+        regions = valley.regions([*before, valley.scan(surface_m), valley.scan(surface_m)])
+        assert [region.sign for region in regions] == signs
+
+
 def test_a_level_has_the_variance_of_a_median():
     rng = np.random.default_rng(0)
     levels = [BlockLevels(0.02 * rng.normal(size=SHAPE), np.full(SHAPE, 4e-4)) for _ in range(7)]
@@ -185,12 +197,16 @@ def test_scatter_of_windows_is_that_of_consecutive_scans_whatever_the_trend():
     noise = 0.02 * rng.normal(size=(24, 40, 50))
     step = np.where(hour >= 12, 1.0, 0.0) * (np.indices((40, 50))[0] < 3)
     for size in (1, 2, 5):
-        scatter_m2 = window_scatter(scan_differences(noise - 0.1 * hour + step), size)
-        expected_m = 0.02 / size
+        scatter = WindowScatter(scan_differences(noise - 0.1 * hour + step))
+        scatter_m2, pairs = scatter.variances(size)
         assert scatter_m2.shape == (41 - size, 51 - size)
-        assert expected_m < np.median(np.sqrt(scatter_m2)) < 1.45 * expected_m  # the largest of nine
+        assert np.unique(pairs).tolist() == [23]
+        assert np.median(np.sqrt(scatter_m2)) == pytest.approx(0.02 / size, rel=0.1)
+        some = np.array([3, 5]), np.array([4, 0])
+        assert scatter.variances(size, some)[0] == pytest.approx(scatter_m2[some], rel=1e-9)
     edge = np.where(rng.random((24, 40, 50)) < 0.3, 0.6, 0.0)
-    assert np.sqrt(window_scatter(scan_differences(noise + edge), 1)).min() > 0.2
+    scatter_m2, _ = WindowScatter(scan_differences(noise + edge)).variances(1)
+    assert np.quantile(np.sqrt(scatter_m2), 0.01) > 0.2
 
 
 def test_blocks_at_an_edge_raise_no_event():
