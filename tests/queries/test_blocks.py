@@ -56,15 +56,12 @@ def reference():
     return replace(surface, random_variance_m2=np.full(GRID.shape, REFERENCE_M**2, np.float32))
 
 
-def test_blocks_are_ten_metres_or_less_on_a_small_grid_with_fine_cells():
-    def block_m(cell_m, width_m, height_m):
-        grid = Grid(0.0, 0.0, cell_m, round(width_m / cell_m), round(height_m / cell_m))
-        return block_sums.cells_per_block(grid) * cell_m
-
-    assert [block_m(cell_m, 4800, 3000) for cell_m in (5, 10, 20)] == [10, 10, 20]
-    assert block_m(5, 300, 250) == 10
-    assert (block_m(0.5, 220, 130), block_m(1, 160, 130), block_m(2, 260, 240)) == (1, 2, 4)
-    assert (block_m(1, 1000, 1000), block_m(1, 4800, 3000)) == (5, 10)
+@pytest.fixture(scope="module", autouse=True)
+def ten_metres():
+    """Blocks of 5 × 5 cells, as on a larger grid of such cells."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(block_sums, "MOST_SMALL_BLOCKS", 500)
+        yield
 
 
 @pytest.fixture(scope="module")
@@ -124,9 +121,9 @@ def days(series):
 def test_a_block_of_an_epoch_has_the_sigma_of_the_mean_of_its_cells(base, index):
     blocks = xr.concat(days(base)[1], "time", data_vars="minimal", join="exact").isel(time=index)
     changes = station.open(base.folder).elevation_change[index].values
-    assert (blocks.x[1] - blocks.x[0], blocks.y[0] - blocks.y[1]) == (4, 4)
-    for row, column in ((0, 0), (3, 4), (25, 50), (44, 64), (28, 30)):
-        mask, block = box_mask(row, column, 2), blocks.isel(y=row, x=column)
+    assert (blocks.x[1] - blocks.x[0], blocks.y[0] - blocks.y[1]) == (10, 10)
+    for row, column in ((0, 0), (3, 4), (10, 20), (17, 25), (11, 12)):
+        mask, block = box_mask(row, column, 5), blocks.isel(y=row, x=column)
         assert block.elevation_change == pytest.approx(np.nanmean(changes[mask]), abs=1e-4)
         count = np.isfinite(changes[mask]).sum()
         assert block.coverage == pytest.approx(count / 25, abs=1e-3)
@@ -136,6 +133,19 @@ def test_a_block_of_an_epoch_has_the_sigma_of_the_mean_of_its_cells(base, index)
         assert block.elevation_change_random_uncertainty == pytest.approx(RANDOM_M / np.sqrt(count), rel=0.02)
     assert np.isnan(blocks.elevation_change[15, 3])
     assert blocks.coverage[15, 3].isnull()
+
+
+def test_blocks_are_ten_metres_or_less_on_a_small_grid_with_fine_cells(monkeypatch):
+    monkeypatch.setattr(block_sums, "MOST_SMALL_BLOCKS", 50_000)
+
+    def block_m(cell_m, width_m, height_m):
+        grid = Grid(0.0, 0.0, cell_m, round(width_m / cell_m), round(height_m / cell_m))
+        return block_sums.cells_per_block(grid) * cell_m
+
+    assert [block_m(cell_m, 4800, 3000) for cell_m in (5, 10, 20)] == [10, 10, 20]
+    assert block_m(5, 300, 250) == 10
+    assert (block_m(0.5, 220, 130), block_m(1, 160, 130), block_m(2, 260, 240)) == (1, 2, 4)
+    assert (block_m(1, 1000, 1000), block_m(1, 4800, 3000)) == (5, 10)
 
 
 def test_times_are_those_of_the_series(base):
@@ -154,8 +164,8 @@ def test_a_daily_mean_has_the_sigma_of_three_epochs(base):
     daily = read(base, "daily.nc").isel(time=0)
     with station.open(base.folder) as ds:
         changes = ds.elevation_change[:3].values
-    for row, column in ((3, 4), (25, 50), (35, 28)):
-        mask, block = box_mask(row, column, 2), daily.isel(y=row, x=column)
+    for row, column in ((3, 4), (10, 20), (14, 11)):
+        mask, block = box_mask(row, column, 5), daily.isel(y=row, x=column)
         expected_m = np.mean([np.nanmean(change[mask]) for change in changes])
         assert block.elevation_change == pytest.approx(expected_m, abs=1e-4)
         assert block.epoch_count == 3
