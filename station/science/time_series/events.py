@@ -21,7 +21,6 @@ from station.science.time_series.window_scores import (
     BlockChange,
     WindowScatter,
     may_exceed,
-    scan_differences,
     smaller_of_both,
     window_scores,
 )
@@ -164,7 +163,7 @@ def _local_regions(
     changes: Sequence[BlockChange], history_m: Floats, rock: Bools, sigmas: float
 ) -> Iterator[Region]:
     """Yield connected blocks whose change less that of their surroundings exceeds the threshold."""
-    shape, scatter = rock.shape, WindowScatter(scan_differences(history_m))
+    shape, scatter = rock.shape, WindowScatter(history_m)
     sizes = [
         size
         for size in WINDOWS

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -49,11 +50,17 @@ def scan_differences(history_m: Floats) -> Floats:
 
 
 class WindowScatter:
-    """How the means of windows scattered from scan to scan, by the differences of scans (n, by, bx) [m]."""
+    """How the means of windows scattered from scan to scan, by a history of scans (n, by, bx) [m]."""
 
-    def __init__(self, differences_m: Floats) -> None:
+    def __init__(self, history_m: Floats) -> None:
+        self._history_m = history_m
+
+    @cached_property
+    def _integrals(self) -> tuple[Floats, Floats]:
+        """Those of the number and of the sum of differences: most scans need none."""
+        differences_m = scan_differences(self._history_m)
         observed = np.isfinite(differences_m)
-        self._count, self._total_m = _integrals(observed), _integrals(np.where(observed, differences_m, 0.0))
+        return _integrals(observed), _integrals(np.where(observed, differences_m, 0.0))
 
     def variances(self, size: int, windows: Windows = EVERYWHERE) -> tuple[Floats, Ints]:
         """Return the variance in one scan [m²], and in how many differences each window was observed.
@@ -62,9 +69,10 @@ class WindowScatter:
         hundred differences is used: one event does not raise it, but an edge does, which beams hit in some
         scans only.
         """
-        count = _sums(self._count, size, windows)
+        observed, total_m = self._integrals
+        count = _sums(observed, size, windows)
         count[count < MIN_OBSERVED * size**2] = np.nan
-        means_m = np.sort(np.abs(_sums(self._total_m, size, windows)) / count, axis=0)  # NaN last
+        means_m = np.sort(np.abs(_sums(total_m, size, windows)) / count, axis=0)  # NaN last
         pairs = np.isfinite(means_m).sum(axis=0)
         rank = np.maximum(np.ceil(SCATTER_QUANTILE * pairs).astype(np.int64) - 1, 0)
         typical_m = np.nan_to_num(np.take_along_axis(means_m, rank[None], 0)[0])
@@ -78,6 +86,8 @@ def may_exceed(
     means, _, systematic_m2 = zip(*(_window_means(change, size) for change in changes), strict=True)
     mean_m, least_m2 = np.abs(smaller_of_both(*means)), np.fmin(*systematic_m2)
     windows = np.nonzero((mean_m > depth_m) & (mean_m**2 > sigmas**2 * least_m2))
+    if not len(windows[0]):
+        return False
     own_m2, _ = scatter.variances(size, windows)
     return bool((mean_m[windows] ** 2 > sigmas**2 * SCATTER_VARIANCE * own_m2).any())
 

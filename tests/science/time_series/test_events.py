@@ -17,7 +17,7 @@ from station.science.time_series.events import (
     overlaps,
 )
 from station.science.time_series.surroundings import surrounding_weights, surroundings
-from station.science.time_series.window_scores import WindowScatter, scan_differences
+from station.science.time_series.window_scores import WindowScatter
 
 SHAPE = 60, 80
 HOURS_PER_YEAR = 8766
@@ -197,7 +197,7 @@ def test_scatter_of_windows_is_that_of_consecutive_scans_whatever_the_trend():
     noise = 0.02 * rng.normal(size=(24, 40, 50))
     step = np.where(hour >= 12, 1.0, 0.0) * (np.indices((40, 50))[0] < 3)
     for size in (1, 2, 5):
-        scatter = WindowScatter(scan_differences(noise - 0.1 * hour + step))
+        scatter = WindowScatter(noise - 0.1 * hour + step)
         scatter_m2, pairs = scatter.variances(size)
         assert scatter_m2.shape == (41 - size, 51 - size)
         assert np.unique(pairs).tolist() == [23]
@@ -205,7 +205,7 @@ def test_scatter_of_windows_is_that_of_consecutive_scans_whatever_the_trend():
         some = np.array([3, 5]), np.array([4, 0])
         assert scatter.variances(size, some)[0] == pytest.approx(scatter_m2[some], rel=1e-9)
     edge = np.where(rng.random((24, 40, 50)) < 0.3, 0.6, 0.0)
-    scatter_m2, _ = WindowScatter(scan_differences(noise + edge)).variances(1)
+    scatter_m2, _ = WindowScatter(noise + edge).variances(1)
     assert np.quantile(np.sqrt(scatter_m2), 0.01) > 0.2
 
 
