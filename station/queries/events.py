@@ -307,8 +307,7 @@ class EventQueries:
         return f"{datetime.fromtimestamp(self._index.time_s[self._positions[scan]], UTC):%Y-%m-%dT%H:%M:%SZ}"
 
     def _volume_of(self, track: Track, others: Bools) -> _Volume:
-        history = self._window(track.first)[: -2 - track.lag]
-        before = history[-BEFORE:]
+        before = self._window(track.first)[: -2 - track.lag][-BEFORE:]
         after = [track.last - 1, track.last]
         texts = encode_blocks(track.blocks), encode_blocks(others)
         key = self._key("volume", [*before, *after], *texts)
