@@ -19,8 +19,8 @@ from station.science.geometry.robust_statistics import MEDIAN_ABSOLUTE_NORMAL
 from station.science.time_series.surroundings import NEIGHBOURS, TILE, nanmedian, surroundings, tiles_of
 from station.science.time_series.window_scores import (
     BlockChange,
-    WindowScatter,
     may_exceed,
+    scan_differences,
     smaller_of_both,
     window_scores,
 )
@@ -163,18 +163,17 @@ def _local_regions(
     changes: Sequence[BlockChange], history_m: Floats, rock: Bools, sigmas: float
 ) -> Iterator[Region]:
     """Yield connected blocks whose change less that of their surroundings exceeds the threshold."""
-    shape, scatter = rock.shape, WindowScatter(history_m)
+    shape = rock.shape
     sizes = [
-        size
-        for size in WINDOWS
-        if size <= min(shape) and may_exceed(changes, size, sigmas, MIN_DEPTH_M, scatter)
+        size for size in WINDOWS if size <= min(shape) and may_exceed(changes, size, sigmas, MIN_DEPTH_M)
     ]
     if not sizes:
         return
+    differences_m = scan_differences(history_m)
     score, depth_m, source = np.zeros(shape), np.zeros(shape), np.zeros(shape, np.int64)
     windows: list[tuple[slice, slice]] = []
     for size in sizes:
-        mean_m, window_z = window_scores(changes, size, scatter, rock)
+        mean_m, window_z = window_scores(changes, size, differences_m, rock)
         hit = (np.abs(window_z) > sigmas) & (np.abs(mean_m) > MIN_DEPTH_M)
         for row, column in np.argwhere(hit).tolist():  # few
             window = slice(row, row + size), slice(column, column + size)
@@ -183,7 +182,7 @@ def _local_regions(
             depth_m[window][higher] = mean_m[row, column]
             source[window][higher] = len(windows)
             windows.append(window)
-    excess_m, block_z = window_scores(changes, 1, scatter, rock)
+    excess_m, block_z = window_scores(changes, 1, differences_m, rock)
     for sign in (1, -1):
         inside = sign * score > 0
         member = inside & (sign * excess_m > sign * depth_m / 2)
@@ -194,7 +193,7 @@ def _local_regions(
             most = int(np.argmax(np.where(blocks, sign * score, 0.0)))
             window = windows[source.flat[most]]
             inside_m = sign * np.sum(excess_m[window] * blocks[window])
-            is_most = inside_m > sign * np.sum(excess_m[window]) / 2  # else it is beside another event
+            is_most = inside_m > sign * np.sum(excess_m[window]) / 2  # else it is beside another change
             if np.count_nonzero(blocks) >= MIN_BLOCKS and is_most:
                 mean_change_m = float(excess_m[blocks].mean())
                 yield Region(

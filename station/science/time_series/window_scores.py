@@ -4,13 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property
-from typing import Any
 
 import numpy as np
 from scipy import ndimage
 
-from station.quantities import Bools, Floats, Ints
+from station.quantities import Bools, Floats
 from station.science.geometry.robust_statistics import MEDIAN_ABSOLUTE_NORMAL
 from station.science.time_series.surroundings import SURROUNDING_TILES, TILE, surroundings
 
@@ -18,12 +16,8 @@ MIN_OBSERVED = 0.5  # share of the blocks of a window
 TAIL_QUANTILE, TAIL_SIGMAS = 0.99, 2.576  # two-sided, of a normal distribution
 OUTLIER_SIGMAS = 6.0  # beyond, a window has changed, and is no sample of the errors
 SCATTER_VARIANCE = 1.3  # of a scan less the median of six, over that of a scan
-MIN_PAIRS = 12  # of scans that show how a window scatters
 SCATTER_QUANTILE, SCATTER_SIGMAS = 0.9, 1.645  # of absolute values, two-sided
 TINY = 1e-9
-
-Windows = tuple[Any, ...]  # rows and columns: indices or slices
-EVERYWHERE: Windows = (slice(None), slice(None))
 
 
 @dataclass(frozen=True)
@@ -49,75 +43,49 @@ def scan_differences(history_m: Floats) -> Floats:
     return differences_m - around_m / np.maximum(share, TINY)
 
 
-class WindowScatter:
-    """How the means of windows scattered from scan to scan, by a history of scans (n, by, bx) [m]."""
+def window_scatter(differences_m: Floats, size: int) -> Floats:
+    """Return the variance of the means of windows in one scan [m²], as consecutive scans differ.
 
-    def __init__(self, history_m: Floats) -> None:
-        self._history_m = history_m
-
-    @cached_property
-    def _integrals(self) -> tuple[Floats, Floats]:
-        """Those of the number and of the sum of differences: most scans need none."""
-        differences_m = scan_differences(self._history_m)
-        observed = np.isfinite(differences_m)
-        return _integrals(observed), _integrals(np.where(observed, differences_m, 0.0))
-
-    def variances(self, size: int, windows: Windows = EVERYWHERE) -> tuple[Floats, Ints]:
-        """Return the variance in one scan [m²], and in how many differences each window was observed.
-
-        Both are those of some windows, or of all, (by - size + 1, bx - size + 1). The tenth largest of a
-        hundred differences is used: one event does not raise it, but an edge does, which beams hit in some
-        scans only.
-        """
-        observed, total_m = self._integrals
-        count = _sums(observed, size, windows)
+    The shape is (by - size + 1, bx - size + 1). The tenth largest of a hundred differences is used: one event
+    does not raise it, but an edge does, which beams hit in some scans only. Its neighbours are on the same
+    edge, so that a window has the largest variance of those around it.
+    """
+    means_m = []
+    for difference_m in differences_m:
+        observed = np.isfinite(difference_m)
+        count = _window_sums(observed, size)
         count[count < MIN_OBSERVED * size**2] = np.nan
-        means_m = np.sort(np.abs(_sums(total_m, size, windows)) / count, axis=0)  # NaN last
-        pairs = np.isfinite(means_m).sum(axis=0)
-        rank = np.maximum(np.ceil(SCATTER_QUANTILE * pairs).astype(np.int64) - 1, 0)
-        typical_m = np.nan_to_num(np.take_along_axis(means_m, rank[None], 0)[0])
-        return typical_m**2 / (2 * SCATTER_SIGMAS**2), pairs
+        means_m.append(np.abs(_window_sums(np.where(observed, difference_m, 0.0), size)) / count)
+    ordered = np.sort(means_m, axis=0)  # NaN last
+    pairs = np.isfinite(ordered).sum(axis=0)
+    rank = np.maximum(np.ceil(SCATTER_QUANTILE * pairs).astype(np.int64) - 1, 0)
+    typical_m = np.nan_to_num(np.take_along_axis(ordered, rank[None], 0)[0])
+    return np.asarray(ndimage.maximum_filter(typical_m**2 / (2 * SCATTER_SIGMAS**2), 3))
 
 
-def may_exceed(
-    changes: Sequence[BlockChange], size: int, sigmas: float, depth_m: float, scatter: WindowScatter
-) -> bool:
-    """Return True if windows exceed both thresholds in both scans by what is least of their errors."""
-    means, _, systematic_m2 = zip(*(_window_means(change, size) for change in changes), strict=True)
-    mean_m, least_m2 = np.abs(smaller_of_both(*means)), np.fmin(*systematic_m2)
-    windows = np.nonzero((mean_m > depth_m) & (mean_m**2 > sigmas**2 * least_m2))
-    if not len(windows[0]):
-        return False
-    own_m2, _ = scatter.variances(size, windows)
-    return bool((mean_m[windows] ** 2 > sigmas**2 * SCATTER_VARIANCE * own_m2).any())
+def may_exceed(changes: Sequence[BlockChange], size: int, sigmas: float, depth_m: float) -> bool:
+    """Return True if windows exceed both thresholds by their stated errors, in both scans: few scans do."""
+    means, variances = zip(*(_window_means(change, size) for change in changes), strict=True)
+    mean_m = np.abs(smaller_of_both(*means))
+    return bool(((mean_m > depth_m) & (mean_m > sigmas * np.sqrt(np.fmin(*variances)))).any())
 
 
 def window_scores(
-    changes: Sequence[BlockChange], size: int, scatter: WindowScatter, rock: Bools
+    changes: Sequence[BlockChange], size: int, differences_m: Floats, rock: Bools
 ) -> tuple[Floats, Floats]:
     """Return mean [m] and z of the windows (by - size + 1, bx - size + 1) that both scans confirm, else 0.
 
-    The variance is what the window scattered before, and its systematic one; or what both its stated errors
-    and the windows around it say at least. Where few scans show how it scatters it is the largest of all:
-    neighbours may lie on the same edge. If windows around it have a larger z than normal errors, so has this
-    one.
+    The variance is that of the errors, or what the window scattered before, if that is more. If windows
+    around it have a larger z than normal errors, so has this one.
     """
-    own_m2, pairs = scatter.variances(size)
-    own_m2 *= SCATTER_VARIANCE
-    around_m2 = ndimage.maximum_filter(own_m2, 3)
-    height, width = own_m2.shape
+    scatter_m2 = SCATTER_VARIANCE * window_scatter(differences_m, size)
+    height, width = scatter_m2.shape
     middle = size // 2
     ground = rock[middle : middle + height, middle : middle + width]
     means, scores = [], []
     for change in changes:
-        mean_m, random_m2, systematic_m2 = _window_means(change, size)
-        stated_m2 = random_m2 + systematic_m2
-        variance_m2 = np.where(
-            pairs >= MIN_PAIRS,
-            np.maximum(own_m2 + systematic_m2, np.minimum(stated_m2, around_m2)),
-            np.maximum(stated_m2, around_m2),
-        )
-        z = mean_m / np.sqrt(variance_m2)
+        mean_m, variance_m2 = _window_means(change, size)
+        z = mean_m / np.sqrt(np.maximum(variance_m2, scatter_m2))
         z /= np.fmax(surroundings(np.abs(z), ground) / MEDIAN_ABSOLUTE_NORMAL, 1.0)
         for kind in (ground, ~ground):
             z[kind] /= _tail_factor(np.abs(z[kind]))
@@ -126,8 +94,8 @@ def window_scores(
     return smaller_of_both(*means), smaller_of_both(*scores)
 
 
-def _window_means(change: BlockChange, size: int) -> tuple[Floats, Floats, Floats]:
-    """Return the mean [m] and its variances of all windows, NaN where a window is hardly observed."""
+def _window_means(change: BlockChange, size: int) -> tuple[Floats, Floats]:
+    """Return the mean [m] and its variance of all windows, NaN where a window is hardly observed."""
     observed = np.isfinite(change.change_m) & (change.random_m2 > 0)
     count = _window_sums(observed, size)
     count[count < MIN_OBSERVED * size**2] = np.nan
@@ -135,7 +103,7 @@ def _window_means(change: BlockChange, size: int) -> tuple[Floats, Floats, Float
         _window_sums(np.where(observed, values, 0.0), size) / count
         for values in (change.change_m, change.random_m2, change.systematic_m2)
     )
-    return mean_m, random_m2 / count, systematic_m2
+    return mean_m, random_m2 / count + systematic_m2
 
 
 def _tail_factor(absolute_z: Floats) -> float:
@@ -149,22 +117,11 @@ def _tail_factor(absolute_z: Floats) -> float:
 
 def _window_sums(values: Floats | Bools, size: int) -> Floats:
     """Return the sums over all windows of size × size."""
-    return _sums(_integrals(values), size)
-
-
-def _integrals(values: Floats | Bools) -> Floats:
-    """Return the sums (..., by + 1, bx + 1) over all that is above and to the left of each corner."""
-    total = np.zeros((*values.shape[:-2], values.shape[-2] + 1, values.shape[-1] + 1))
-    np.cumsum(np.cumsum(values, axis=-2, dtype=np.float64), axis=-1, out=total[..., 1:, 1:])
-    return total
-
-
-def _sums(integrals: Floats, size: int, windows: Windows = EVERYWHERE) -> Floats:
-    """Return the sums over windows of size × size, by their first row and column; over all by default."""
-    first, last = integrals[..., :-size, :], integrals[..., size:, :]
-    corners = last[..., size:], first[..., :-size], first[..., size:], last[..., :-size]
-    whole, above_left, above, left = (corner[(..., *windows)] for corner in corners)
-    return np.asarray(whole + above_left - above - left)
+    total = np.zeros((values.shape[0] + 1, values.shape[1] + 1))
+    np.cumsum(np.cumsum(values, axis=0, dtype=np.float64), axis=1, out=total[1:, 1:])
+    return np.asarray(
+        total[size:, size:] - total[:-size, size:] - total[size:, :-size] + total[:-size, :-size]
+    )
 
 
 def smaller_of_both(first: Floats, second: Floats) -> Floats:
