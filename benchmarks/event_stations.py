@@ -274,14 +274,15 @@ def main() -> None:
                     scores[case].largest_z = max(scores[case].largest_z, largest_z(home))
             print(f"{case}: {'; '.join(scores[case].cells(quiet=quiet))}", flush=True)
     if options.markdown:
-        last = options.first + options.seeds - 1
+        first, last = options.first, options.first + options.seeds - 1
+        seeds = f"seeds {first} to {last}" if last > first else f"seed {first}"
         rows = {cases[case].title: its for case, its in scores.items()} | {
             "all": sum(scores.values(), Score())
         }
         write_tables(
             options.markdown,
             f"event_stations{' --quiet' * quiet}",
-            f"{QUIET_HOURS if quiet else HOURS} scans, seeds {options.first} to {last}",
+            f"{QUIET_HOURS if quiet else HOURS} scans, {seeds}",
             [
                 (
                     QUIET_HEADS if quiet else HEADS,
