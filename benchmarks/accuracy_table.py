@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -12,13 +12,13 @@ from rich.table import Table
 
 from benchmarks.accuracy_measures import SCALES
 from benchmarks.accuracy_rows import Limits, Row
+from benchmarks.markdown_tables import write_tables
 
 Figures = dict[str, Any]
 SHARE = 0.95  # of the scans: verdicts, reasons
 RETAINED = (0.9, 1.1)
 CHANCE = 0.01  # less is beyond chance
 WIDER = 1.1
-BEGIN, END = "<!-- tables of benchmarks.accuracy -->", "<!-- end of the tables of benchmarks.accuracy -->"
 HEADS = (
     "case", "100 m boxes, rms / 95 % [m]", "must (aim)", "z: cell / 10 m / 100 m / area", "must",
     "cells in 95 %", "unchanged, yet significant", "good / degraded / unusable", "most frequent reason",
@@ -107,16 +107,9 @@ def print_tables(rows: dict[str, Row], figures: dict[str, Figures], title: str) 
 
 
 def write_markdown(page: Path, rows: dict[str, Row], figures: dict[str, Figures], title: str) -> None:
-    """Write both tables into a page, between the two comments that mark their place."""
-    before, rest = page.read_text().split(BEGIN)
-    _, after = rest.split(END)
-    tables = [_markdown(HEADS, main_table(rows, figures)), _markdown(*band_table(figures))]
-    page.write_text("\n\n".join([f"{before}{BEGIN}", f"{title}:", *tables, f"{END}{after}"]))
-
-
-def _markdown(heads: Sequence[str], cells: Iterable[Sequence[str]]) -> str:
-    lines = [heads, ["---"] * len(heads), *cells]
-    return "\n".join("| " + " | ".join(line) + " |" for line in lines)
+    """Write both tables into a page."""
+    tables = (HEADS, main_table(rows, figures)), band_table(figures)
+    write_tables(page, "accuracy", title, tables)
 
 
 def _limits(row: Row) -> str:

@@ -24,6 +24,7 @@ from scipy import ndimage
 from station.quantities import Bools, Floats
 from station.science.time_series.event_tracks import Track, track_events
 from station.science.time_series.events import (
+    BlockErrors,
     BlockLevels,
     Region,
     detect_regions,
@@ -33,7 +34,7 @@ from station.science.time_series.events import (
 AREAS_M2 = (200, 500, 1000, 3000)
 DEPTH_M, EVENT_HOUR, BLOCK_M = 0.3, 30, 10.0
 SYSTEMATIC_RAD, MELT_M_PER_H = 5e-6, 0.003
-HISTORY, BEFORE, LEAST_HISTORY = 24, 6, 8
+HISTORY, LEAST_HISTORY = 24, 8
 HOURS_PER_YEAR = 8766
 FINE = 10  # samples along the edge of a block
 
@@ -95,18 +96,14 @@ def station_objects(series: Series) -> list[tuple[int, Bools]]:
     """Return hour of confirmation and blocks of the local events."""
     levels = [BlockLevels(change_m.astype(float), series.random_m**2) for change_m in series.change_m]
     thresholds = event_thresholds(series.rock.size, HOURS_PER_YEAR)
+    errors = BlockErrors(*[series.systematic_m2] * 3)
 
     def regions(hour: int) -> list[Region]:
-        history = levels[max(hour - HISTORY - 1, 0) : hour - 1]
-        history_m = np.stack([level.change_m for level in history])
-        shared_m2 = series.systematic_m2, series.systematic_m2
-        pair = levels[hour - 1], levels[hour]
-        return detect_regions(
-            history[-BEFORE:], pair, shared_m2, shared_m2, history_m, series.rock, thresholds
-        )
+        history, pair = levels[max(hour - HISTORY - 1, 0) : hour - 1], levels[hour - 1 : hour + 1]
+        return detect_regions(history, pair, (errors, errors), series.rock, thresholds)
 
     detected = ((hour, regions(hour)) for hour in range(LEAST_HISTORY + 1, len(levels)))
-    tracks: list[Track] = track_events(detected)
+    tracks: list[Track] = track_events(detected, series.rock.size)
     return [(track.first, track.blocks) for track in tracks if not track.widespread]
 
 

@@ -9,11 +9,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from benchmarks import events
+from benchmarks import event_stations, events
 from benchmarks.accuracy_measures import RECORD, SCALES, summarise
 from benchmarks.accuracy_rows import ROWS
-from benchmarks.accuracy_table import BEGIN, END, missed, write_markdown
+from benchmarks.accuracy_table import missed, write_markdown
 from benchmarks.levels import measure
+from benchmarks.markdown_tables import marks
 from benchmarks.page_cost import kept_hours
 from benchmarks.peers import GridTask, Peer, peer_cost
 from benchmarks.process_cost import Cost, FailedError, Row, cost_of, job_cost, median_cost
@@ -194,16 +195,39 @@ def test_change_that_is_taken_for_motion_misses_the_limits_unless_sigma_covers_i
 
 def test_accuracy_tables_replace_those_of_a_page(tmp_path):
     page = tmp_path / "accuracy.md"
-    page.write_text(f"before\n\n{BEGIN}\n\nold\n\n{END}\n\nafter\n")
+    begin, end = marks("accuracy")
+    page.write_text(f"before\n\n{begin}\n\nold\n\n{end}\n\nafter\n")
     figures = {"rough": figures_of_row(records_of(1.0, 0.0))}
     for _ in range(2):  # the second time replaces the tables of the first
         write_markdown(page, ROWS, figures, "28 scans")
     text = page.read_text()
-    assert text.startswith(f"before\n\n{BEGIN}\n\n28 scans:\n\n| case |")
-    assert text.endswith(f"|\n\n{END}\n\nafter\n")
+    assert text.startswith(f"before\n\n{begin}\n\n28 scans:\n\n| case |")
+    assert text.endswith(f"|\n\n{end}\n\nafter\n")
     row = r"\| rough: rough valley, rock all round \| 0\.010 / 0\.0(19|20) \| 0\.015 / 0\.03 \("
     assert len(re.findall(row, text)) == 1
     assert "old" not in text
+
+
+def test_scores_of_event_stations_make_a_row_and_a_sum():
+    found = event_stations.Score(late=[0, None, 2], z=[1.0, -1.0], sigma_m3=[20.0, 20.0], scans=16)
+    snow = event_stations.Score(
+        late=[0], z=[2.0], sigma_m3=[40.0], false=1, widespread=["snowfall"] * 2, scans=16
+    )
+    assert found.cells(quiet=False) == ("1 of 3", "1", "1.00, 20 m³", "0 in 16 scans", "none")
+    assert (found + snow).cells(quiet=False) == (
+        "2 of 4", "1", "1.41, 28 m³", "1 in 32 scans", "2 snowfall",
+    )  # fmt: skip
+    quiet = event_stations.Score(scans=40, largest_z=4.26) + event_stations.Score(scans=40)
+    assert quiet.cells(quiet=True) == ("80", "0", "4.3", "none")
+    assert event_stations.Score().cells(quiet=True) == ("0", "0", "below 3", "none")
+
+
+def test_quiet_stations_have_no_event():
+    for case in event_stations.QUIET_CASES:
+        scenario = event_stations.scenario_of(case, 3, quiet=True)
+        assert scenario.scans in {57, 56}
+        assert not scenario.deposits
+        assert scenario.rockfall_m == 0
 
 
 @pytest.mark.integration

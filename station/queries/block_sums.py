@@ -1,4 +1,4 @@
-"""Sums over the cells of each block of about 10 m: of an epoch, and of a reference surface.
+"""Sums over the cells of each block, of 10 m or less: of an epoch, and of a reference surface.
 
 They are formed while an epoch is written, because reading it back takes longer, and kept beside the store. A
 file that is missing, damaged or of another epoch is replaced by sums of what is stored, which are the same to
@@ -7,6 +7,7 @@ the last bit.
 
 from __future__ import annotations
 
+import math
 import zipfile
 from collections.abc import Collection, Mapping
 from contextlib import suppress
@@ -25,7 +26,8 @@ from station.archive.schema import FILL
 from station.quantities import Floats, Grid, Quality, Reference
 
 FOLDER = ".block_sums"  # in the data folder
-FORMAT = 1  # of the kept sums
+MOST_SMALL_BLOCKS = 50_000  # of less than 10 m: they cost as much as those of a valley
+FORMAT = 2  # of the kept sums
 QUALITY = "quality"
 ROCK = int(Quality.STABLE_GROUND | Quality.BARE_GROUND)
 
@@ -33,8 +35,12 @@ Sums = dict[str, Floats]  # (by, bx) by name
 
 
 def cells_per_block(grid: Grid) -> int:
-    """Return the rows and columns of a block."""
-    return max(round(BLOCK_M / grid.cell_m), 1)
+    """Return the rows and columns of a block: 10 m, or fewer cells on a grid that is small.
+
+    A block has at least 2 × 2 cells, if these are not larger than 10 m, and there are so many blocks at most.
+    """
+    finest = max(2, math.ceil(math.sqrt(grid.nx * grid.ny / MOST_SMALL_BLOCKS)))
+    return min(finest, max(round(BLOCK_M / grid.cell_m), 1))
 
 
 class EpochSummer:

@@ -90,7 +90,7 @@ class SurfaceBlocks:
 
 
 class BlockQueries:
-    """Blocks of about 10 m, and boxes of about 100 m made of them, of the epochs of a store."""
+    """Blocks of 10 m or less, and boxes of about 100 m made of them, of the epochs of a store."""
 
     def __init__(self, series: Series) -> None:
         self._reader, self._series = EpochReader(series), series

@@ -37,21 +37,19 @@ from station.science.analysis.voids import area_weights, void_variance
 from station.science.time_series import event_errors
 from station.science.time_series.event_tracks import Track, pair_tracks, track_events
 from station.science.time_series.events import (
+    BEFORE,
     BlockLevels,
     Region,
     before_level,
     detect_regions,
     event_thresholds,
-    surrounding_weights,
 )
+from station.science.time_series.surroundings import NEIGHBOURS, surrounding_weights
 
 HISTORY = 24  # scans before the two newest, which show how a block scatters
 LEAST_HISTORY = 8
-BEFORE = 6  # the last of them, with which the two newest are compared
-LEAST_BEFORE = 3  # of them must have seen a block
 YEAR_S = 365.25 * 86_400
-CACHED_EPOCHS = 4  # whose shared parameters are in memory
-NEIGHBOURS = np.ones((3, 3), np.bool_)  # of a block, itself included
+CACHED_EPOCHS = 5  # whose shared parameters are in memory
 RETAINED_SIGMA = 0.02  # of the share of a change that cells with few points retain (accuracy.md)
 EDGE_BLOCKS = 2  # around what was detected: an event covers them in part
 SEARCHES_KEPT = 200  # at once: a long search of a whole series can be interrupted
@@ -124,7 +122,8 @@ class EventQueries:
 
     def _update(self, progress: Callable[[], None]) -> set[str]:
         keys = self._unchanged_keys()
-        tracks = track_events(self._detections(keys, progress))
+        known = self._queries.reference_blocks(self._version(-1))["known"] > 0
+        tracks = track_events(self._detections(keys, progress), int(np.count_nonzero(known)))
         write_events(self._series, self._events(tracks))
         self._keep(keys)
         newest = len(self._names) - 1
@@ -212,20 +211,19 @@ class EventQueries:
     def _search(self, window: range, progress: Callable[[], None]) -> list[list[Any]]:
         """Return the regions that the two newest scans of a window show: encoded blocks, and the rest."""
         *history, first, second = window
-        before = history[-BEFORE:]
         newest = self._queries.read(self._epoch(second))
         errors = _systematic_errors(newest)
-        differences = [_difference(self._shared(scan), self._shared(before[-1])) for scan in (first, second)]
+        old, new = self._shared(history[min(BEFORE, len(history)) - 1]), self._shared(history[-1])
         known = self._queries.reference_blocks(self._version(second))["known"] > 0
         regions = detect_regions(
-            [self._levels(scan) for scan in before],
-            (self._levels(first), self._levels(second)),
-            [errors.of_blocks(difference) for difference in differences],
-            [errors.against_surroundings(difference) for difference in differences],
-            np.stack([self._levels(scan).change_m for scan in history]),
+            [self._levels(scan) for scan in history],
+            [self._levels(scan) for scan in (first, second)],
+            [
+                errors.of_scan(*(_difference(self._shared(scan), before) for before in (new, old)))
+                for scan in (first, second)
+            ],
             newest.rock > 0.5,
             event_thresholds(int(np.count_nonzero(known)), self._scans_per_year),
-            LEAST_BEFORE,
         )
         progress()
         return [
@@ -235,6 +233,7 @@ class EventQueries:
                 region.widespread,
                 round(region.mean_m, 6),
                 round(region.sigmas, 3),
+                region.lag,
             ]
             for region in regions
         ]
@@ -245,15 +244,19 @@ class EventQueries:
             others = [
                 other.blocks
                 for other in tracks
-                if other is not track and abs(other.first - track.first) <= BEFORE
+                if other is not track
+                and not other.widespread  # it is what is taken off
+                and abs(other.first - track.first) <= BEFORE
             ]
             volumes.append(
                 self._volume_of(track, np.any(others, axis=0) if others else np.zeros_like(track.blocks))
             )
         surface = self._queries.reference_blocks(self._version(-1))
         with np.errstate(invalid="ignore"):
-            elevation_m = surface["surface_m"] / surface["known"]
-        partners = pair_tracks(tracks, elevation_m)
+            surface_m = surface["surface_m"] / surface["known"]
+        place_m = self.grid.x_m[None, :], self.grid.y_m[:, None], surface_m
+        elevation_m = self.grid.plane.in_map_axes(place_m)[2]
+        partners = pair_tracks(tracks, elevation_m, self.grid.cell_m)
         ids = self._ids(tracks)
         for number, (track, volume) in enumerate(zip(tracks, volumes, strict=True)):
             event = self._event(ids[number], track, volume)
@@ -286,7 +289,7 @@ class EventQueries:
             id=name,
             kind=kinds[0 if track.sign > 0 else 1],
             state="active" if track.is_open(newest) else "closed",
-            after=self._time(window[-3]),
+            after=self._time(window[-3 - track.lag]),
             begin=self._time(track.first - 1),
             confirmed=self._time(track.first),
             end=self._time(track.grew - 1 if track.grew == track.first else track.grew),
@@ -304,7 +307,7 @@ class EventQueries:
         return f"{datetime.fromtimestamp(self._index.time_s[self._positions[scan]], UTC):%Y-%m-%dT%H:%M:%SZ}"
 
     def _volume_of(self, track: Track, others: Bools) -> _Volume:
-        before = self._window(track.first)[:-2][-BEFORE:]
+        before = self._window(track.first)[: -2 - track.lag][-BEFORE:]
         after = [track.last - 1, track.last]
         texts = encode_blocks(track.blocks), encode_blocks(others)
         key = self._key("volume", [*before, *after], *texts)
@@ -319,7 +322,7 @@ class EventQueries:
         were not observed are interpolated.
         """
         newest = self._queries.read(self._epoch(after[-1]))
-        base = before_level([self._levels(scan) for scan in before], LEAST_BEFORE)
+        base = before_level([self._levels(scan) for scan in before])
         level = _mean_level(self._levels(after[0]), self._levels(after[1]))
         change_m, random_m2 = level.change_m - base.change_m, level.random_m2 + base.random_m2
         known = np.isfinite(change_m) & newest.observed

@@ -31,7 +31,7 @@ ERRORS = (
     "moved_deg", "moved_m",
     "range_bias_m", "range_noise_m", "beam_divergence_mrad", "echo_loss", "airborne_share", "airborne_clouds",
     "log_noise_deg", "log_bias_deg", "log_cyclic_deg", "log_cyclic_change", "log_clock_s", "log_fault",
-    "melt_m_per_h", "snowfall_m", "avalanche_m", "settling_m_per_h", "winter_m", "summer_melt_m",
+    "melt_m_per_h", "thaw_m", "snowfall_m", "avalanche_m", "settling_m_per_h", "winter_m", "summer_melt_m",
     "heave_m", "creep_m", "bar_growth_m", "rockfall_m", "deposits",
 )  # fmt: skip
 
@@ -176,6 +176,9 @@ class Scenario:
     melt_m_per_h: float = 0.0  # of ice at the end of the tongue; zero 450 m (times size) higher
     melt_from_hour: float = 0.0
     melt_by_day: bool = False  # all of it between 6 and 18 h, as the sun rises and sinks
+    thaw_m: float = 0.0  # of snow on the ice, gone below an edge that climbs from the end of the tongue
+    thaw_from_hour: float = 0.0
+    thaw_climb_m_per_h: float = 30.0  # times size
     snowfall_m: float = 0.0  # in total, during snow_hours
     snow_hours: tuple[float, float] = (4.0, 12.0)
     avalanche_m: float = 0.0  # height of the deposit

@@ -56,6 +56,14 @@ def reference():
     return replace(surface, random_variance_m2=np.full(GRID.shape, REFERENCE_M**2, np.float32))
 
 
+@pytest.fixture(scope="module", autouse=True)
+def ten_metres():
+    """Blocks of 5 × 5 cells, as on a larger grid of such cells."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(block_sums, "MOST_SMALL_BLOCKS", 500)
+        yield
+
+
 @pytest.fixture(scope="module")
 def base(tmp_path_factory):
     series = Series(tmp_path_factory.mktemp("store"), "hef", GRID, "EPSG:32632")
@@ -125,6 +133,19 @@ def test_a_block_of_an_epoch_has_the_sigma_of_the_mean_of_its_cells(base, index)
         assert block.elevation_change_random_uncertainty == pytest.approx(RANDOM_M / np.sqrt(count), rel=0.02)
     assert np.isnan(blocks.elevation_change[15, 3])
     assert blocks.coverage[15, 3].isnull()
+
+
+def test_blocks_are_ten_metres_or_less_on_a_small_grid_with_fine_cells(monkeypatch):
+    monkeypatch.setattr(block_sums, "MOST_SMALL_BLOCKS", 50_000)
+
+    def block_m(cell_m, width_m, height_m):
+        grid = Grid(0.0, 0.0, cell_m, round(width_m / cell_m), round(height_m / cell_m))
+        return block_sums.cells_per_block(grid) * cell_m
+
+    assert [block_m(cell_m, 4800, 3000) for cell_m in (5, 10, 20)] == [10, 10, 20]
+    assert block_m(5, 300, 250) == 10
+    assert (block_m(0.5, 220, 130), block_m(1, 160, 130), block_m(2, 260, 240)) == (1, 2, 4)
+    assert (block_m(1, 1000, 1000), block_m(1, 4800, 3000)) == (5, 10)
 
 
 def test_times_are_those_of_the_series(base):

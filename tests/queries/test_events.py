@@ -20,6 +20,7 @@ from station.archive.derived.event_table import (
 )
 from station.archive.netcdf_layout import Series
 from station.archive.reference_files import write_reference
+from station.archive.series.index import list_epochs
 from station.archive.series.virtual import build_series
 from station.quantities import Grid, Quality, Reference
 from station.queries import block_sums
@@ -36,7 +37,15 @@ SCAR = (X_M - 80) ** 2 + (Y_M + 60) ** 2 < 15**2
 SURFACE_M = 0.8 * DEPOSIT - 1.0 * SCAR
 
 
-def make_epoch(hour):
+def deposit_and_scar(hour):
+    return SURFACE_M if hour >= EVENT_HOUR else np.zeros(GRID.shape)
+
+
+def slow_snowfall(hour):
+    return np.full(GRID.shape, 0.02 * max(hour - EVENT_HOUR, 0))
+
+
+def make_epoch(hour, surface=deposit_and_scar):
     epoch = random_epoch(
         hour,
         GRID,
@@ -47,14 +56,13 @@ def make_epoch(hour):
         scalars=SCANNER,
         provenance={"adjustment": "joint", "reference_version": "1"},
     )
-    surface_m = SURFACE_M if hour >= EVENT_HOUR else np.zeros(GRID.shape)
-    change_m = epoch.measurement.change_m + (surface_m.ravel() - hour / 10).astype(np.float32)
+    change_m = epoch.measurement.change_m + (surface(hour) - hour / 10).ravel().astype(np.float32)
     return replace(epoch, measurement=replace(epoch.measurement, change_m=change_m))
 
 
-def write(series, hours):
+def write(series, hours, surface=deposit_and_scar):
     for hour in hours:
-        epochs.write_epoch(series, make_epoch(hour))
+        epochs.write_epoch(series, make_epoch(hour, surface))
     build_series(series)
 
 
@@ -115,6 +123,22 @@ def test_scar_and_deposit_are_a_pair_with_the_true_volumes(base):
     assert deposit.balance_m3 == pytest.approx(scar.volume_m3 + deposit.volume_m3, abs=0.02)
     assert (deposit.east_m, deposit.north_m) == pytest.approx((632_180, 5_185_840), abs=6)
     assert deposit.confirmed[11:13] == f"{(int(deposit.begin[11:13]) + 1):02}"
+
+
+@pytest.mark.integration
+def test_slow_snowfall_is_counted_from_the_scans_before_it(tmp_path):
+    series = empty_store(tmp_path / "store")
+    hours = 25
+    write(series, range(hours), slow_snowfall)
+    update(series)
+    (snow,) = read_events(series.folder)
+    assert (snow.kind, snow.state) == ("snowfall", "active")
+    times = [f"{epoch.start:%Y-%m-%dT%H}" for epoch in list_epochs(series)]
+    after, begin = (times.index(time[:13]) for time in (snow.after, snow.begin))
+    assert after <= EVENT_HOUR < begin
+    true_m3 = 0.02 * (hours - 1.5 - EVENT_HOUR) * snow.area_m2
+    assert abs(snow.volume_m3 - true_m3) < 1.96 * snow.volume_sigma_m3
+    assert snow.volume_sigma_m3 < 0.2 * true_m3
 
 
 @pytest.mark.integration

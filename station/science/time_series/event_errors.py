@@ -15,7 +15,8 @@ from scipy import ndimage, sparse
 from station.quantities import Bools, Floats, Ints, Reals, SharedParameters
 from station.science.analysis.calibration import SparseJacobian, group_means
 from station.science.geometry.robust_statistics import MEDIAN_ABSOLUTE_NORMAL
-from station.science.time_series.events import SURROUNDING_TILES, TILE
+from station.science.time_series.events import BlockErrors
+from station.science.time_series.surroundings import SURROUNDING_TILES, TILE
 from station.science.uncertainty.jacobian import HeightJacobian
 
 LEAST_SQUARES = 30  # around a region, in any position, for their scatter
@@ -30,6 +31,10 @@ class SystematicErrors:
 
     def __init__(self, jacobian: HeightJacobian | None, observed: Bools, rock: Bools) -> None:
         self._jacobian, self._observed, self._rock = jacobian, observed, rock
+
+    def of_scan(self, newest: SharedParameters | None, oldest: SharedParameters | None) -> BlockErrors:
+        """Return the variances of a scan less the newest, and less the oldest, of the scans before it."""
+        return BlockErrors(self.of_blocks(newest), self.against_surroundings(newest), self.of_blocks(oldest))
 
     def of_blocks(self, difference: SharedParameters | None) -> Floats:
         """Return the variance of each block (by, bx) [m²]."""

@@ -65,7 +65,8 @@ def surface_changes(scenario: Scenario, valley: Valley) -> tuple[SurfaceChange, 
         if size
     )
     deposits = tuple(_debris(deposit, valley) for deposit in scenario.deposits)
-    return (*single, *deposits, *(heave(scenario, valley) if scenario.heave_m else ()))
+    thaw = _thaw(scenario, valley) if scenario.thaw_m else ()
+    return (*single, *thaw, *deposits, *(heave(scenario, valley) if scenario.heave_m else ()))
 
 
 def ground_at(valley: Valley, changes: tuple[SurfaceChange, ...], hours: float) -> NodeField:
@@ -112,6 +113,23 @@ def _melting_h(scenario: Scenario, hours: float) -> float:
         return hours
     day, hour = divmod(scenario.start.hour + scenario.start.minute / 60 + hours, 24)
     return float(24 * day + 12 * (1 - np.cos(np.pi * np.clip((hour - 6) / 12, 0, 1))))
+
+
+def _thaw(scenario: Scenario, valley: Valley) -> tuple[SurfaceChange, ...]:
+    """Return what melts in each hour: the snow between the heights that the edge passes."""
+    height_m = valley.ground.node / valley.size
+    edge_m = height_m[valley.ice.node > 0.5].min()
+    ice = np.where(valley.ice.node < 0.01, 0.0, valley.ice.node)  # its smooth edge lies on rock
+
+    def amount(begin_hour: float) -> Callable[[float], float]:
+        return lambda hours: scenario.thaw_m * min(max(hours - begin_hour, 0.0), 1.0)
+
+    bands = []
+    for hour in range(int(scenario.hours - scenario.thaw_from_hour) + 1):
+        passed = np.floor((height_m - edge_m) / scenario.thaw_climb_m_per_h) == hour
+        pattern = valley.ground.with_nodes(-1.0 * passed * ice)
+        bands.append(SurfaceChange("thaw", pattern, amount(scenario.thaw_from_hour + hour)))
+    return tuple(bands)
 
 
 def _settling(scenario: Scenario, valley: Valley) -> SurfaceChange:

@@ -18,7 +18,7 @@ from station.archive.series.virtual import build_series
 from station.quantities import Grid, Quality, Reference
 from station.queries.blocks import BlockQueries
 from station.science.time_series.event_errors import SystematicErrors, like_regions_variance
-from station.science.time_series.events import surrounding_weights
+from station.science.time_series.surroundings import surrounding_weights
 
 GRID = Grid(west_m=632_000.0, north_m=5_186_000.0, cell_m=10.0, nx=57, ny=93)
 SHARED = random_shared(1, GRID)

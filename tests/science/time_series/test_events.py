@@ -6,18 +6,18 @@ import numpy as np
 import pytest
 from scipy import ndimage
 
+from station.science.time_series.event_tracks import track_events
 from station.science.time_series.events import (
+    BlockErrors,
     BlockLevels,
     before_level,
     detect_regions,
     distance_blocks,
     event_thresholds,
     overlaps,
-    scan_differences,
-    surrounding_weights,
-    surroundings,
-    window_scatter,
 )
+from station.science.time_series.surroundings import surrounding_weights, surroundings
+from station.science.time_series.window_scores import scan_differences, window_scatter
 
 SHAPE = 60, 80
 HOURS_PER_YEAR = 8766
@@ -53,17 +53,8 @@ class Valley:
         return (2 * self.systematic_rad * RANGE_M) ** 2
 
     def regions(self, scans):
-        shared_m2 = self.systematic_m2
-        history_m = np.stack([scan.change_m for scan in scans[:-2]])
-        return detect_regions(
-            scans[-8:-2],
-            (scans[-2], scans[-1]),
-            (shared_m2,) * 2,
-            (shared_m2,) * 2,
-            history_m,
-            ROCK,
-            THRESHOLDS,
-        )
+        errors = BlockErrors(*[self.systematic_m2] * 3)
+        return detect_regions(scans[:-2], scans[-2:], (errors, errors), ROCK, THRESHOLDS)
 
 
 def disc(row, column, area_m2, depth_m):
@@ -138,12 +129,75 @@ def test_snowfall_is_widespread_and_hides_no_avalanche():
     assert np.count_nonzero(regions[1].blocks) == pytest.approx(60, abs=20)
 
 
+@pytest.mark.integration
+def test_slow_snowfall_is_widespread_while_it_lasts():
+    """2 cm an hour off steep ground, 2 to 4 cm of systematic σ: the hours just before do not show it."""
+    valley = Valley(7, systematic_rad=3e-5)
+    flat = ROW < 40
+    scans = [valley.scan(0.02 * max(0, min(hour - 10, 18)) * flat) for hour in range(38)]
+    found = {last: valley.regions(scans[max(last - 25, 0) : last + 1]) for last in range(9, 38)}
+    assert not any(found[last] for last in range(9, 12))
+    for last in range(20, 28):
+        (snow,) = found[last]
+        assert (snow.widespread, snow.sign) == (True, 1)
+        assert np.mean(flat[snow.blocks]) > 0.95
+    assert np.count_nonzero(snow.blocks) > 0.8 * np.count_nonzero(flat & ~valley.unseen)
+    assert snow.lag == 18
+    assert snow.mean_m == pytest.approx(0.02 * (26 - 10), abs=0.05)
+    assert not any(found[last] for last in range(34, 38))
+
+
+@pytest.mark.integration
+def test_quiet_hours_with_large_systematic_errors_are_no_snowfall():
+    for seed in range(4):
+        valley = Valley(40 + seed, systematic_rad=3e-5)
+        scans = [valley.scan() for _ in range(40)]
+        assert not any(valley.regions(scans[max(last - 25, 0) : last + 1]) for last in range(9, 40))
+
+
+@pytest.mark.integration
+@pytest.mark.parametrize("rows_per_h", [2, 3, 10, 20])
+def test_an_edge_of_melt_that_moves_over_hours_is_one_front(rows_per_h):
+    """Snow of 0.3 m goes behind an edge that climbs: too little at once, or nearly everything."""
+    valley = Valley(11)
+    scans = []
+    for hour in range(30):
+        behind = np.clip((ROW - SHAPE[0] + rows_per_h * max(hour - 10, 0)) / 3, 0, 1)
+        scans.append(valley.scan(np.where(ROCK, 0.0, -0.3 * behind)))
+    found = ((last, valley.regions(scans[max(last - 25, 0) : last + 1])) for last in range(9, 30))
+    front = max(track_events(found, ROCK.size), key=lambda track: np.count_nonzero(track.blocks))
+    assert (front.widespread, front.sign) == (True, -1)
+    passed = min(19 * rows_per_h, SHAPE[0]) / SHAPE[0]
+    assert np.count_nonzero(front.blocks) > 0.8 * passed * np.count_nonzero(~ROCK & ~valley.unseen)
+
+
+def test_what_stays_while_its_surroundings_change_is_no_event():
+    """Ground that snow does not reach is no loss; of a scar beside it more than the snow is missing."""
+    valley = Valley(9)
+    for surface_m, signs in (
+        (np.where(disc(30, 45, 3000, 1.0) > 0, 0.0, 0.2), [1]),
+        (np.where(disc(30, 45, 3000, 1.0) > 0, -1.0, 0.2), [1, -1]),
+    ):
+        before = [valley.scan() for _ in range(10)]
+        regions = valley.regions([*before, valley.scan(surface_m), valley.scan(surface_m)])
+        assert [region.sign for region in regions] == signs
+
+
+def test_noise_beside_a_large_event_is_no_event_of_its_own():
+    """Blocks that scatter by 0.05 m, half of the change of the windows of 130 m that reach the event."""
+    valley = Valley(1)
+    deposit = disc(30, 45, 4000, 1.0)
+    scans = [valley.scan(0.05 * valley.rng.normal(size=SHAPE) + (hour >= 24) * deposit) for hour in range(26)]
+    (region,) = valley.regions(scans)
+    assert overlaps(region.blocks, deposit > 0.1)
+
+
 def test_a_level_has_the_variance_of_a_median():
     rng = np.random.default_rng(0)
     levels = [BlockLevels(0.02 * rng.normal(size=SHAPE), np.full(SHAPE, 4e-4)) for _ in range(7)]
-    level = before_level(levels, 3)
+    level = before_level(levels)
     assert np.std(level.change_m / np.sqrt(level.random_m2)) == pytest.approx(0.95, abs=0.07)
-    assert np.isnan(before_level(levels[:2], 3).change_m).all()
+    assert np.isnan(before_level(levels[:2]).change_m).all()
 
 
 def test_scatter_of_windows_is_that_of_consecutive_scans_whatever_the_trend():

@@ -10,7 +10,7 @@ import pytest
 from station.simulation.instrument.motion import pose_offset, tilt_axes
 from station.simulation.scenario import Deposit
 from station.simulation.station import Scenario, Station, small
-from station.simulation.world.change import surface_changes
+from station.simulation.world.change import ground_at, surface_changes
 from station.simulation.world.terrain import NodeField, Valley
 
 
@@ -60,6 +60,18 @@ def test_melt_by_day_follows_the_sun_and_is_as_much_in_a_day():
     assert daily(18.0) == daily(30.0)  # not by night
     noon = daily(12.5) - daily(11.5)
     assert noon == pytest.approx(np.pi * 0.01, rel=0.01)  # a sine over half of the day
+
+
+def test_an_edge_of_melt_climbs():
+    scenario = replace(Scenario().without_errors(), hours=8, thaw_m=0.3, thaw_from_hour=2.0)
+    valley = slope_valley(0.5, ice=1.0)
+    height_m = valley.ground.node - valley.ground.node.min()
+    changes = surface_changes(scenario, valley)
+    for hours in (2.0, 4.5, 7.0):
+        change_m = ground_at(valley, changes, hours).node - valley.ground.node
+        edge_m = 30.0 * (hours - 2.0)
+        assert change_m[height_m < edge_m - 30] == pytest.approx(-0.3)
+        assert np.abs(change_m[height_m > edge_m + 30]).max() == 0
 
 
 def test_months_bring_snow_with_drifts_or_take_ice_and_move_the_scanner():

@@ -1,0 +1,129 @@
+"""Change summed over windows of blocks, and its z. Source: equations.md, 6.11."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import ndimage
+
+from station.quantities import Bools, Floats
+from station.science.geometry.robust_statistics import MEDIAN_ABSOLUTE_NORMAL
+from station.science.time_series.surroundings import SURROUNDING_TILES, TILE, surroundings
+
+MIN_OBSERVED = 0.5  # share of the blocks of a window
+TAIL_QUANTILE, TAIL_SIGMAS = 0.99, 2.576  # two-sided, of a normal distribution
+OUTLIER_SIGMAS = 6.0  # beyond, a window has changed, and is no sample of the errors
+SCATTER_VARIANCE = 1.3  # of a scan less the median of six, over that of a scan
+SCATTER_QUANTILE, SCATTER_SIGMAS = 0.9, 1.645  # of absolute values, two-sided
+TINY = 1e-9
+
+
+@dataclass(frozen=True)
+class BlockChange:
+    """Change of a scan against those before (by, bx) [m], NaN where not observed, and its variances [m²].
+
+    The systematic errors of blocks nearby are taken as fully correlated.
+    """
+
+    change_m: Floats
+    random_m2: Floats
+    systematic_m2: Floats
+
+
+def scan_differences(history_m: Floats) -> Floats:
+    """Return how consecutive scans (n, by, bx) differ (n - 1, by, bx) [m], less what surrounds a block."""
+    differences_m = np.diff(history_m, axis=0)
+    observed = np.isfinite(differences_m)
+    extent = 1, TILE * SURROUNDING_TILES, TILE * SURROUNDING_TILES
+    around_m, share = (
+        ndimage.uniform_filter(np.where(observed, values, 0.0), extent) for values in (differences_m, 1.0)
+    )
+    return differences_m - around_m / np.maximum(share, TINY)
+
+
+def window_scatter(differences_m: Floats, size: int) -> Floats:
+    """Return the variance of the means of windows in one scan [m²], as consecutive scans differ.
+
+    The shape is (by - size + 1, bx - size + 1). The tenth largest of a hundred differences is used: one event
+    does not raise it, but an edge does, which beams hit in some scans only. Its neighbours are on the same
+    edge, so that a window has the largest variance of those around it.
+    """
+    means_m = []
+    for difference_m in differences_m:
+        observed = np.isfinite(difference_m)
+        count = _window_sums(observed, size)
+        count[count < MIN_OBSERVED * size**2] = np.nan
+        means_m.append(np.abs(_window_sums(np.where(observed, difference_m, 0.0), size)) / count)
+    ordered = np.sort(means_m, axis=0)  # NaN last
+    pairs = np.isfinite(ordered).sum(axis=0)
+    rank = np.maximum(np.ceil(SCATTER_QUANTILE * pairs).astype(np.int64) - 1, 0)
+    typical_m = np.nan_to_num(np.take_along_axis(ordered, rank[None], 0)[0])
+    return np.asarray(ndimage.maximum_filter(typical_m**2 / (2 * SCATTER_SIGMAS**2), 3))
+
+
+def may_exceed(changes: Sequence[BlockChange], size: int, sigmas: float, depth_m: float) -> bool:
+    """Return True if windows exceed both thresholds by their stated errors, in both scans: few scans do."""
+    means, variances = zip(*(_window_means(change, size) for change in changes), strict=True)
+    mean_m = np.abs(smaller_of_both(*means))
+    return bool(((mean_m > depth_m) & (mean_m > sigmas * np.sqrt(np.fmin(*variances)))).any())
+
+
+def window_scores(
+    changes: Sequence[BlockChange], size: int, differences_m: Floats, rock: Bools
+) -> tuple[Floats, Floats]:
+    """Return mean [m] and z of the windows (by - size + 1, bx - size + 1) that both scans confirm, else 0.
+
+    The variance is that of the errors, or what the window scattered before, if that is more. If windows
+    around it have a larger z than normal errors, so has this one.
+    """
+    scatter_m2 = SCATTER_VARIANCE * window_scatter(differences_m, size)
+    height, width = scatter_m2.shape
+    middle = size // 2
+    ground = rock[middle : middle + height, middle : middle + width]
+    means, scores = [], []
+    for change in changes:
+        mean_m, variance_m2 = _window_means(change, size)
+        z = mean_m / np.sqrt(np.maximum(variance_m2, scatter_m2))
+        z /= np.fmax(surroundings(np.abs(z), ground) / MEDIAN_ABSOLUTE_NORMAL, 1.0)
+        for kind in (ground, ~ground):
+            z[kind] /= _tail_factor(np.abs(z[kind]))
+        means.append(mean_m)
+        scores.append(z)
+    return smaller_of_both(*means), smaller_of_both(*scores)
+
+
+def _window_means(change: BlockChange, size: int) -> tuple[Floats, Floats]:
+    """Return the mean [m] and its variance of all windows, NaN where a window is hardly observed."""
+    observed = np.isfinite(change.change_m) & (change.random_m2 > 0)
+    count = _window_sums(observed, size)
+    count[count < MIN_OBSERVED * size**2] = np.nan
+    mean_m, random_m2, systematic_m2 = (
+        _window_sums(np.where(observed, values, 0.0), size) / count
+        for values in (change.change_m, change.random_m2, change.systematic_m2)
+    )
+    return mean_m, random_m2 / count + systematic_m2
+
+
+def _tail_factor(absolute_z: Floats) -> float:
+    """Return by how much the tail of z is larger than of normal errors, at least 1.
+
+    Outliers are left out: they may be events.
+    """
+    errors = absolute_z[absolute_z < OUTLIER_SIGMAS]
+    return max(float(np.quantile(errors, TAIL_QUANTILE)) / TAIL_SIGMAS, 1.0) if len(errors) else 1.0
+
+
+def _window_sums(values: Floats | Bools, size: int) -> Floats:
+    """Return the sums over all windows of size × size."""
+    total = np.zeros((values.shape[0] + 1, values.shape[1] + 1))
+    np.cumsum(np.cumsum(values, axis=0, dtype=np.float64), axis=1, out=total[1:, 1:])
+    return np.asarray(
+        total[size:, size:] - total[:-size, size:] - total[size:, :-size] + total[:-size, :-size]
+    )
+
+
+def smaller_of_both(first: Floats, second: Floats) -> Floats:
+    """Return the value with the smaller magnitude where both have the same sign, else 0."""
+    return np.where(first * second > 0, np.sign(first) * np.fmin(np.abs(first), np.abs(second)), 0.0)
