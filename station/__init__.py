@@ -68,10 +68,11 @@ def coarsen(site_or_folder: str | Path, epoch: Epoch, cells: int) -> xr.Dataset:
     Meant for cells with few points. Raises StoreError if there is no series.
     """
     from station.archive.series.index import series_in
-    from station.queries.aggregates import Aggregates
+    from station.queries import blocks
+    from station.queries.epoch_cells import EpochReader
 
-    aggregates = Aggregates(series_in(site_or_folder))
-    return aggregates.coarsen(aggregates.find_epoch(epoch), cells)
+    series = series_in(site_or_folder)
+    return blocks.coarsen(series, EpochReader(series).find_epoch(epoch), cells)
 
 
 def volume(

@@ -3,24 +3,21 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
 
 import h5py
 import numpy as np
 
 from station.archive.areas import AreaChange
 from station.archive.derived.computed_rasters import (
-    CHANGE,
-    RANDOM,
     SYSTEMATIC,
-    TOTAL,
     ReferenceSurfaces,
     is_value,
 )
 from station.archive.epochs import EpochRef
 from station.archive.netcdf_layout import Series
 from station.archive.small_variables import read_number
-from station.quantities import Bools, Floats, Grid, Quality, Reals, SharedParameters
+from station.quantities import Bools, Floats, Grid, Quality, Reals
+from station.queries.common_errors import common_error_covariance, shared_of
 from station.queries.epoch_cells import (
     EpochCells,
     EpochMean,
@@ -28,22 +25,16 @@ from station.queries.epoch_cells import (
     bounding_box,
     observed_in_all,
     read_cells_of,
-    read_window,
 )
 from station.science.adjustment import ground_classes
 from station.science.adjustment.leverage import leverage
 from station.science.analysis.voids import area_weights, void_variance
 from station.science.geometry.terrain import smooth_gradient
-from station.science.uncertainty.common_mode import cross_covariance
 from station.science.uncertainty.jacobian import HeightJacobian, cell_jacobian
 from station.science.uncertainty.propagation import (
     aggregate_variance,
     cell_covariances,
-    difference_to_reference,
 )
-
-if TYPE_CHECKING:
-    import xarray as xr
 
 MARGIN_CELLS = 6  # reach of the smoothed gradient around a cell
 
@@ -348,42 +339,6 @@ class Aggregates(EpochReader):
         )
         return np.asarray((first != second) | (first_mean != second_mean))
 
-    def coarsen(self, epoch: EpochRef, cells: int) -> xr.Dataset:
-        """Return the change of an epoch in blocks of `cells` × `cells` with one sigma [m].
-
-        Every point has the same weight; `point_count` is the sum. Shared errors are taken as fully correlated
-        within a block. Rows and columns that do not fill a block are omitted.
-        """
-        import xarray as xr  # noqa: PLC0415 - the service does not need it
-
-        grid = self.grid
-        ny, nx = grid.ny // cells, grid.nx // cells
-        if not ny or not nx:
-            raise ValueError(f"blocks of {cells} cells do not fit a grid of {grid.ny} × {grid.nx}")
-        with h5py.File(epoch.path, "r") as file:
-            change_m, random_m, sigma_m, count = (
-                read_window(file, name, epoch.index, (slice(ny * cells), slice(nx * cells)))
-                for name in (CHANGE, RANDOM, TOTAL, "point_count")
-            )
-        count = np.where(np.isfinite(change_m), count, 0.0)
-
-        def block_sum(values: Floats) -> Floats:
-            return np.asarray(np.nansum(values.reshape(ny, cells, nx, cells), axis=(1, 3)))
-
-        point_sum = block_sum(count)
-        with np.errstate(invalid="ignore", divide="ignore"):
-            random_m2 = block_sum(count**2 * random_m**2) / point_sum**2
-            shared_m2 = block_sum(count * (sigma_m**2 - random_m**2)) / point_sum
-            rasters = {
-                CHANGE: block_sum(count * change_m) / point_sum,
-                TOTAL: np.sqrt(random_m2 + np.maximum(shared_m2, 0.0)),
-                RANDOM: np.sqrt(random_m2),
-                "point_count": point_sum,
-            }
-        y_m = grid.y_m[: ny * cells].reshape(ny, cells).mean(axis=1)
-        x_m = grid.x_m[: nx * cells].reshape(nx, cells).mean(axis=1)
-        return xr.Dataset({name: (("y", "x"), v) for name, v in rasters.items()}, {"y": y_m, "x": x_m})
-
     def jacobian(self, epoch_cells: EpochCells, cells: Bools) -> HeightJacobian:
         """Return the Jacobian of the selected cells (ny, nx) of an epoch by its shared parameters."""
         if (
@@ -415,20 +370,6 @@ class Aggregates(EpochReader):
 LEVERAGE_VARIABLES = ("adjustment_leverage_moving", "adjustment_leverage_stable")
 
 
-def shared_of(
-    epochs: list[EpochCells], epoch_cells: EpochCells, *, above_surface: bool
-) -> SharedParameters | None:
-    """Return the shared parameters of one of the epochs whose cells are summed; None if it has none.
-
-    Those of an adjusted epoch are relative to the reference, those of another one to the map. The errors of
-    the reference are added where it takes part and does not cancel.
-    """
-    shared = epoch_cells.shared
-    if shared is None or len(epochs) > 1 or epoch_cells.adjusted != above_surface:
-        return shared
-    return difference_to_reference(shared, epoch_cells.reference.shared)
-
-
 def _scaled_to_cells(jacobian: HeightJacobian, epoch_cells: EpochCells, cells: Bools) -> HeightJacobian:
     """Return the Jacobian that gives selected cells (ny, nx) their stored systematic variances.
 
@@ -442,28 +383,6 @@ def _scaled_to_cells(jacobian: HeightJacobian, epoch_cells: EpochCells, cells: B
     sigma_m = np.sqrt(np.asarray(jacobian.variance(shared), np.float64))
     known = np.isfinite(systematic_m) & (sigma_m > 0)
     return jacobian.scaled(np.divide(systematic_m, sigma_m, out=np.ones(len(sigma_m)), where=known))
-
-
-def common_error_covariance(epochs: list[EpochCells]) -> Floats | None:
-    """Return the error covariance (p, p) between two epochs; None if there is none, or for one epoch."""
-    first, second = epochs[0], epochs[-1]
-    if (
-        first is second
-        or not (first.adjusted and second.adjusted)
-        or first.shared is None
-        or second.shared is None
-    ):
-        return None
-    if first.reference.version != second.reference.version:
-        return None
-    covariances = [
-        covariance
-        for covariance in (
-            cross_covariance(first.shared, shared) for shared in second.members or (second.shared,)
-        )
-        if covariance is not None
-    ]
-    return np.mean(covariances, axis=0) if covariances else None
 
 
 def _has_quality(epoch: EpochRef, cells: Bools, flags: Quality) -> Bools:

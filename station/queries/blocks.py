@@ -11,8 +11,9 @@ from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from itertools import combinations
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
+import h5py
 import numpy as np
 from scipy import sparse
 
@@ -32,13 +33,16 @@ from station.archive.netcdf_layout import Series
 from station.archive.series.index import SeriesIndex, references_and_usable
 from station.quantities import Bools, Floats, Ints, Reference, SharedParameters
 from station.queries.block_sums import Sums, cells_per_block, drop_epoch_sums, epoch_sums, reference_sums
-from station.queries.epoch_cells import EpochCells, EpochReader
+from station.queries.epoch_cells import EpochCells, EpochReader, read_window
 from station.science.analysis.calibration import SparseJacobian
 from station.science.geometry.observation import Observation
 from station.science.geometry.terrain import GRADIENT_CELLS, smooth_gradient
 from station.science.uncertainty.common_mode import cross_covariance
 from station.science.uncertainty.jacobian import HeightJacobian, height_jacobian
 from station.science.uncertainty.propagation import difference_to_reference
+
+if TYPE_CHECKING:
+    import xarray as xr
 
 CACHED_EPOCHS = 2  # whose blocks are in memory
 MIN_GRADIENT_BLOCKS = 0.5  # one sigma of the Gaussian
@@ -337,3 +341,40 @@ def _closed_days(
         chosen = epochs[usable[epochs]]
         if len(chosen):
             yield chosen[versions[chosen] == versions[chosen[-1]]]
+
+
+def coarsen(series: Series, epoch: EpochRef, cells: int) -> xr.Dataset:
+    """Return the change of an epoch in blocks of `cells` × `cells` with one sigma [m].
+
+    Every point has the same weight; `point_count` is the sum. Shared errors are taken as fully correlated
+    within a block. Rows and columns that do not fill a block are omitted.
+    """
+    import xarray as xr  # noqa: PLC0415 - the service does not need it
+
+    grid = series.grid
+    ny, nx = grid.ny // cells, grid.nx // cells
+    if not ny or not nx:
+        raise ValueError(f"blocks of {cells} cells do not fit a grid of {grid.ny} × {grid.nx}")
+    with h5py.File(epoch.path, "r") as file:
+        change_m, random_m, sigma_m, count = (
+            read_window(file, name, epoch.index, (slice(ny * cells), slice(nx * cells)))
+            for name in (CHANGE, RANDOM, TOTAL, "point_count")
+        )
+    count = np.where(np.isfinite(change_m), count, 0.0)
+
+    def block_sum(values: Floats) -> Floats:
+        return np.asarray(np.nansum(values.reshape(ny, cells, nx, cells), axis=(1, 3)))
+
+    point_sum = block_sum(count)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        random_m2 = block_sum(count**2 * random_m**2) / point_sum**2
+        shared_m2 = block_sum(count * (sigma_m**2 - random_m**2)) / point_sum
+        rasters = {
+            CHANGE: block_sum(count * change_m) / point_sum,
+            TOTAL: np.sqrt(random_m2 + np.maximum(shared_m2, 0.0)),
+            RANDOM: np.sqrt(random_m2),
+            "point_count": point_sum,
+        }
+    y_m = grid.y_m[: ny * cells].reshape(ny, cells).mean(axis=1)
+    x_m = grid.x_m[: nx * cells].reshape(nx, cells).mean(axis=1)
+    return xr.Dataset({name: (("y", "x"), v) for name, v in rasters.items()}, {"y": y_m, "x": x_m})

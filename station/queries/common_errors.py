@@ -1,14 +1,57 @@
-"""How much of the errors of an area is the same in all epochs: those of the reference above all."""
+"""Errors that epochs have in common: those of the reference above all."""
 
 from __future__ import annotations
+
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from station.archive.epochs import EpochRef
-from station.quantities import Bools
-from station.queries.aggregates import Aggregates
+from station.quantities import Bools, Floats, SharedParameters
+from station.queries.epoch_cells import EpochCells
+from station.science.uncertainty.common_mode import cross_covariance
+from station.science.uncertainty.propagation import difference_to_reference
+
+if TYPE_CHECKING:
+    from station.queries.aggregates import Aggregates
 
 PAIRS = 8  # of consecutive epochs, spread over the series
+
+
+def shared_of(
+    epochs: list[EpochCells], epoch_cells: EpochCells, *, above_surface: bool
+) -> SharedParameters | None:
+    """Return the shared parameters of one of the epochs whose cells are summed; None if it has none.
+
+    Those of an adjusted epoch are relative to the reference, those of another one to the map. The errors of
+    the reference are added where it takes part and does not cancel.
+    """
+    shared = epoch_cells.shared
+    if shared is None or len(epochs) > 1 or epoch_cells.adjusted != above_surface:
+        return shared
+    return difference_to_reference(shared, epoch_cells.reference.shared)
+
+
+def common_error_covariance(epochs: list[EpochCells]) -> Floats | None:
+    """Return the error covariance (p, p) between two epochs; None if there is none, or for one epoch."""
+    first, second = epochs[0], epochs[-1]
+    if (
+        first is second
+        or not (first.adjusted and second.adjusted)
+        or first.shared is None
+        or second.shared is None
+    ):
+        return None
+    if first.reference.version != second.reference.version:
+        return None
+    covariances = [
+        covariance
+        for covariance in (
+            cross_covariance(first.shared, shared) for shared in second.members or (second.shared,)
+        )
+        if covariance is not None
+    ]
+    return np.mean(covariances, axis=0) if covariances else None
 
 
 def common_error_share(aggregates: Aggregates, cells: Bools, epochs: list[EpochRef]) -> float:

@@ -29,9 +29,9 @@ from station.archive.netcdf_layout import Series
 from station.archive.series.index import SeriesIndex, references_and_usable
 from station.errors import StoreError
 from station.quantities import Bools, Floats, Grid, Ints, SharedParameters
-from station.queries.aggregates import common_error_covariance
 from station.queries.block_sums import epoch_sums
 from station.queries.blocks import BlockQueries, Blocks
+from station.queries.common_errors import common_error_covariance
 from station.queries.epoch_cells import EpochCells, EpochReader
 from station.science.analysis.voids import area_weights, void_variance
 from station.science.time_series import event_errors

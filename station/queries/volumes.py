@@ -14,7 +14,8 @@ from station.archive.epochs import EpochRef
 from station.errors import StationError, StoreError
 from station.grid_plane import MAP_PLANE
 from station.quantities import Bools, Floats
-from station.queries.aggregates import Aggregates, ObservedArea, common_error_covariance, shared_of
+from station.queries.aggregates import Aggregates, ObservedArea
+from station.queries.common_errors import common_error_covariance, shared_of
 from station.queries.epoch_cells import EpochCells, observed_in_all, read_cells_of
 from station.science.analysis.voids import area_weights
 from station.science.analysis.volume import common_contributions, shared_contributions

@@ -35,7 +35,8 @@ from station.quantities import (
     SharedParameters,
     VarianceComponents,
 )
-from station.queries.aggregates import Aggregates, common_error_covariance
+from station.queries.aggregates import Aggregates
+from station.queries.common_errors import common_error_covariance
 from station.science.adjustment import ground_classes, prior
 from station.science.adjustment.joint import adjust_scan
 from station.science.adjustment.patches import Patches

@@ -8,7 +8,8 @@ import numpy as np
 
 from station.archive.epochs import EpochRef
 from station.quantities import Bools, Floats, SharedParameters
-from station.queries.aggregates import Aggregates, common_error_covariance
+from station.queries.aggregates import Aggregates
+from station.queries.common_errors import common_error_covariance
 from station.queries.epoch_cells import EpochCells
 from station.queries.site_products.profile_lines import Line
 from station.queries.site_products.quantities_of_places import CountedFrom, datum_of

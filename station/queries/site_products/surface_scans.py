@@ -9,7 +9,8 @@ import numpy as np
 
 from station.archive.epochs import EpochRef
 from station.quantities import Bools, Floats, SharedParameters
-from station.queries.aggregates import Aggregates, common_error_covariance
+from station.queries.aggregates import Aggregates
+from station.queries.common_errors import common_error_covariance
 from station.queries.epoch_cells import EpochCells, EpochMean, observed_in_all
 from station.science.gridding.reference_surface import REFRACTION_CORRELATION_S
 
