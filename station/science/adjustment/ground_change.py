@@ -39,6 +39,7 @@ CORRELATED_CHANGE_RATIOS = (0.0, 3.0, 10.0)
 # Log prior odds against each. Smooth errors of the air look like correlated change too, but raise its log
 # likelihood by tens at most; a smooth snowfall raises it by hundreds.
 CORRELATION_LOG_PRIORS = (0.0, 12.0, 24.0)
+EVEN_LOG_PRIOR = 2.0  # against small trends
 SMALL_TREND_LOG_PRIOR = 2.0  # against each factor e by which trends are smaller than the change between knots
 CORRELATION_AZIMUTH_KNOTS, CORRELATION_RANGE_KNOTS = 4.0, 2.5  # correlation lengths, in knots
 # Where moving ground rises, stable ground may be under snow too thin to change its intensity.
@@ -76,9 +77,10 @@ class ChangeModel(NamedTuple):
 
     @property
     def log_prior(self) -> float:
-        """Logarithm of the prior odds: correlation needs evidence, and so do trends below local change."""
+        """Logarithm of the prior odds: correlation, even change and small trends need evidence."""
         below = max(float(np.log(self.step_m / TREND_SIZES_M[self.trend])), 0.0)
-        return -CORRELATION_LOG_PRIORS[self.ratio] - SMALL_TREND_LOG_PRIOR * below
+        evidence = CORRELATION_LOG_PRIORS[self.ratio] + EVEN_LOG_PRIOR * self.even
+        return -evidence - SMALL_TREND_LOG_PRIOR * below
 
     def with_ratio(self, ratio: int) -> ChangeModel:
         """Return the model of another correlation with about the same change between knots."""
