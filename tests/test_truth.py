@@ -1,5 +1,6 @@
 """Simulated stations with a known truth: errors of the pipeline and calibration of its uncertainty."""
 
+import re
 import shutil
 from collections import defaultdict
 from dataclasses import replace
@@ -217,7 +218,6 @@ def test_snow_on_stable_ground_is_not_adjusted_as_tilt(snowfall):
 
 
 @pytest.mark.slow
-@pytest.mark.xfail(strict=True, reason="sigma is too large: z is 0.56")
 def test_snow_on_stable_ground_without_brightness_is_within_sigma(snowfall, tmp_path):
     """The same snowfall in scans whose intensity is zero: only steep rock is stable."""
     copy_of_inputs(snowfall, tmp_path / "station")
@@ -426,7 +426,7 @@ def test_changed_cyclic_error_is_reported(tmp_path):
     processed = ProcessedStation(folder)
     error, sigma, _ = processed.boxes()
     assert 0.8 < rms(error / sigma) < 1.25
-    assert any("cyclic error differs" in result.reason for result in processed.results)
+    assert any("cyclic error that differs" in result.reason for result in processed.results)
 
 
 def cut_short(folder):
@@ -446,8 +446,13 @@ def cut_short(folder):
     [
         ({"fog_visibility_m": 700.0, "fog_hours": (3.0, 9.0)}, None, "unusable", "usually visible cells"),
         ({}, cut_short, "degraded", "partial sweep: no points at azimuth"),
-        ({"moved_hour": 3.0, "moved_deg": 0.5, "moved_m": 0.05}, None, "degraded", "tilted by 0.4"),
-        ({"moved_hour": 3.0, "moved_deg": 3.0, "moved_m": 0.5}, None, "unusable", "moved, or another SOP?"),
+        (
+            {"moved_hour": 3.0, "moved_deg": 0.5, "moved_m": 0.05},
+            None,
+            "degraded",
+            r"tilted by 0\.(49|50)\d deg",
+        ),
+        ({"moved_hour": 3.0, "moved_deg": 3.0, "moved_m": 0.5}, None, "unusable", r"moved, or another SOP\?"),
     ],
     ids=["dense fog", "partial sweep", "knocked", "fallen"],
 )
@@ -458,7 +463,7 @@ def test_disturbed_scan_gets_its_verdict(tmp_path, changes, damage, verdict, mes
         damage(folder)
     (result,) = ProcessedStation(folder).results
     assert result.verdict == verdict
-    assert message in result.reason
+    assert re.search(message, result.reason)
 
 
 def test_a_scanner_that_turned_in_a_season_does_not_seem_to_have_shifted(tmp_path):
