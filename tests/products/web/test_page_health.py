@@ -139,7 +139,7 @@ def test_reasons_are_grouped_and_explained():
     [
         ("flagged: crane in view", "flagged"),
         ("partial sweep: no points at azimuth 105-120 degrees", "sweep"),
-        ("inclination log 3.0 s late (± 0.2 s), compared with the ground", "clock"),
+        ("inclination log 3.0 s late (± 0.2 s) by the ground: it is not used", "clock"),
         ("inclination log has a gap of 300 s", "log"),
         ("scanner tilted by 0.120 degrees against its SOP: moved?", "moved"),
         ("no stable ground observed", "stable"),
