@@ -32,14 +32,14 @@ KINDS = 2  # of moving ground: ice and snow, bare ground
 STABLE = KINDS  # kind of all other ground
 KIND_SPACING = 10_000  # of the azimuth knots of two kinds, so that they are not correlated
 MIN_SHARE = 1e-6  # of a kind of ground in a patch; less is rounding
-# Of a trend's size to that of the mean: melt or settling from zero to twice the mean, or snow all over.
+# Of a trend's size to that of the mean: melt from zero to twice the mean, or snow that falls everywhere.
 TREND_RATIOS = (0.6, 0.15)
 # Sigma of the change that neighbouring knots share, in sigmas of one knot: no, some or strong correlation.
 CORRELATED_CHANGE_RATIOS = (0.0, 3.0, 10.0)
 # Log prior odds against each. Smooth errors of the air look like correlated change too, but raise its log
 # likelihood by tens at most; a smooth snowfall raises it by hundreds.
 CORRELATION_LOG_PRIORS = (0.0, 12.0, 24.0)
-EVEN_LOG_PRIOR = 2.0  # against small trends
+UNIFORM_LOG_PRIOR = 2.0  # against trends that are small against the mean
 SMALL_TREND_LOG_PRIOR = 2.0  # against each factor e by which trends are smaller than the change between knots
 CORRELATION_AZIMUTH_KNOTS, CORRELATION_RANGE_KNOTS = 4.0, 2.5  # correlation lengths, in knots
 # Where moving ground rises, stable ground may be under snow too thin to change its intensity.
@@ -55,15 +55,15 @@ MIN_HEAVE_M = 1e-5
 class ChangeModel(NamedTuple):
     """Indices into `CORRELATED_CHANGE_RATIOS`, `CHANGE_STEPS_M`, `TREND_SIZES_M` and `TREND_RATIOS`.
 
-    `bare` is 1 if bare ground has trends of the same size as ice and snow, 0 if it has none. `even` is 1 if
-    trends are small against the mean.
+    `bare` is 1 if bare ground has trends of the same size as ice and snow, 0 if it has none. `uniform` is 1
+    if trends are small against the mean.
     """
 
     ratio: int
     step: int
     trend: int
     bare: int = 0
-    even: int = 0
+    uniform: int = 0
 
     @property
     def step_m(self) -> float:
@@ -77,9 +77,9 @@ class ChangeModel(NamedTuple):
 
     @property
     def log_prior(self) -> float:
-        """Logarithm of the prior odds: correlation, even change and small trends need evidence."""
+        """Logarithm of the prior odds: correlation, uniform change and small trends need evidence."""
         below = max(float(np.log(self.step_m / TREND_SIZES_M[self.trend])), 0.0)
-        evidence = CORRELATION_LOG_PRIORS[self.ratio] + EVEN_LOG_PRIOR * self.even
+        evidence = CORRELATION_LOG_PRIORS[self.ratio] + UNIFORM_LOG_PRIOR * self.uniform
         return -evidence - SMALL_TREND_LOG_PRIOR * below
 
     def with_ratio(self, ratio: int) -> ChangeModel:
@@ -89,7 +89,7 @@ class ChangeModel(NamedTuple):
 
     def neighbours(self, *, bare: bool, ratios: bool = False) -> list[ChangeModel]:
         """Return the models that differ by one index: step, trend, with `bare` and `ratios` also these."""
-        sizes = {"step": len(CHANGE_STEPS_M), "trend": len(TREND_SIZES_M), "even": len(TREND_RATIOS)}
+        sizes = {"step": len(CHANGE_STEPS_M), "trend": len(TREND_SIZES_M), "uniform": len(TREND_RATIOS)}
         if bare:
             sizes["bare"] = 2
         if ratios:
@@ -131,7 +131,7 @@ class GroundChange:
     def precision_at(self, model: ChangeModel) -> tuple[Floats, float]:
         """Return the precision (k, k) of a model, and log |precision⁻¹|."""
         snow_m = min(model.size_m, THIN_SNOW_M) if self.surface_rises else NO_CHANGE_M
-        trend_m = TREND_SIZES_M[model.trend] * np.array([1.0] + [TREND_RATIOS[model.even]] * (TRENDS - 1))
+        trend_m = TREND_SIZES_M[model.trend] * np.array([1.0] + [TREND_RATIOS[model.uniform]] * (TRENDS - 1))
         bare_m = trend_m if model.bare else np.full(TRENDS, NO_CHANGE_M)
         knots, step_m = len(self.knot_precisions[model.ratio]), CHANGE_STEPS_M[model.step]
         first, last = self.trend_columns, self.trend_columns + knots

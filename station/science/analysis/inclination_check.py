@@ -133,7 +133,7 @@ def sensor_warnings(prediction: LogPrediction) -> list[str]:
         for prediction in (~biases, biases)
     )
     chosen = biases if bias_p < cyclic_p else ~biases
-    # Without the prior, which it exceeds.
+    # By least squares: the prior, which it exceeds, would shrink it.
     size = (
         np.linalg.pinv(variance[np.ix_(chosen, chosen)], MIN_OBSERVABILITY, hermitian=True) @ estimate[chosen]
     )

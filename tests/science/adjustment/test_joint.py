@@ -188,8 +188,8 @@ def simulate(seed, stable, *, log=False, moving=0, change_m=None, sigma_m=0.01):
     )
 
 
-def even_snow(mean_m):
-    """Snow depth that varies by 30 % from patch to patch, and is even over the glacier."""
+def uniform_snow(mean_m):
+    """Snow depth that varies by 30 % from patch to patch, and has no trend over the glacier."""
     return lambda snow, rng: mean_m * (1 + 0.3 * rng.normal(size=len(snow.line)))
 
 
@@ -493,11 +493,11 @@ def test_sigma_matches_the_errors_during_snowfall_with_little_stable_ground(stab
 
 
 @pytest.mark.integration
-def test_even_snow_is_not_taken_for_tilt_and_refraction():
+def test_uniform_snow_is_not_taken_for_tilt_and_refraction():
     """Together these lower all ground alike but for a far ridge. With trends as large as 0.6 of the mean
     alone, errors were 0.042 m, 0.011 m of it the same in all scans."""
     stable = random_sites(42, 60, sector_deg=(0, 10))
-    z, error_m, _ = standardised_errors(16, stable, moving=800, change_m=even_snow(0.2))
+    z, error_m, _ = standardised_errors(16, stable, moving=800, change_m=uniform_snow(0.2))
     assert 0.8 < np.sqrt(np.mean(z**2)) < 1.25
     assert np.sqrt(np.mean(error_m**2)) < 0.035
     assert abs(error_m.mean()) < 0.006

@@ -87,7 +87,8 @@ def test_mixture_has_the_moments_of_all_models(moderate):
     reduced, moments = solved._reduced, []
     sizes = len(ground_change.CHANGE_STEPS_M), len(ground_change.TREND_SIZES_M)
     models = [
-        ChangeModel(ratio, step, trend, even=even) for ratio, step, trend, even in np.ndindex(3, *sizes, 2)
+        ChangeModel(ratio, step, trend, uniform=uniform)
+        for ratio, step, trend, uniform in np.ndindex(3, *sizes, 2)
     ]
     odds = np.array([solved.log_odds(model) for model in models])
     weight = np.exp(odds - odds.max())
