@@ -98,10 +98,10 @@ QUANTITIES: dict[str, tuple[Variable, ...]] = {
         _COVERAGE,
     ),
     "surface_mass_balance": (
-        *_quantity("surface_mass_balance", "change of mass by area", "m", None, _WATER),
+        *_quantity("surface_mass_balance", "change of mass per area", "m", None, _WATER),
         _COVERAGE,
     ),
-    "melt": (*_quantity("melt", "loss of mass by area", "m", None, _WATER), _COVERAGE),
+    "melt": (*_quantity("melt", "loss of mass per area", "m", None, _WATER), _COVERAGE),
     "volume_budget": (
         *_quantity("net_change", "volume gained less volume lost", "m3", cell_methods="area: sum"),
         *_quantity("deposition", "volume gained", "m3", cell_methods="area: sum"),
