@@ -447,12 +447,12 @@ def cut_short(folder):
         ({"fog_visibility_m": 700.0, "fog_hours": (3.0, 9.0)}, None, "unusable", "usually visible cells"),
         ({}, cut_short, "degraded", "partial sweep: no points at azimuth"),
         (
-            {"moved_hour": 3.0, "moved_deg": 0.5, "moved_m": 0.05},
+            {"moved_hour": 2.5, "moved_deg": 0.5, "moved_m": 0.05},
             None,
             "degraded",
-            r"tilted by 0\.(49|50)\d deg",
+            r"^scanner tilted by 0\.(49|50)\d deg",
         ),
-        ({"moved_hour": 3.0, "moved_deg": 3.0, "moved_m": 0.5}, None, "unusable", r"moved, or another SOP\?"),
+        ({"moved_hour": 2.5, "moved_deg": 8.0, "moved_m": 0.5}, None, "unusable", r"moved, or another SOP\?"),
     ],
     ids=["dense fog", "partial sweep", "knocked", "fallen"],
 )

@@ -309,7 +309,7 @@ def named(name: str, hours: int = 24, seed: int = 1) -> Scenario:
         "avalanche": {"avalanche_m": 2.0, "avalanche_hour": 2 * hours / 3, "avalanche_size": 0.11},
         "poor": {"stable_ground": "poor"},
         "fog": {"fog_visibility_m": 1500.0, "fog_hours": (hours / 3, 2 * hours / 3)},
-        "moved": {"moved_hour": hours / 2, "moved_deg": 0.02, "moved_m": 0.005},
+        "moved": {"moved_hour": (hours + 1) // 2 - 0.5, "moved_deg": 0.02, "moved_m": 0.005},
         "rough": ROUGH,
         "rough-poor": {**ROUGH, "stable_ground": "poor"},
         "airborne": {"airborne_share": 0.001},
