@@ -1,7 +1,7 @@
 """Accuracy of simulated stations against their truth: one row per case, over several seeds.
 
 python -m benchmarks.accuracy [--rows NAME …] [--seeds N] [--first SEED] [--small] [--rough]
-                              [--folder DIR] [--keep] [--json FILE] [--markdown PAGE]
+                              [--folder DIR] [--keep | --measured] [--json FILE] [--markdown PAGE]
 """
 
 from __future__ import annotations
@@ -30,6 +30,7 @@ from benchmarks.accuracy_rows import ROWS, Row
 from benchmarks.accuracy_table import Figures, missed, print_tables, write_markdown
 
 WORKERS = 2
+MAX_SEED = 1000  # of measures that are looked for
 Verdicts = list[tuple[str, str]]
 Measures = tuple[Records, Verdicts, int]  # the last is the first scan of the figures
 
@@ -37,12 +38,12 @@ Measures = tuple[Records, Verdicts, int]  # the last is the first scan of the fi
 def main() -> None:
     """Measure the selected rows, print the tables, and write them to files if asked to."""
     options = _arguments()
-    rows = {name: ROWS[name] for name in options.rows}
     stations: dict[tuple[str, int], list[Row]] = {}
-    for row in rows.values():
-        for seed in range(options.first, options.first + options.seeds):
-            stations.setdefault((row.station, seed), []).append(row)
-    measures: dict[str, list[Measures]] = {name: [] for name in rows}
+    for name in options.rows:
+        for seed in _seeds(ROWS[name], options):
+            stations.setdefault((ROWS[name].station, seed), []).append(ROWS[name])
+    measures: dict[str, list[Measures]] = {row.name: [] for its in stations.values() for row in its}
+    rows = {name: row for name, row in ROWS.items() if name in measures}
     with ProcessPoolExecutor(WORKERS, mp_context=get_context("spawn")) as pool:
         jobs = [pool.submit(measure, its, seed, options) for (_, seed), its in stations.items()]
         for job in as_completed(jobs):
@@ -61,13 +62,12 @@ def main() -> None:
 def measure(rows: list[Row], seed: int, options: argparse.Namespace) -> dict[str, Measures]:
     """Return the measures of the rows that share a station, which is simulated unless it exists."""
     scenario = accuracy_stations.scenario_of(rows[0], seed, small=options.small, rough=options.rough)
-    size = ("-small" if options.small else "") + ("-rough" if options.rough else "")
     with tempfile.TemporaryDirectory() as temporary:
-        home = (options.folder or Path(temporary)) / f"{rows[0].station}-{seed}{size}"
         measures = {}
         for row in rows:
-            path = home / f"measures-{row.name}.npz"
-            if not (options.keep and path.exists()):
+            path = _measures_path(options.folder or Path(temporary), row, seed, options)
+            home = path.parent
+            if not ((options.keep or options.measured) and path.exists()):
                 accuracy_stations.simulated(home, scenario)
                 site, verdicts = accuracy_stations.processed(home, row)
                 errors = StationErrors(site, home / "truth.nc", scenario.reference_scans, seed)
@@ -92,10 +92,21 @@ def figures_of(row: Row, measures: list[Measures]) -> Figures:
     return figures | {"missed": missed(row, figures)}
 
 
+def _seeds(row: Row, options: argparse.Namespace) -> range | list[int]:
+    """Return the seeds asked for, or those that a row has measures of."""
+    if not options.measured:
+        return range(options.first, options.first + options.seeds)
+    return [seed for seed in range(MAX_SEED) if _measures_path(options.folder, row, seed, options).exists()]
+
+
+def _measures_path(folder: Path, row: Row, seed: int, options: argparse.Namespace) -> Path:
+    size = ("-small" if options.small else "") + ("-rough" if options.rough else "")
+    return folder / f"{row.station}-{seed}{size}" / f"measures-{row.name}.npz"
+
+
 def _title(options: argparse.Namespace) -> str:
     size = "16 scans, 10 m cells" if options.small else "28 scans, 5 m cells"
-    rough = ", everything on rough rock" if options.rough else ""
-    return f"{size}, seeds {options.first} to {options.first + options.seeds - 1}{rough}"
+    return size + (", everything on rough rock" if options.rough else "")
 
 
 def _arguments() -> argparse.Namespace:
@@ -106,10 +117,15 @@ def _arguments() -> argparse.Namespace:
     parser.add_argument("--small", action="store_true", help="16 scans on 10 m cells instead of 28 on 5 m")
     parser.add_argument("--rough", action="store_true", help="rough rock and wandering tilt in every row")
     parser.add_argument("--folder", type=Path, help="folder that keeps the simulated stations and measures")
-    parser.add_argument("--keep", action="store_true", help="use earlier measures in that folder")
+    earlier = parser.add_mutually_exclusive_group()
+    earlier.add_argument("--keep", action="store_true", help="use earlier measures in that folder")
+    earlier.add_argument("--measured", action="store_true", help="show those only, whatever their seeds")
     parser.add_argument("--json", type=Path, help="file for the figures")
     parser.add_argument("--markdown", type=Path, help="page of the docs whose tables are replaced")
-    return parser.parse_args()
+    options = parser.parse_args()
+    if options.measured and not options.folder:
+        parser.error("--measured needs the --folder that keeps the measures")
+    return options
 
 
 if __name__ == "__main__":

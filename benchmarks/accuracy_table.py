@@ -22,7 +22,7 @@ WIDER = 1.1
 HEADS = (
     "case", "100 m boxes, rms / 95 % [m]", "must (aim)", "z: cell / 10 m / 100 m / area", "must",
     "cells in 95 %", "unchanged, yet significant", "good / degraded / unusable", "most frequent reason",
-    "retained: 100 m / cells of 1-2 points", "scans with positive error, by seed", "missed",
+    "retained: 100 m / cells of 1-2 points", "scans with positive error (seed)", "missed",
 )  # fmt: skip
 
 
@@ -71,7 +71,7 @@ def main_table(rows: dict[str, Row], figures: dict[str, Figures]) -> list[tuple[
             " / ".join(_percent(share) for share in verdicts.values()),
             its["reason"],
             _slashed((retained["100 m"], retained["few"]), 2),
-            ", ".join(_percent(share) for share in its["positive"].values()),
+            ", ".join(f"{_percent(share)} ({seed})" for seed, share in its["positive"].items()),
             ", ".join(missed(row, its)) or "none",
         ))  # fmt: skip
     return table
