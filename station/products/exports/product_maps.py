@@ -33,11 +33,7 @@ def export_maps(
     missing, StoreError if an epoch is damaged or a file cannot be written.
     """
     map_variables(product)  # refuses products without maps before anything is read
-    index = SeriesIndex(series)
-    if not len(index):
-        raise StationError("no epoch with a change in this span")
-    versions, usable = references_and_usable(series)
-    measured = [index[position] for position in np.flatnonzero(usable & (versions != b"")).tolist()]
+    measured = _measured_epochs(series)
     chosen = measured[-1:] if span is None else [epoch for epoch in measured if epoch.start in span]
     if not chosen:
         raise StationError("no epoch with a change in this span")
@@ -45,6 +41,15 @@ def export_maps(
     if file_format == "netcdf":
         return [_write_netcdf(queries, product, chosen, folder, track)]
     return [path for epoch in track(chosen) for path in _write_geotiffs(queries, product, epoch, folder)]
+
+
+def _measured_epochs(series: Series) -> list[EpochRef]:
+    """Return the usable epochs with a change."""
+    index = SeriesIndex(series)
+    if not len(index):
+        return []
+    versions, usable = references_and_usable(series)
+    return [index[position] for position in np.flatnonzero(usable & (versions != b"")).tolist()]
 
 
 def _write_geotiffs(queries: ProductQueries, product: Product, epoch: EpochRef, folder: Path) -> list[Path]:

@@ -119,15 +119,14 @@ def adjustment_warnings(adjustment: Adjustment, components: VarianceComponents) 
             "stable ground cannot tell the change of the ground from motion of the scanner:"
             f" sigma of its mean is {adjustment.mean_sigma_m:.2g} m"
         )
-    for verb, part, usual in (
-        ("tilted", slice(0, 2), components.tilt_rad),
-        ("rotated", slice(2, 3), components.heading_rad),
-        ("shifted", slice(3, 6), components.translation_m),
+    for motion, part, usual in (
+        ("tilted by {deg:.3f} degrees", slice(0, 2), components.tilt_rad),
+        ("rotated by {deg:.3f} degrees", slice(2, 3), components.heading_rad),
+        ("shifted by {m:.2g} m", slice(3, 6), components.translation_m),
     ):
         size = float(np.linalg.norm(adjustment.estimate[part]))
         if size > MOVED_SIGMAS * np.hypot(usual, adjustment.sigma[part].max()):
-            amount = f"{size:.2g} m" if verb == "shifted" else f"{np.degrees(size):.3f} degrees"
-            reasons.append(f"scanner {verb} by {amount} against its SOP: moved?")
+            reasons.append(f"scanner {motion.format(deg=np.degrees(size), m=size)} against its SOP: moved?")
     return reasons
 
 
