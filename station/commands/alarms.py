@@ -15,10 +15,10 @@ app = typer.Typer(
 
 @app.command()
 def check(site: SiteArgument) -> None:
-    """Evaluate the rules of [alarms] and send what is new, unresolved or over.
+    """Evaluate the rules of [alarms] and send messages.
 
-    Run every few minutes by a timer, beside the service. Exits with 1 if a target could not be reached; its
-    message is sent again next time.
+    They say what is new, unresolved or over. Run every few minutes by a timer, beside the service. Exits
+    with 1 if a target could not be reached; its message is sent again next time.
     """
     from station.config import read_site
     from station.monitoring.alarms import evaluate

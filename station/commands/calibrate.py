@@ -64,7 +64,7 @@ def score(
     *,
     json_: Json = False,
 ) -> None:
-    """Process an archive of scans and write a page that says how good the results are.
+    """Process an archive of scans and write a page on its accuracy.
 
     Errors of withheld stable ground over their sigma, gain over the registration, alarms, CPU time. Nothing
     is written to the archive, and the page holds no point of it.

@@ -131,7 +131,7 @@ def export(
         ),
     ] = None,
 ) -> None:
-    """Write files to pass on, or for tools that cannot read the series.
+    """Write the series or some of its epochs in other formats.
 
     netcdf and zarr: the series itself, complete and compressed, with the same values. Files that exist and
     whose epochs did not change are kept, so an interrupted export continues when it is repeated.

@@ -17,9 +17,10 @@ def papers(
         Path | None, typer.Option(metavar="DIR", help="Write a page for each paper there (Markdown).")
     ] = None,
 ) -> None:
-    """Compute the numbers of the four papers and compare them with the printed ones.
+    """Recompute the numbers of the four papers.
 
-    hartzell2015, voordendag2023, ozendi2016, leslar2014. Exits with 1 if one does not agree.
+    Compares them with the printed ones: hartzell2015, voordendag2023, ozendi2016, leslar2014. Exits
+    with 1 if one does not agree.
     """
     from station.papers.errata import PAPERS
     from station.papers.pages import format_table, run_checks, write_pages

@@ -91,10 +91,11 @@ def product(
     table: CsvOption = None,
     json_: Json = False,
 ) -> None:
-    """Print the products of the site file: the newest values, or with NAME one over time.
+    """Print the products of the site file, or one over time.
 
-    With 95 % intervals. CSV and JSON have one sigma, and its random and systematic part. With observations in
-    the site file, prints how the product agrees with them. Computes what the service has not computed yet.
+    The newest values of all, or with NAME those of one, with 95 % intervals. CSV and JSON have one sigma,
+    and its random and systematic part. With observations in the site file, prints how the product agrees
+    with them. Computes what the service has not computed yet.
     """
     from json import dumps
 
@@ -136,10 +137,10 @@ def trend(
     ] = None,
     table: CsvOption = None,
 ) -> None:
-    """Print how fast areas change, and whether they speed up, with 95 % intervals.
+    """Print how fast areas change, and whether they speed up.
 
-    The rate is that of the straight line through the mean change of the area. Its interval
-    allows for errors that last for hours. CSV has the inverse velocity too.
+    With 95 % intervals. The rate is that of the straight line through the mean change of the area. Its
+    interval allows for errors that last for hours. CSV has the inverse velocity too.
     """
     from station.config import read_site
     from station.products.area_tables import Span
@@ -162,10 +163,10 @@ def events(
         typer.Option(metavar="FILE", help="Write GeoParquet with the outlines instead.", show_default=False),
     ] = None,
 ) -> None:
-    """Print where and when the surface changed, anywhere on the grid.
+    """Print where and when the surface changed.
 
-    Loss and gain against the surroundings, pairs of scar and deposit, snowfall and melt, each
-    with its volume and 95 % interval. The outlines are in events.geojson of the data folder.
+    Anywhere on the grid: loss and gain against the surroundings, pairs of scar and deposit, snowfall and
+    melt, each with its volume and 95 % interval. The outlines are in events.geojson of the data folder.
     """
     from station.config import read_site
     from station.products.area_tables import Span
@@ -243,10 +244,10 @@ def serve(
     sites: SitesArgument,
     port: Annotated[int, typer.Option(min=1, max=65535, help="On 127.0.0.1.")] = 8750,
 ) -> None:
-    """Serve the page of a station on this machine, read-only; of several below a page with all.
+    """Serve the page of a station on this machine, read-only.
 
-    Below api/ it answers what a static page cannot: the change of any polygon over any epochs, and parts of
-    the series as NetCDF and GeoTIFF.
+    Several stations get a page with all of them. Below api/ it answers what a static page cannot: the
+    change of any polygon over any epochs, and parts of the series as NetCDF and GeoTIFF.
     """
     from station.config import read_site
     from station.processing.workers.isolation import TaskRunner
@@ -268,9 +269,10 @@ def index(
     sites: SitesArgument,
     out: Annotated[Path, typer.Option("--out", "-o", metavar="FILE", help="The page.")] = Path("index.html"),
 ) -> None:
-    """Write a page of several stations: a row each with its state, newest map and newest alarm.
+    """Write a page of several stations.
 
-    It reads the pages of the stations when it is opened: write it again for another list of stations only.
+    A row each with its state, newest map and newest alarm. It reads the pages of the stations when it is
+    opened: write it again for another list of stations only.
     """
     from station.config import read_site
     from station.processing.epoch_recorder import page_folder

@@ -29,10 +29,10 @@ def reprocess(
         bool, typer.Option("--dry-run", help="Only print how many scans there are to do, and why.")
     ] = False,
 ) -> None:
-    """Reprocess what a changed SOP, setting, flag or log affects, and only that.
+    """Reprocess what a changed SOP, setting, flag or log affects.
 
-    Uses all cores. If interrupted, it continues when started again. Exits with 3 if a scan is missing or was
-    set aside.
+    Only that is redone. Uses all cores. If interrupted, it continues when started again. Exits with 3 if
+    a scan is missing or was set aside.
     """
     from station.config import read_site
     from station.operations.reprocessing import reprocess as reprocess_site
@@ -48,9 +48,10 @@ def retry(
         typer.Argument(metavar="[SCAN...]", help="File names; all if none is given.", show_default=False),
     ] = None,
 ) -> None:
-    """Try scans again that were set aside or failed, also beside the running service.
+    """Try scans again that were set aside or failed.
 
-    Not needed after a change of settings, limits or version: then the service tries them by itself.
+    Also beside the running service. Not needed after a change of settings, limits or version: then the
+    service tries them by itself.
     """
     from station.config import read_site
     from station.operations.retry import retry_scans

@@ -32,10 +32,10 @@ def status(site: SiteArgument, *, json_: Json = False) -> None:
 
 
 def publish(site: SiteArgument) -> None:
-    """Send what is new to the targets of [publish], run its hook and send its heartbeat.
+    """Send what is new to the targets of [publish].
 
-    Run every minute by a timer, beside the service. Exits with 1 if a target could not be reached; it gets
-    its files next time.
+    Also runs its hook and sends its heartbeat. Run every minute by a timer, beside the service. Exits
+    with 1 if a target could not be reached; it gets its files next time.
     """
     from station.config import read_site
     from station.service.publication.run import publish_once
