@@ -15,7 +15,7 @@ from contextlib import ExitStack, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from queue import Empty
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING, NamedTuple, Protocol
 
 from station.config import Site, read_site
 from station.errors import ConfigError, NotReadyError, StationError
@@ -25,6 +25,7 @@ from station.inbox.journal_reader import State
 from station.inbox.listing import ScanFile
 from station.inbox.lock import LockedFolder, exclusive_lock, require_known
 from station.logs import log_to_stderr, logfmt
+from station.monitoring.arrivals import Arrivals
 from station.monitoring.metrics import Metrics
 from station.monitoring.preconditions import EARLIEST_S, clock_problem, require_disk_space
 from station.processing.workers import fork_server
@@ -51,6 +52,21 @@ class ScanProcessor(Protocol):
     def close(self) -> None: ...  # noqa: D102
     def run_maintenance(self) -> None: ...  # noqa: D102
     def proceed_with_renewals(self) -> None: ...  # noqa: D102
+
+
+class Components(NamedTuple):
+    """What depends on the site file and is made again when it is reloaded."""
+
+    worker: ScanProcessor
+    inbox: Inbox
+    watcher: InboxWatcher
+    scheduler: JobScheduler
+
+    def close(self) -> None:
+        """End the worker's processes, the watcher's thread and the scheduler."""
+        self.worker.close()
+        self.watcher.close()
+        self.scheduler.stop()
 
 
 @dataclass(frozen=True)
@@ -116,13 +132,12 @@ class Daemon:
         self._stop_deadline_s = math.inf  # monotonic time at which the running scan is abandoned
         self._consecutive_faults = 0
         self._last_poll_s = -math.inf
-        self._last_arrival_s = self._clock.monotonic_s()
-        self._is_overdue = False
+        self._arrivals = Arrivals(self._clock.monotonic_s)
         self._site_file_fault = ""  # why the last reload was rejected
         self._exit_stack = ExitStack()
         self._folder: LockedFolder
         self._journal: Journal | None = None
-        self._open_components: tuple[ScanProcessor, Inbox, InboxWatcher, JobScheduler] | None = None
+        self._open_components: Components | None = None
         self._is_reconciled = False
         self._metrics = Metrics(lambda: self._site)
 
@@ -176,14 +191,14 @@ class Daemon:
             log.warning(logfmt(clock="set", step_s=round(step_s)))
         if LoopEvent.OVERDUE_CHECK in self._due:
             self._due.discard(LoopEvent.OVERDUE_CHECK)
-            self._warn_if_overdue()
+            self._arrivals.check(self._site.scans.expected_every_s)
             self._metrics.write()
         if LoopEvent.COMPACTED in self._due:
             self._due.discard(LoopEvent.COMPACTED)
             self._guarded(LoopEvent.COMPACTED, worker.publish_compacted)
         self._last_poll_s = self._clock.monotonic_s()
         state = inbox.poll()
-        self._record_arrivals(state.new)
+        self._arrivals.record(state.new)
         if state.first is None and state.to_precheck is not None:
             worker.precheck(state.to_precheck)
             return 0.0
@@ -230,19 +245,19 @@ class Daemon:
 
     # ---- opening, reloading
 
-    def _components(self) -> tuple[ScanProcessor, Inbox, InboxWatcher, JobScheduler]:
+    def _components(self) -> Components:
         """Return the components; create them on first use and reconcile journal and store."""
         if self._open_components is None:
             self._open_components = self._create_components(self._site)
         if not self._is_reconciled:
             self._systemd.status("reconciling journal and store")
-            self._open_components[0].recover()
+            self._open_components.worker.recover()
             self._is_reconciled = True
             self._systemd.ready()
             log.info(logfmt(service="running", station=self._site.station.id, inbox=self._site.scans.inbox))
         return self._open_components
 
-    def _create_components(self, site: Site) -> tuple[ScanProcessor, Inbox, InboxWatcher, JobScheduler]:
+    def _create_components(self, site: Site) -> Components:
         journal = self._open_journal()
         worker = self._make_worker(
             site,
@@ -268,7 +283,7 @@ class Daemon:
             monotonic_s=self._clock.monotonic_s,
             now_s=self._clock.now_s,
         )
-        return worker, inbox, watcher, scheduler
+        return Components(worker, inbox, watcher, scheduler)
 
     def _open_journal(self) -> Journal:
         if self._journal is None:
@@ -299,9 +314,7 @@ class Daemon:
 
     def _close_components(self) -> None:
         if self._open_components is not None:
-            self._open_components[0].close()
-            self._open_components[2].close()
-            self._open_components[3].stop()
+            self._open_components.close()
             self._open_components = None
 
     # ---- faults, waiting, stopping
@@ -374,33 +387,11 @@ class Daemon:
 
     # ---- reports
 
-    def _record_arrivals(self, count: int) -> None:
-        if count:
-            self._last_arrival_s = self._clock.monotonic_s()
-            if self._is_overdue:
-                log.info(logfmt(scans="arriving again", new=count))
-            self._is_overdue = False
-
-    def _warn_if_overdue(self) -> None:
-        """Log one warning when a scan is overdue."""
-        interval_s = self._site.scans.expected_every_s
-        silent_s = self._clock.monotonic_s() - self._last_arrival_s
-        if silent_s > 1.5 * interval_s and not self._is_overdue:
-            self._is_overdue = True
-            log.warning(
-                logfmt(
-                    scans="overdue",
-                    silent_s=round(silent_s),
-                    expected_every_s=round(interval_s),
-                    reason="nothing new in the inbox: check the scanner and the transfer",
-                )
-            )
-
     def _report_idle(self) -> None:
         counts = self._open_journal().counts()
         waiting = counts[State.WAITING] + counts[State.LATER]
         text = f"{counts[State.STORED]} stored, {waiting} waiting, {counts[State.SET_ASIDE]} set aside"
-        if self._is_overdue:
+        if self._arrivals.is_overdue:
             text += "; a scan is overdue"
         if self._site_file_fault:
             text += f"; the new site file was rejected, the old one is in use: {self._site_file_fault}"
