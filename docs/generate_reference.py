@@ -130,7 +130,7 @@ def _command(name: str, callback: typing.Callable[..., object]) -> list[str]:
         annotation, info = typing.get_args(hints[key])[:2]
         required = parameter.default is inspect.Parameter.empty
         if isinstance(info, typer.models.ArgumentInfo):
-            word = (info.metavar or key.upper()).strip("[]")
+            word = (info.metavar or key.upper()) + ("…" if "list[" in str(annotation) else "")
             usage += f" {word}" if required else f" [{word}]"
         else:
             word = next(iter(info.param_decls or ()), None) or f"--{key.strip('_').replace('_', '-')}"

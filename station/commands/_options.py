@@ -35,7 +35,7 @@ ToOption = Annotated[
 Polygons = Annotated[
     Path | None,
     typer.Argument(
-        metavar="[POLYGONS]",
+        metavar="POLYGONS",
         help="File of named polygons; without it, those of the site.",
         show_default=False,
     ),

@@ -17,7 +17,7 @@ def calibrate(
     scans: Annotated[
         list[Path] | None,
         typer.Argument(
-            metavar="[SCAN...]",
+            metavar="SCAN",
             help="Scan files to measure the precision of ranges and angles with; default: the newest two.",
             exists=True,
             dir_okay=False,

@@ -76,12 +76,12 @@ def export(
     kind: Annotated[
         ExportFormat,
         typer.Argument(
-            metavar="geotiff|csv|stac|points|transformations|levels|netcdf|zarr|references|ncml|erddap",
-            help="The format.",
+            metavar="FORMAT",
+            help="See above.",
             show_default=False,
         ),
     ],
-    out: Annotated[Path, typer.Argument(metavar="[OUT]", help="Folder or file to write.")] = Path(),
+    out: Annotated[Path, typer.Argument(metavar="OUT", help="Folder or file to write.")] = Path(),
     first: FromOption = None,
     last: ToOption = None,
     every: Annotated[

@@ -11,7 +11,7 @@ import typer
 
 def papers(
     paper: Annotated[
-        str | None, typer.Argument(metavar="[PAPER]", help="One of them.", show_default=False)
+        str | None, typer.Argument(metavar="PAPER", help="One of them.", show_default=False)
     ] = None,
     pages: Annotated[
         Path | None, typer.Option(metavar="DIR", help="Write a page for each paper there (Markdown).")

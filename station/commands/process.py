@@ -15,9 +15,7 @@ def process(
     site: SiteArgument,
     scans: Annotated[
         list[Path],
-        typer.Argument(
-            metavar="SCAN...", help="Scan files.", exists=True, dir_okay=False, show_default=False
-        ),
+        typer.Argument(metavar="SCAN", help="Scan files.", exists=True, dir_okay=False, show_default=False),
     ],
 ) -> None:
     """Process these scans now and print the verdict of each.

@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 
 MAX_ANSWER_S = 60.0  # of the server, for one request
 SitesArgument = Annotated[
-    list[Path], typer.Argument(metavar="SITE…", help="The site files (TOML).", show_default=False)
+    list[Path], typer.Argument(metavar="SITE", help="The site files (TOML).", show_default=False)
 ]
 
 
@@ -84,7 +84,7 @@ def areas(
 def product(
     site: SiteArgument,
     name: Annotated[
-        str | None, typer.Argument(metavar="[NAME]", help="A product of the site.", show_default=False)
+        str | None, typer.Argument(metavar="NAME", help="A product of the site.", show_default=False)
     ] = None,
     first: FromOption = None,
     last: ToOption = None,

@@ -45,7 +45,7 @@ def retry(
     site: SiteArgument,
     scans: Annotated[
         list[str] | None,
-        typer.Argument(metavar="[SCAN...]", help="File names; all if none is given.", show_default=False),
+        typer.Argument(metavar="SCAN", help="File names; all if none is given.", show_default=False),
     ] = None,
 ) -> None:
     """Try scans again that were set aside or failed.

@@ -65,7 +65,7 @@ def simulate(
 
 
 def demo(
-    folder: Annotated[Path, typer.Argument(metavar="[DIR]", help="Where to run it.")] = Path("station-demo"),
+    folder: Annotated[Path, typer.Argument(metavar="DIR", help="Where to run it.")] = Path("station-demo"),
     hours: Annotated[int, typer.Option(min=1, max=2000, help="Number of hourly scans.")] = 24,
 ) -> None:
     """Simulate a day, process it and print what changed.

@@ -61,9 +61,7 @@ def solve(
 
 @app.command()
 def show(
-    sop: Annotated[
-        list[Path], typer.Argument(metavar="SOP...", help="One or more, in order.", **EXISTING_FILE)
-    ],
+    sop: Annotated[list[Path], typer.Argument(metavar="SOP", help="One or more, in order.", **EXISTING_FILE)],
     pop: Annotated[
         Path | None, typer.Option(metavar="POP", help="From the project to WGS84.", **EXISTING_FILE)
     ] = None,
