@@ -14,6 +14,7 @@ from station.queries.epoch_cells import EpochCells
 from station.queries.site_products.profile_lines import Line
 from station.queries.site_products.quantities_of_places import CountedFrom, datum_of
 from station.science.analysis.product_estimates import Estimate, crest, crossing
+from station.science.gridding.reference_surface import errors_on_map
 from station.science.uncertainty.jacobian import HeightJacobian
 from station.science.uncertainty.propagation import aggregate_variance
 
@@ -194,7 +195,7 @@ def _reference_errors(scan: EpochCells) -> SharedParameters:
     Without errors if the reference has none.
     """
     assert scan.shared is not None  # noqa: S101 - the caller has looked
-    reference = scan.reference.shared
+    reference = errors_on_map(scan.reference)
     if reference is None:
         return scan.shared.scaled(0.0)
     return reference if reference.names == scan.shared.names else scan.shared

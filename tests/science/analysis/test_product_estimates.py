@@ -124,8 +124,7 @@ def test_a_crest_on_rough_ground_is_as_uncertain_as_repetitions_show():
         found = [crest(distance_m, ridge_m + rng.normal(0, 0.3, 40), noise_m2) for _ in range(2000)]
         error_m = np.array([place.distance_m for place in found]) - 195.0
         stated_m2 = [
-            noise_m**2 * place.sensitivity @ place.sensitivity
-            + place.relief_m2 * place.relief @ place.relief
+            noise_m**2 * place.sensitivity @ place.sensitivity + place.relief_m2 * place.relief @ place.relief
             for place in found
         ]
         assert np.mean(error_m) == pytest.approx(0.0, abs=0.2)
