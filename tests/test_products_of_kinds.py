@@ -65,7 +65,7 @@ def later_less_earlier(values, days):
 
 
 def test_budgets_volumes_and_new_snow_are_as_far_from_the_truth_as_sigma_says(kind_and_stations):
-    """On calm sand sigma is larger, for the height of the scanner over stable ground (accuracy.md, products)."""
+    """On calm sand sigma is larger, for that of the height of the scanner (accuracy.md, products)."""
     kind, stations = kind_and_stations
     z = {}
     for processed in stations:

@@ -70,7 +70,8 @@ def test_melt_and_depth_above_the_mean_of_scans(stations, side):
     """Of exactly known density. The mean of a surface has errors as far below sigma as a single scan has.
 
     A third of the variance of places of several cells is systematic, and larger than it need be on calm
-    ground (accuracy.md, products). Heights and volumes between heights have the errors of the reference on the map.
+    ground (accuracy.md, products). Heights and volumes between heights have the errors of the reference on
+    the map.
     """
     z, later = defaultdict(list), slice(IN_SURFACE, None)
     for processed in stations:
