@@ -20,6 +20,7 @@ from station.monitoring.alarm_state import active
 from station.monitoring.area_curves import AreaCurve, read_curves
 from station.processing.workers.worker_process import Progress
 from station.products.site_products.product_tables import newest_rows, value_and_interval
+from station.products.web.page_text import PageText
 from station.science.gridding.significance import SIGNIFICANT_SIGMAS
 
 MAX_BYTES = 10_000
@@ -128,12 +129,17 @@ def _area_changes(curves: list[AreaCurve], begin_s: float) -> Iterator[str]:
 
 
 def _product_values(site: Site, end_s: float) -> Iterator[str]:
-    """Yield the newest value of each product at the end of the day, with its 95 % interval."""
+    """Yield the newest value of each product at the end of the day, with its 95 % interval.
+
+    Quantities have the names that they have on the page in English.
+    """
+    words = PageText.of("en", on_map=site.grid_cells.plane.is_map).page
     products = [product.until(end_s) for product in read_products(site.station.data)]
     for row in newest_rows(products):
         value, half = value_and_interval(row["value"], row["sigma"], row["unit"])
         when = f"{datetime.fromtimestamp(row['start_s'], UTC):%Y-%m-%d %H:%M}"
-        yield f"{row['product']}, {row['place']}: {row['quantity']} {value} {half} {row['unit']} at {when}"
+        quantity = words[f"quantity_{row['quantity']}"]
+        yield f"{row['product']}, {row['place']}: {quantity} {value} {half} {row['unit']} at {when}"
 
 
 def _truncate(lines: list[str]) -> str:

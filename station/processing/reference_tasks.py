@@ -39,7 +39,7 @@ from station.processing.scans.scan_inputs import ScanInputs
 from station.processing.site_files import exclusion_reason, series_for, sha256_log
 from station.processing.workers.worker_process import Progress
 from station.quantities import Reference, ScanGeometry, VarianceComponents
-from station.scan_names import scan_id
+from station.scan_names import scan_id, scan_stem
 from station.science.adjustment.joint import Adjustment
 from station.science.adjustment.variance_components import estimate_variance_components
 from station.science.gridding.gridder import Gridder
@@ -104,7 +104,7 @@ def _build_and_store(site: Site, scans: list[ScanFile], version: str, progress: 
     geometry = stacked[-1].inputs.geometry
     components = _estimate_components(surface.components, stacked)
     reference = centre_reference(surface, stack, geometry.position_m, components)
-    reference = _with_mean_state(reference, stacked)
+    reference = replace(_with_mean_state(reference, stacked), sop_scans=_sop_scans(site, scans))
     scan_provenance = tuple(scan.provenance.to_attrs() for scan in stacked)
     write_reference(
         series_for(site),
@@ -219,6 +219,16 @@ def _with_mean_state(reference: Reference, stacked: list[_StackedScan]) -> Refer
     estimate = np.mean([adjustment.estimate for adjustment in adjustments], axis=0)
     estimate = condense_rows(adjustments[0].params, estimate[:, None])[:, 0]
     return replace(reference, shared=replace(shared, estimate=estimate))
+
+
+def _sop_scans(site: Site, scans: list[ScanFile]) -> int | None:
+    """Return how many scans an SOP was determined from; None if tilt does not count from that of a scan."""
+    if site.inclination is None or site.inclination.mode == "absolute" or site.registration is not None:
+        return None
+    named = {sop.scan for sop in site.sop if sop.scan is not None}
+    if not named:
+        return 1  # the first one
+    return sum(bool(named & {scan.name, scan_stem(scan.name)}) for scan in scans)
 
 
 def _estimate_components(components: VarianceComponents, stacked: list[_StackedScan]) -> VarianceComponents:

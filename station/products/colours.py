@@ -63,10 +63,14 @@ class ColourScale:
         return np.stack(bands, axis=-1).round().astype(np.uint8)
 
 
-def change_scale(limit_m: float, since: str) -> ColourScale:
-    """Return the scale of change up to `limit_m` [m]: red where the surface sank, blue where it rose."""
+def change_scale(limit_m: float, since: str, *, on_map: bool = True) -> ColourScale:
+    """Return the scale of change up to `limit_m` [m]: red where the surface sank, blue where it rose.
+
+    Of a grid that lies on another plane than the map: where it moved in, and out.
+    """
     ticks = tuple(limit_m * share for share in (-1.0, -0.5, 0.0, 0.5, 1.0))
-    return ColourScale(f"elevation change since {since}, m", -limit_m, limit_m, ticks, _from_hex(_VIK)[::-1])
+    quantity = "elevation change" if on_map else "change along the normal"
+    return ColourScale(f"{quantity} since {since}, m", -limit_m, limit_m, ticks, _from_hex(_VIK)[::-1])
 
 
 def sigma_scale(limit_m: float) -> ColourScale:

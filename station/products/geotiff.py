@@ -41,7 +41,11 @@ def export_geotiff(series: Series, epoch: EpochRef, folder: Path, limit_m: float
             "software": f"station {__version__}",
         }
         write_cog(path, series, values, description, tags)
-        scale = change_scale(limit_m, "the reference") if kind == "change" else sigma_scale(limit_m)
+        scale = (
+            change_scale(limit_m, "the reference", on_map=series.grid.plane.is_map)
+            if kind == "change"
+            else sigma_scale(limit_m)
+        )
         replace_if_changed(path.with_suffix(".qml"), _qgis_style(scale).encode())
         paths.append(path)
     return paths

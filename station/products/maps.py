@@ -51,7 +51,7 @@ def change_map(
     overview: Overview, caption: Caption, limit_m: float, width_px: int, since: str
 ) -> Image.Image:
     """Return a map of change: coloured where significant at 95 %, grey where not, hatched where not seen."""
-    scale = change_scale(limit_m, since)
+    scale = change_scale(limit_m, since, on_map=overview.base.grid.plane.is_map)
     observed, significant = overview.observed, overview.is_significant
     light = np.nan_to_num(overview.base.hillshade, nan=0.63)[..., None]
     painted = _terrain(overview, observed)

@@ -9,6 +9,7 @@ import numpy as np
 from station.archive.epochs import EpochRef
 from station.quantities import Bools, Floats, SharedParameters
 from station.queries.epoch_cells import EpochCells
+from station.science.gridding.reference_surface import errors_on_map
 from station.science.uncertainty.common_mode import cross_covariance
 from station.science.uncertainty.propagation import difference_to_reference
 
@@ -26,10 +27,10 @@ def shared_of(
     Those of an adjusted epoch are relative to the reference, those of another one to the map. The errors of
     the reference are added where it takes part and does not cancel.
     """
-    shared = epoch_cells.shared
+    shared, reference = epoch_cells.shared, epoch_cells.reference
     if shared is None or len(epochs) > 1 or epoch_cells.adjusted != above_surface:
         return shared
-    return difference_to_reference(shared, epoch_cells.reference.shared)
+    return difference_to_reference(shared, errors_on_map(reference) if above_surface else reference.shared)
 
 
 def common_error_covariance(epochs: list[EpochCells]) -> Floats | None:

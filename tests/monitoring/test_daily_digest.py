@@ -8,7 +8,7 @@ from datetime import UTC, date, datetime
 
 import numpy as np
 import pytest
-from support.products import write_melt
+from support.products import write_melt, write_product
 
 from station.archive.schema import FILL
 from station.errors import StoreError
@@ -69,8 +69,15 @@ def test_products_have_the_newest_usable_value_of_the_day(site):
     hours = np.array([-2.0, 5.0, 20.0, 23.0, 24.5])
     write_melt(site, DAY_S + 3600 * hours, [0.1, 0.2, 0.3, 9.0, 0.4], [0, 0, 1, 2, 0])
     assert format_digest(site, DAY).splitlines()[-1] == (
-        "Ice melt, stake: melt 0.300 ±0.196 m at 2026-11-20 20:00"
+        "Ice melt, stake: melt, water equivalent 0.300 ±0.196 m at 2026-11-20 20:00"
     )
+
+
+def test_quantities_of_a_plane_have_the_words_of_its_page(make_site):
+    site = make_site(more="[grid.plane]\norigin_m = [0, 0, 0]\nfacing_deg = 180\ndip_deg = 90\n")
+    fill(site, [(1, "good", "")])
+    write_product(site, "point", "elevation", DAY_S + np.array([3600.0]), [0.25])
+    assert "Rock, stake: distance out of the plane 0.250 ±0.196 m" in format_digest(site, DAY)
 
 
 def test_unusable_epochs_are_excluded(site, write_series):

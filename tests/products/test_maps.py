@@ -14,6 +14,7 @@ from station.archive.netcdf_layout import Series
 from station.archive.reference_files import write_reference
 from station.archive.series import index
 from station.archive.series.virtual import build_series
+from station.grid_plane import GridPlane
 from station.products import maps
 from station.products.colours import change_scale, points_scale, round_up, sigma_scale
 from station.products.maps import (
@@ -259,3 +260,17 @@ def test_file_size_of_a_map_of_noise(tmp_path, small):
         enlarged = decoded.convert("L").resize(picture.size)
         deviation = np.abs(np.asarray(enlarged, float) - np.asarray(picture.convert("L"), float)).mean()
     assert deviation < 25
+
+
+def test_the_colour_bar_of_a_plane_names_the_normal(series, last):
+    overview, wall = (
+        read_overview(last, base_map(series, "1", WIDTH)),
+        GridPlane((0.0, 0.0, 0.0), 180.0, 90.0),
+    )
+    on_plane = replace(overview, base=replace(overview.base, grid=replace(overview.base.grid, plane=wall)))
+    assert change_scale(0.5, "May", on_map=False).title == "change along the normal since May, m"
+    bars = [
+        np.asarray(change_map(of, CAPTION, 0.5, WIDTH, "May"))[-100:, : WIDTH // 2]
+        for of in (overview, on_plane)
+    ]
+    assert (bars[0] != bars[1]).any()

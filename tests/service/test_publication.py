@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import shutil
 import socket
@@ -21,8 +22,8 @@ from support.site import char_array
 from station.errors import ConfigError, NotReadyError
 from station.inbox.lock import exclusive_lock
 from station.monitoring.status import queue_status
+from station.service.publication import rclone, uploads
 from station.service.publication import run as publication
-from station.service.publication import uploads
 
 DAY_S = 86_400.0
 START_S = 1_752_537_600.0  # 2025-07-15 00:00 UTC
@@ -427,3 +428,19 @@ def test_a_wrong_key_is_reported_and_keeps_no_other_from_its_files(
         remote(kind, port, "p", monkeypatch)
         assert publish(site)[0] == 0
     assert list(contents(folder_target).values()) == list(contents(other).values())
+
+
+def test_the_page_that_a_server_sends_for_an_error_is_one_line_of_text(monkeypatch, tmp_path):
+    """As WsgiDAV does where its disk is full; and rclone's last words have a time, which is no part of it."""
+    page = "<!DOCTYPE HTML>\n<html><head>\n<title>500 Error</title></head>\n<body><h1>500</h1>\n"
+    log = json.dumps({"level": "error", "msg": f"Failed to copy: {page}", "object": "a"})
+    for stderr, fault in (
+        (log, "Failed to copy: 500"),
+        ("2026/11/27 03:36:58 Failed: 401 Not Authorized", "Failed: 401 Not Authorized"),
+    ):
+        program = tmp_path / "rclone"
+        program.write_text(f"#!/bin/sh\ncat >&2 <<'END'\n{stderr}\nEND\nexit 1\n")
+        program.chmod(0o755)
+        monkeypatch.setenv("PATH", str(tmp_path), prepend=os.pathsep)
+        to = {"oldest_first": False, "immutable": False, "bandwidth_kbit_s": None}
+        assert rclone.copy(tmp_path, ["a"], "nas:", **to).fault == fault

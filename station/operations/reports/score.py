@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import resource
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping
@@ -44,6 +45,8 @@ Score = dict[str, Any]
 Errors = Mapping[str, tuple[Ints, Floats]]  # cells and their change [m], by scan
 Report = Callable[[Entry], None]
 
+FIGURE, FOLDER = re.compile(r"[-+−]?\d+([.,]\d+)*"), re.compile(r"(?<!\S)/\S*/")  # in a reason
+MAX_REASONS = 5
 OWN, OTHER = "own", "registration"  # folders of the two stores
 
 
@@ -79,6 +82,8 @@ def score(site: Site, out: Path, max_epochs: int, report: Report) -> Score:
         "cells": list(series.grid.shape),
         "cell_m": series.grid.cell_m,
         "scans": _verdicts(entries),
+        "reasons": _reasons(entries),
+        "after_reference": _scans_after_reference(site, entries),
         "cpu_s_per_scan": cpu_s,
         **_sigma(own, max_epochs),
         "gain": gain,
@@ -169,6 +174,18 @@ def _verdicts(entries: Iterable[Entry]) -> dict[str, int]:
         for entry in entries
     ]
     return dict(Counter(words))
+
+
+def _reasons(entries: Iterable[Entry]) -> dict[str, int]:
+    """Return the number of scans by why they are not good, without figures and folders; the most common."""
+    reasons = Counter(FIGURE.sub("…", FOLDER.sub("", entry.reason)) for entry in entries if entry.reason)
+    return dict(reasons.most_common(MAX_REASONS))
+
+
+def _scans_after_reference(site: Site, entries: Iterable[Entry]) -> int:
+    """Return the number of stored scans that the reference is not made of."""
+    taken = site.reference.scans if isinstance(site.reference.scans, int) else 0
+    return max(sum(entry.state is State.STORED for entry in entries) - taken, 0)
 
 
 def withheld_errors(

@@ -13,7 +13,8 @@ from station.queries.common_errors import common_error_covariance
 from station.queries.epoch_cells import EpochCells
 from station.queries.site_products.profile_lines import Line
 from station.queries.site_products.quantities_of_places import CountedFrom, datum_of
-from station.science.analysis.product_estimates import Estimate, LinePosition, crest, crossing
+from station.science.analysis.product_estimates import Estimate, crest, crossing
+from station.science.gridding.reference_surface import errors_on_map
 from station.science.uncertainty.jacobian import HeightJacobian
 from station.science.uncertainty.propagation import aggregate_variance
 
@@ -45,12 +46,13 @@ def contour(
     """
     scan = aggregates.read_cells(epoch, line.cells)
     reference_m = aggregates.mean_elevation(scan, line.cells)
-    here = _find(line, reference_m + scan.change_m, height_m)
+    here = _find(line, reference_m + scan.change_m, _own_variance(scan, line.cells), height_m)
     if here is None:
         return {"distance": Estimate(), "distance_change": Estimate()}
-    variances = _variances(aggregates, line, scan, here.cells)
+    random_m2, systematic_m2 = _variances(aggregates, line, scan, here.cells)
+    relief_m2 = here.relief_m2 * here.relief @ here.relief
     return {
-        "distance": _estimate(here.position.distance_m, variances, here.position.scatter_variance),
+        "distance": Estimate(here.distance_m, random_m2 + relief_m2, systematic_m2),
         "distance_change": _movement(aggregates, line, scan, reference_m, here, height_m, base),
     }
 
@@ -59,32 +61,32 @@ def contour(
 class _Found:
     """A place along a line, and how far it moves by the height of each cell (n,) of the line [m/m]."""
 
-    position: LinePosition
+    distance_m: float
     cells: Floats
-    samples: Floats  # (k,) likewise by the height of each sample
+    relief: Floats  # (k,) likewise by the relief of each sample
+    relief_m2: float  # variance of that
 
 
-def _find(line: Line, heights_m: Floats, height_m: HeightOrCrest) -> _Found | None:
-    """Return where heights (n,) of the cells of a line, NaN where unknown, cross one or are highest."""
+def _find(line: Line, heights_m: Floats, noise_m2: Floats, height_m: HeightOrCrest) -> _Found | None:
+    """Return where heights (n,) of the cells of a line cross one or are highest; None if nowhere.
+
+    Heights are NaN where unknown; `noise_m2` (n,) is their random variance.
+    """
     known = np.zeros_like(line.cells)
     known[line.cells] = np.isfinite(heights_m)
     weights, complete = line.weights(known)
     profile_m = np.where(complete, weights @ heights_m[np.isfinite(heights_m)], np.nan)
+    profile_noise_m2 = line.interpolation.power(2) @ np.nan_to_num(noise_m2)
     found = (
-        crossing(line.distance_m, profile_m, height_m)
+        crossing(line.distance_m, profile_m, profile_noise_m2, height_m)
         if isinstance(height_m, float)
-        else crest(line.distance_m, profile_m)
+        else crest(line.distance_m, profile_m, profile_noise_m2)
     )
     if found is None:
         return None
-    samples = np.zeros(len(line.distance_m))
-    samples[found.samples] = found.sensitivity
-    return _Found(found, samples @ line.interpolation, samples)
-
-
-def _estimate(value_m: float, variances_m2: tuple[float, float], scatter_m2: float) -> Estimate:
-    """Return a distance; its random part is at least that by which the ground scatters."""
-    return Estimate(value_m, max(variances_m2[0], scatter_m2), variances_m2[1])
+    samples, relief = np.zeros((2, len(line.distance_m)))
+    samples[found.samples], relief[found.samples] = found.sensitivity, found.relief
+    return _Found(found.distance_m, samples @ line.interpolation, relief, found.relief_m2)
 
 
 def _movement(
@@ -108,11 +110,12 @@ def _movement(
         ]
         change_m = np.where(share < 1.0, (1 - share) * np.nan_to_num(scan.change_m), 0.0)
         surface_m = aggregates.mean_elevation(other, line.cells) + change_m + share * other.change_m
-    there = _find(line, surface_m, height_m)
+    fixed = base.raster_m is not None  # without errors
+    noise_m2 = _base_variance(scan, other, line.cells)
+    there = _find(line, surface_m, 0.0 * noise_m2 if fixed else noise_m2, height_m)
     if there is None:
         return Estimate()
-    fixed = base.raster_m is not None  # without errors
-    variances = _variances(
+    random_m2, systematic_m2 = _variances(
         aggregates,
         line,
         scan,
@@ -120,10 +123,9 @@ def _movement(
         0.0 * share if fixed else share * there.cells,
         other,
     )
-    scatter_m2 = (here.position.scatter_m2 + there.position.scatter_m2) / 2
-    moved = here.samples - there.samples
-    value_m = here.position.distance_m - there.position.distance_m
-    return _estimate(value_m, variances, float(scatter_m2 * moved @ moved))
+    moved = here.relief - there.relief
+    relief_m2 = (here.relief_m2 + there.relief_m2) / 2 * moved @ moved
+    return Estimate(here.distance_m - there.distance_m, random_m2 + relief_m2, systematic_m2)
 
 
 def _variances(
@@ -140,8 +142,7 @@ def _variances(
     adjusted scans share the errors of the reference. Source: equations.md, 6.2 and 6.18.
     """
     base_weights = np.zeros(len(weights)) if base_weights is None else base_weights
-    reference_m2 = scan.reference.random_variance_m2[line.cells]
-    base_m2 = reference_m2 if base is None else _own_variance(base, line.cells)
+    base_m2 = _base_variance(scan, base, line.cells)
     random = float(
         np.sum(weights**2 * np.where(weights != 0, _own_variance(scan, line.cells), 0.0))
         + np.sum(base_weights**2 * np.where(base_weights != 0, base_m2, 0.0))
@@ -181,13 +182,20 @@ def _own_variance(scan: EpochCells, cells: Bools) -> Floats:
     return np.asarray(np.maximum(scan.random_m**2 - reference_m2, 0.0))
 
 
+def _base_variance(scan: EpochCells, base: EpochCells | None, cells: Bools) -> Floats:
+    """Return the random variance (n,) of the heights of a surface, without one of the reference [m²]."""
+    if base is not None:
+        return _own_variance(base, cells)
+    return np.asarray(scan.reference.random_variance_m2[cells], np.float64)
+
+
 def _reference_errors(scan: EpochCells) -> SharedParameters:
     """Return the shared parameters of the reference of a scan; those of the scan if they are of another kind.
 
     Without errors if the reference has none.
     """
     assert scan.shared is not None  # noqa: S101 - the caller has looked
-    reference = scan.reference.shared
+    reference = errors_on_map(scan.reference)
     if reference is None:
         return scan.shared.scaled(0.0)
     return reference if reference.names == scan.shared.names else scan.shared

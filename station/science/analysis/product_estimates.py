@@ -16,7 +16,7 @@ from station.quantities import Bools, Floats, Ints
 WATER_KG_M3 = 1000.0
 SIGN_WINDOW_CELLS = 5  # the neighbours that decide whether a cell lost or gained
 CLEAR_SIGMAS = 4.0  # beyond, a cell decides itself: noise gets there once in 16,000 cells
-CROSSING_SAMPLES = 2  # on either side of a crossing, which make its line
+CROSSING_SAMPLES = 2  # on either side of a crossing, which it is from
 CREST_SAMPLES = 3  # on either side of the highest, which make its parabola
 SCATTER_SAMPLES = 10  # on either side, which show how the ground scatters about lines and parabolas
 
@@ -86,38 +86,50 @@ class LinePosition(NamedTuple):
     distance_m: float
     samples: Ints  # (k,) that it is from
     sensitivity: Floats  # (k,)
-    scatter_m2: float  # variance of a height about such a line or parabola, of the samples around
-
-    @property
-    def scatter_variance(self) -> float:
-        """Variance of the distance that the scatter of the heights causes [m²]."""
-        return float(self.scatter_m2 * self.sensitivity @ self.sensitivity)
+    relief: Floats  # (k,) likewise by heights that are no error, but that no line or parabola has
+    relief_m2: float  # variance of such heights
 
 
-def crossing(distance_m: Floats, height_m: Floats, level_m: float) -> LinePosition | None:
+def crossing(distance_m: Floats, height_m: Floats, noise_m2: Floats, level_m: float) -> LinePosition | None:
     """Return the first place along a profile (n,) where its height crosses a level; None if there is none.
 
-    Heights are NaN where not observed. The place is that on the straight line through the samples on either
-    side. Source: equations.md, 6.18.
+    Heights are NaN where not observed; `noise_m2` (n,) is their random variance. The place is between two of
+    the samples on either side, which noise has brought nearer to a straight line than they were measured.
+    Source: equations.md, 6.18.
     """
     above, known = height_m > level_m, np.isfinite(height_m)
     for first in np.flatnonzero((above[1:] != above[:-1]) & known[1:] & known[:-1]).tolist():
         samples = _around(known, first - CROSSING_SAMPLES + 1, first + CROSSING_SAMPLES)
-        offset_m, h = distance_m[samples] - distance_m[samples].mean(), height_m[samples]
-        slope = float(offset_m @ h / (offset_m @ offset_m))
-        if slope * (height_m[first + 1] - height_m[first]) > 0:
-            shift_m = (level_m - h.mean()) / slope
-            sensitivity = -(1 / len(h) + shift_m * offset_m / (offset_m @ offset_m)) / slope
-            scatter_m2 = _scatter(distance_m, height_m, first, 2 * CROSSING_SAMPLES, 1)
-            return LinePosition(float(distance_m[samples].mean() + shift_m), samples, sensitivity, scatter_m2)
+        offset_m = distance_m[samples] - distance_m[samples].mean()
+        line = 1 / len(samples) + np.outer(offset_m, offset_m) / (offset_m @ offset_m)
+        relief_m2, kept = _relief(distance_m, height_m, noise_m2, first, 2 * CROSSING_SAMPLES, 1)
+        smoothing = line + kept * (np.eye(len(samples)) - line)
+        sign = 1.0 if above[first + 1] else -1.0
+        smooth_m = sign * (smoothing @ height_m[samples] - level_m)
+        rising = np.flatnonzero((smooth_m[1:] > 0) & (smooth_m[:-1] <= 0))
+        if not len(rising):
+            continue
+        before, step_m = int(rising[0]), np.diff(smooth_m)[rising[0]]
+        length_m = distance_m[samples[before + 1]] - distance_m[samples[before]]
+        share = -smooth_m[before] / step_m
+        between = np.zeros(len(samples))
+        between[before : before + 2] = 1 - share, share
+        moves = -sign * length_m / step_m * between
+        return LinePosition(
+            float(distance_m[samples[before]] + share * length_m),
+            samples,
+            moves @ smoothing,
+            moves @ (smoothing - np.eye(len(samples))),
+            relief_m2,
+        )
     return None
 
 
-def crest(distance_m: Floats, height_m: Floats) -> LinePosition | None:
+def crest(distance_m: Floats, height_m: Floats, noise_m2: Floats) -> LinePosition | None:
     """Return the place of the crest of a profile (n,); None if its highest sample is at an end or a gap.
 
-    Heights are NaN where not observed. It is the summit of the parabola through the samples around the
-    highest. Source: equations.md, 6.18.
+    Heights are NaN where not observed; `noise_m2` (n,) is their random variance. It is the summit of the
+    parabola through the samples around the highest. Source: equations.md, 6.18.
     """
     known = np.isfinite(height_m)
     if not known.any():
@@ -132,23 +144,37 @@ def crest(distance_m: Floats, height_m: Floats) -> LinePosition | None:
     if curvature >= 0:
         return None
     sensitivity = (slope * fit[2] / curvature - fit[1]) / (2 * curvature)
-    scatter_m2 = _scatter(distance_m, height_m, highest, 2 * CREST_SAMPLES + 1, 2)
-    return LinePosition(float(origin_m - slope / (2 * curvature)), samples, sensitivity, scatter_m2)
+    relief_m2, _ = _relief(distance_m, height_m, noise_m2, highest, 2 * CREST_SAMPLES + 1, 2)
+    return LinePosition(
+        float(origin_m - slope / (2 * curvature)), samples, sensitivity, sensitivity, relief_m2
+    )
 
 
-def _scatter(distance_m: Floats, height_m: Floats, place: int, count: int, degree: int) -> float:
-    """Return the mean variance of heights about the polynomials through `count` consecutive ones [m²].
+def _relief(
+    distance_m: Floats, height_m: Floats, noise_m2: Floats, place: int, count: int, degree: int
+) -> tuple[float, float]:
+    """Return the variance of true heights about polynomials [m²], and its share in that of measured ones.
 
-    Of the samples around a place; 0 if nowhere enough of them are known.
+    It is what the scatter around a place exceeds the noise by.
     """
     around = slice(max(place - SCATTER_SAMPLES, 0), place + SCATTER_SAMPLES + 1)
-    if len(height_m[around]) < count:
+    scatter_m2 = _scatter(distance_m[around], height_m[around], count, degree)
+    relief_m2 = max(scatter_m2 - float(np.mean(noise_m2[around][np.isfinite(height_m[around])])), 0.0)
+    return relief_m2, relief_m2 / scatter_m2 if relief_m2 > 0 else 0.0
+
+
+def _scatter(distance_m: Floats, height_m: Floats, count: int, degree: int) -> float:
+    """Return the mean variance of heights (n,) about the polynomials through `count` consecutive ones [m²].
+
+    It is 0 if nowhere enough of them are known.
+    """
+    if len(height_m) < count:
         return 0.0
-    windows_m = np.lib.stride_tricks.sliding_window_view(height_m[around], count)
+    windows_m = np.lib.stride_tricks.sliding_window_view(height_m, count)
     windows_m = windows_m[np.isfinite(windows_m).all(axis=1)]
     if not len(windows_m):
         return 0.0
-    basis = np.vander(distance_m[around][:count] - distance_m[around][0], degree + 1)
+    basis = np.vander(distance_m[:count] - distance_m[0], degree + 1)
     residuals_m = windows_m - windows_m @ (basis @ np.linalg.pinv(basis)).T
     return float(np.mean(residuals_m**2) * count / (count - degree - 1))
 

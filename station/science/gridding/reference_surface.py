@@ -14,6 +14,8 @@ from station.science.gridding.scan_stack import ScanStack
 REFRACTION_CORRELATION_S = 6 * 3600.0  # of the refraction of the air, from scan to scan
 MAX_DEVIATION_SIGMAS = 3.0  # of a mean over many scans, on stable ground
 MAX_VARIANCE_FACTOR = 3.0  # empirical over modelled variance from scan to scan, on stable ground
+LOG_PARAMETERS = ("tilt_", "sight_tilt")  # whose errors are those of the inclination log …
+MOTION_PARAMETERS = ("heading", "translation_")  # … and of the motion since the SOP
 
 Position = tuple[float, float, float]
 
@@ -75,6 +77,22 @@ def build_surface(
         visibility=stack.visibility(),
         time_s=float(np.mean(times_s)),
     )
+
+
+def errors_on_map(reference: Reference) -> SharedParameters | None:
+    """Return the shared parameters of a reference with the covariance of its errors on the map.
+
+    All its scans are placed relative to the one that the SOP was determined from, and have the errors of that
+    scan, and of its inclination log, in common. Change does not: they cancel. Source: equations.md, 6.20.
+    """
+    shared, count = reference.shared, len(reference.scan_ids)
+    if shared is None or reference.sop_scans is None or not count:
+        return shared
+    others = count - reference.sop_scans
+    ratio, factors = others * (others + 1) / count, np.ones(len(shared.names))
+    factors[[name.startswith(LOG_PARAMETERS) for name in shared.names]] = max(ratio, 1.0)
+    factors[[name.startswith(MOTION_PARAMETERS) for name in shared.names]] = max(ratio / 2, 1.0)
+    return replace(shared, covariance=shared.covariance * np.sqrt(np.outer(factors, factors)))
 
 
 def centre_reference(

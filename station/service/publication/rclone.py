@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import shutil
 import subprocess
 from collections.abc import Sequence
@@ -15,6 +16,8 @@ from station.errors import ConfigError
 
 CONFIG_NAME = "rclone.conf"  # of the credential with the remotes and their keys
 LIMIT_S = 6 * 3600.0  # of one call; rclone itself gives up a connection that is silent for a minute
+MARKUP = re.compile(r"<(head|style|script)\b.*?</\1>|<[^>]*>", re.DOTALL | re.IGNORECASE)
+LOG_TIME = re.compile(r"^\d{4}/\d\d/\d\d \d\d:\d\d:\d\d ")
 PATIENCE = (
     "--contimeout=20s",
     "--timeout=60s",
@@ -83,10 +86,15 @@ def _parse(result: subprocess.CompletedProcess[str], names: Sequence[str]) -> Tr
         if message.startswith("Copied ("):
             copied.add(str(record.get("object")))
         elif record.get("level") not in {"debug", "info", "notice", "warning"} and not fault:
-            fault = message
+            fault = _plain(message)
     if result.returncode == 0:
         return Transfer(frozenset(names), sent_bytes, "")
     return Transfer(frozenset(copied), sent_bytes, fault[:300] or f"rclone: exit status {result.returncode}")
+
+
+def _plain(message: str) -> str:
+    """Return a message on one line: without its time, and without the markup of a page that a server sent."""
+    return " ".join(MARKUP.sub(" ", LOG_TIME.sub("", message)).split())
 
 
 def _record(line: str) -> dict[str, Any]:

@@ -1,6 +1,7 @@
 """`station score`: what it computes, against arithmetic by hand, and the page of a small archive."""
 
 import json
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -8,7 +9,7 @@ from support import tiny_station
 from typer.testing import CliRunner
 
 from station.cli import app
-from station.operations.reports.score import gain_by_scale
+from station.operations.reports.score import _reasons, gain_by_scale
 from station.quantities import Grid
 
 GRID = Grid(west_m=0.0, north_m=40.0, cell_m=5.0, nx=8, ny=8)
@@ -38,6 +39,13 @@ def test_blocks_are_means():
     assert table["10 m"]["gain"] == pytest.approx(4.0)
 
 
+def test_reasons_are_counted_without_figures_and_folders():
+    reasons = ["0.46% of the echoes", "2% of the echoes", "", "/srv/tls/a1.txt: log −3.2 s late"]
+    assert _reasons([SimpleNamespace(reason=reason) for reason in reasons]) == {
+        "…% of the echoes": 2, "a….txt: log … s late": 1,
+    }  # fmt: skip
+
+
 def listing(folder):
     return {path: path.stat().st_mtime_ns for path in folder.rglob("*")}
 
@@ -54,6 +62,7 @@ def test_an_archive_is_scored_and_not_touched(tmp_path):
     score = json.loads((out / "score.json").read_text(encoding="utf-8"))
     assert sum(score["scans"].values()) == 3
     assert score["registration"] == "SOP and log"
+    assert score["after_reference"] == 1
     assert {"cell", "all"} <= {row["scale"] for row in score["gain"]}  # unadjusted scans have it, too
     assert 0.1 < score["cpu_s_per_scan"] < 60
     page = (out / "score.html").read_text(encoding="utf-8")

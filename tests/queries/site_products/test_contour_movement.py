@@ -1,7 +1,8 @@
-"""How far a contour moved, against plain lines through four cells and dense matrix algebra."""
+"""How far a contour moved, against crossings sample by sample and dense matrix algebra."""
 
 import numpy as np
 import pytest
+from support.crossings import crossing
 from support.plane_store import (
     EAST,
     GRID,
@@ -38,26 +39,6 @@ def movement(series, index, surface=None, raster_m=None):
     return station.product(series.folder, "test").isel(time=index, place=0)
 
 
-def crossing(heights_m):
-    """Return the crossing of a profile, its weights by numerical derivatives, and the scatter around."""
-    known = np.isfinite(heights_m)
-    first = int(np.flatnonzero(heights_m > LEVEL_M)[0]) - 1
-    samples = np.array([k for k in range(first - 1, first + 3) if known[k]])
-
-    def place_m(heights):
-        slope, height = np.polyfit(LINE_M[samples], heights, 1)
-        return (LEVEL_M - height) / slope
-
-    near_m, weights, step = heights_m[samples], np.zeros(len(heights_m)), 1e-4
-    weights[samples] = [
-        (place_m(near_m + row) - place_m(near_m - row)) / (2 * step) for row in step * np.eye(len(samples))
-    ]
-    around_m = heights_m[first - 10 : first + 11]
-    fits = [np.polyfit(range(4), around_m[k : k + 4], 1, full=True)[1] for k in range(len(around_m) - 3)
-            if np.isfinite(around_m[k : k + 4]).all()]  # fmt: skip
-    return place_m(near_m), weights, np.mean(fits) / 2
-
-
 def on_grid(weights):
     raster = np.zeros(GRID.shape)
     raster[ROW, FIRST:END] = weights
@@ -65,10 +46,10 @@ def on_grid(weights):
 
 
 def assert_movement(product, here, there, noise_m2, systematic_m2):
-    """Assert value and sigmas; two places of different cells scatter as the ground does."""
+    """Assert value and sigmas; relief is what both places have not in common."""
     assert float(product.distance_change) == pytest.approx(here[0] - there[0], abs=2e-3)  # heights are f4
-    moved = here[1] - there[1]
-    random_m2 = max(noise_m2, (here[2] + there[2]) / 2 * moved @ moved)
+    moved = here[2] - there[2]
+    random_m2 = noise_m2 + (here[3] + there[3]) / 2 * moved @ moved
     assert float(product.distance_change_random_uncertainty) ** 2 == pytest.approx(random_m2, rel=3e-3)
     total_m2 = float(product.distance_change_uncertainty) ** 2
     assert total_m2 == pytest.approx(random_m2 + systematic_m2, rel=3e-3)
@@ -97,9 +78,28 @@ def noise_m2(series, stored, index, weights):
     return np.nansum(on_grid(weights) ** 2 * independent_m2(stored, index, reference_random_m2(series)))
 
 
+def along_line(raster):
+    return raster[ROW, FIRST:END]
+
+
+def crossing_in(series, stored, index):
+    """Return the crossing in a scan."""
+    own_m2 = along_line(independent_m2(stored, index, reference_random_m2(series)))
+    return crossing(LINE_M, profile_m(stored, index), own_m2, LEVEL_M)
+
+
+def crossing_of_mean(series, stored, indices):
+    """Return the crossing of the mean surface of all scans, with the noise of the mean of some of them."""
+    heights_m = np.array([profile_m(stored, index) for index in BASE])
+    noise = [along_line(independent_m2(stored, index, reference_random_m2(series))) for index in indices]
+    count = np.isfinite(noise).sum(axis=0)
+    return crossing(LINE_M, np.nanmean(heights_m, axis=0), np.nansum(noise, axis=0) / count**2, LEVEL_M)
+
+
 def test_a_contour_moved_since_the_reference(series, stored):
     """The systematic error of the reference moves both places alike; its noise moves one."""
-    here, there = crossing(profile_m(stored, LAST)), crossing(PLANE_M)
+    here = crossing_in(series, stored, LAST)
+    there = crossing(LINE_M, PLANE_M, along_line(reference_random_m2(series)), LEVEL_M)
     noise = noise_m2(series, stored, LAST, here[1])
     noise += np.nansum(on_grid(there[1]) ** 2 * reference_random_m2(series))
     systematic = epoch_m2(stored, LAST, here[1]) + reference_m2(stored, here[1] - there[1])
@@ -116,8 +116,7 @@ def mode_effect(stored, weights):
 
 
 def test_a_contour_moved_since_the_mean_of_scans(series, stored):
-    here = crossing(profile_m(stored, LAST))
-    there = crossing(np.nanmean([profile_m(stored, index) for index in BASE], axis=0))
+    here, there = crossing_in(series, stored, LAST), crossing_of_mean(series, stored, BASE)
     noise = noise_m2(series, stored, LAST, here[1])
     noise += sum(noise_m2(series, stored, index, there[1] / 3) for index in BASE)
     systematic = epoch_m2(stored, LAST, here[1]) + shared_m2(
@@ -129,8 +128,7 @@ def test_a_contour_moved_since_the_mean_of_scans(series, stored):
 
 
 def test_the_movement_in_a_scan_of_the_surface_has_its_error_once(series, stored):
-    here = crossing(profile_m(stored, 0))
-    there = crossing(np.nanmean([profile_m(stored, index) for index in BASE], axis=0))
+    here, there = crossing_in(series, stored, 0), crossing_of_mean(series, stored, (1, 2))
     own, others = here[1] - there[1] / 3, 2 / 3 * there[1]
     noise = noise_m2(series, stored, 0, own)
     noise += sum(noise_m2(series, stored, index, others / 2) for index in (1, 2))
@@ -143,7 +141,8 @@ def test_the_movement_in_a_scan_of_the_surface_has_its_error_once(series, stored
 def test_a_given_surface_has_no_errors(series, stored):
     raster_m = np.broadcast_to(np.nan, GRID.shape).copy()
     raster_m[ROW] = np.interp(GRID.x_m, GRID.x_m[FIRST:END], PLANE_M) + 0.5
-    here, there = crossing(profile_m(stored, LAST)), crossing(PLANE_M + 0.5)
+    here = crossing_in(series, stored, LAST)
+    there = crossing(LINE_M, PLANE_M + 0.5, np.zeros(END - FIRST), LEVEL_M)
     systematic = epoch_m2(stored, LAST, here[1]) + reference_m2(stored, here[1])
     product = movement(series, LAST, "before.tif", raster_m)
     assert_movement(product, here, there, noise_m2(series, stored, LAST, here[1]), systematic)

@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from support.crossings import crossing
 from support.plane_store import (
     EAST,
     GRID,
@@ -236,23 +237,14 @@ def test_a_contour_is_where_the_surface_crosses_the_height(base, stored):
     expected_m = (level_m - start_m - np.nanmean(stored.elevation_change.values[LAST])) / EAST
     assert float(contour.distance[LAST, 0]) == pytest.approx(expected_m, abs=1.0)  # cells scatter by 0.1 m
 
-    def place_m(heights):
-        slope, height = np.polyfit(10.0 * np.arange(4) - 15.0, heights, 1)
-        return (level_m - height) / slope
-
-    four_m, weights = heights_m[first - 1 : first + 3], np.zeros(GRID.shape)
-    lifted_m = four_m + 1e-5 * np.eye(4)
-    weights[ROW, 4 + first - 1 : 4 + first + 3] = [(place_m(h) - place_m(four_m)) / 1e-5 for h in lifted_m]
     random_m2 = independent_m2(stored, LAST, reference_random_m2(base))
+    _, along, relief, relief_m2 = crossing(10.0 * np.arange(31), heights_m, random_m2[ROW, 4:35], level_m)
+    weights = np.zeros(GRID.shape)
+    weights[ROW, 4:35] = along
     total = dense_variance(stored, weights, LAST, random_m2=random_m2, reference=random_parameters(7, 0.5))
-    around_m = heights_m[max(first - 11, 0) : first + 10]  # ten samples on either side of the one before it
-    fits = [np.polyfit(range(4), around_m[k : k + 4], 1, full=True)[1] for k in range(len(around_m) - 3)
-            if np.isfinite(around_m[k : k + 4]).all()]  # fmt: skip
-    scatter_m2 = np.mean(fits) / 2  # four samples less two unknowns
-    measured_m2, scatter_m2 = np.nansum(weights**2 * random_m2), scatter_m2 * np.sum(weights**2)
-    assert scatter_m2 > measured_m2
-    total += scatter_m2 - measured_m2
-    assert_sigmas(contour, "distance", LAST, random=scatter_m2, total=total, rel=2e-3)  # heights are f4
+    random = np.nansum(weights**2 * random_m2) + relief_m2 * relief @ relief
+    total += relief_m2 * relief @ relief
+    assert_sigmas(contour, "distance", LAST, random=random, total=total, rel=2e-3)  # heights are f4
 
 
 def test_only_new_epochs_and_those_that_depend_on_them_are_computed(base, box, tmp_path):

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from scipy import ndimage
 
 from station.science.analysis.product_estimates import (
     Estimate,
@@ -78,58 +79,82 @@ def moved(position, distance_m, height_m, sample):
 
 def test_a_crossing_of_a_plane_is_exact_and_the_first_is_taken():
     distance_m = np.arange(0.0, 50.0, 2.0)
-    assert crossing(distance_m, 7.0 - 0.2 * distance_m, 3.1).distance_m == pytest.approx(3.9 / 0.2)
+    quiet_m2 = np.zeros(25)
+    assert crossing(distance_m, 7.0 - 0.2 * distance_m, quiet_m2, 3.1).distance_m == pytest.approx(3.9 / 0.2)
     wave_m = np.sin(distance_m / 5)
-    found = crossing(distance_m, wave_m, 0.2)
-    assert found.distance_m == pytest.approx(5 * np.arcsin(0.2), abs=0.1)
+    found = crossing(distance_m, wave_m, quiet_m2, 0.2)
+    assert found.distance_m == pytest.approx(2 * 0.2 / np.sin(0.4))  # what is no noise stays as measured
+    noise_m2 = np.full(25, 1.0)
+    found = crossing(distance_m, wave_m, noise_m2, 0.2)
+    slope, height_m = np.polyfit(distance_m[:3], wave_m[:3], 1)  # all of it may be noise
+    assert found.distance_m == pytest.approx((0.2 - height_m) / slope)
     for sample, sensitivity in zip(found.samples, found.sensitivity, strict=True):
-        expected = moved(lambda s, h: crossing(s, h, 0.2), distance_m, wave_m, sample)
+        expected = moved(lambda s, h: crossing(s, h, noise_m2, 0.2), distance_m, wave_m, sample)
         assert sensitivity == pytest.approx(expected, rel=1e-3)
 
 
 def test_a_crest_is_the_summit_of_a_parabola():
     distance_m = np.arange(0.0, 50.0, 2.0)
     height_m = 8.0 - 0.01 * (distance_m - 23.4) ** 2
-    found = crest(distance_m, height_m)
+    noise_m2 = np.zeros(25)
+    found = crest(distance_m, height_m, noise_m2)
     assert found.distance_m == pytest.approx(23.4)
     assert found.sensitivity.sum() == pytest.approx(0.0, abs=1e-9)  # not moved by a common error
     for sample, sensitivity in zip(found.samples, found.sensitivity, strict=True):
-        expected = moved(crest, distance_m, height_m, sample)
+        expected = moved(lambda s, h: crest(s, h, noise_m2), distance_m, height_m, sample)
         assert sensitivity == pytest.approx(expected, rel=1e-2)
-    assert crest(distance_m, distance_m) is None
-    assert crest(distance_m, np.full(25, np.nan)) is None
+    assert crest(distance_m, distance_m, noise_m2) is None
+    assert crest(distance_m, np.full(25, np.nan), noise_m2) is None
 
 
 def test_there_is_no_crossing_without_both_sides():
     distance_m = np.arange(0.0, 20.0, 1.0)
     height_m = 5.0 - 0.5 * distance_m
-    assert crossing(distance_m, height_m, 6.0) is None
+    assert crossing(distance_m, height_m, np.zeros(20), 6.0) is None
     height_m[4:7] = np.nan
-    assert crossing(distance_m, height_m, 2.5) is None
+    assert crossing(distance_m, height_m, np.zeros(20), 2.5) is None
 
 
-def test_the_scatter_of_positions_is_that_of_their_sensitivity():
-    rng, distance_m = np.random.default_rng(3), np.arange(0.0, 40.0, 1.0)
-    for height_m, position, expected_m in (
-        (10 - 0.5 * distance_m, lambda s, h: crossing(s, h, 2.6), 14.8),
-        (8 - 0.05 * (distance_m - 19.7) ** 2, crest, 19.7),
-    ):
-        places_m = [position(distance_m, height_m + rng.normal(0, 0.02, 40)).distance_m for _ in range(1500)]
-        sensitivity = position(distance_m, height_m).sensitivity
-        assert np.mean(places_m) == pytest.approx(expected_m, abs=0.01)
-        assert np.std(places_m) == pytest.approx(0.02 * np.sqrt(sensitivity @ sensitivity), rel=0.1)
-
-
-def test_a_position_on_rough_ground_is_as_uncertain_as_repetitions_show():
-    """Positions on 2,000 rough slopes and ridges with one truth, scatter of 0.3 m."""
+def test_a_crest_on_rough_ground_is_as_uncertain_as_repetitions_show():
+    """2,000 ridges with one summit, whose heights scatter by 0.3 m, by noise or not."""
     rng, distance_m = np.random.default_rng(1), np.arange(0.0, 400.0, 10.0)
-    shapes = {
-        200.0: (100.0 - 0.5 * distance_m, lambda h: crossing(distance_m, h, 0.0)),
-        195.0: (-2e-3 * (distance_m - 195.0) ** 2, lambda h: crest(distance_m, h)),
-    }
-    for true_m, (height_m, find) in shapes.items():
-        found = [find(height_m + 0.3 * rng.standard_normal(len(height_m))) for _ in range(2000)]
-        assert np.mean([place.scatter_m2 for place in found]) == pytest.approx(0.3**2, rel=0.05)
-        error_m = [place.distance_m - true_m for place in found]
-        stated_m2 = np.mean([place.scatter_variance for place in found])
-        assert np.var(error_m) == pytest.approx(stated_m2, rel=0.15)
+    ridge_m = -2e-3 * (distance_m - 195.0) ** 2
+    for noise_m in (0.0, 0.1, 0.3):
+        noise_m2 = np.full(40, noise_m**2)
+        found = [crest(distance_m, ridge_m + rng.normal(0, 0.3, 40), noise_m2) for _ in range(2000)]
+        error_m = np.array([place.distance_m for place in found]) - 195.0
+        stated_m2 = [
+            noise_m**2 * place.sensitivity @ place.sensitivity + place.relief_m2 * place.relief @ place.relief
+            for place in found
+        ]
+        assert np.mean(error_m) == pytest.approx(0.0, abs=0.2)
+        assert 0.8 < np.std(error_m) / np.sqrt(np.mean(stated_m2)) < 1.25
+
+
+@pytest.mark.parametrize("noise_m", [0.0, 0.05, 0.2, 0.6])
+@pytest.mark.parametrize("length_cells", [0.5, 2.0])
+def test_a_contour_is_where_rough_ground_crosses_the_height(noise_m, length_cells):
+    """2,000 slopes, each with relief of 0.3 m and this length of correlation, and noise of its own.
+
+    The truth is between two true heights. Positions are as good as those of a line through four heights or
+    between two measured ones, whichever is better on such ground.
+    """
+    rng, distance_m, noise_m2 = np.random.default_rng(4), np.arange(0.0, 400.0, 10.0), np.full(40, noise_m**2)
+    z, errors_m = [], {"position": [], "line": [], "two": []}
+    for _ in range(2000):
+        relief_m = ndimage.gaussian_filter1d(rng.standard_normal(80), length_cells)[20:60]
+        relief_m *= 0.3 / np.sqrt(np.sum(ndimage.gaussian_filter1d(np.eye(80)[40], length_cells) ** 2))
+        true_m = 100.0 - 0.5 * distance_m + relief_m
+        measured_m = true_m + rng.normal(0, noise_m, 40)
+        true_place_m, two_m = (np.interp(0.0, -h, distance_m) for h in (true_m, measured_m))
+        found = crossing(distance_m, measured_m, noise_m2, 0.0)
+        variance_m2 = noise_m**2 * found.sensitivity @ found.sensitivity
+        variance_m2 += found.relief_m2 * found.relief @ found.relief
+        slope, height_m = np.polyfit(distance_m[found.samples], measured_m[found.samples], 1)
+        for name, place_m in (("position", found.distance_m), ("two", two_m), ("line", -height_m / slope)):
+            errors_m[name].append(place_m - true_place_m)
+        if variance_m2 > 0:
+            z.append(errors_m["position"][-1] / np.sqrt(variance_m2))
+    rms_m = {name: np.sqrt(np.mean(np.square(values))) for name, values in errors_m.items()}
+    assert rms_m["position"] < 1.1 * min(rms_m["line"], rms_m["two"]) + 1e-6
+    assert (0.8 < np.sqrt(np.mean(np.square(z))) < 1.25) if noise_m else (rms_m["position"] < 1e-6)

@@ -1,11 +1,13 @@
 """Update of a reference from more scans: stable ground improves, changed ground stays."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from station.quantities import Grid, Reference, SharedParameters, VarianceComponents
 from station.science.gridding.gridder import Gridder
-from station.science.gridding.reference_surface import build_surface, update_reference
+from station.science.gridding.reference_surface import build_surface, errors_on_map, update_reference
 from station.science.gridding.scan_stack import ScanStack
 
 GRID = Grid(west_m=1000.0, north_m=2000.0, cell_m=10.0, nx=60, ny=50)
@@ -120,3 +122,22 @@ def test_refraction_of_consecutive_scans_is_correlated():
     assert np.diag(hourly.shared.covariance) == pytest.approx([4 / 8, 1 / effective, 9 / effective])
     assert np.diag(daily.shared.covariance) == pytest.approx(np.array([4, 1, 9]) / 8, rel=0.05)
     assert hourly.time_s == 3.5 * 3600
+
+
+@pytest.mark.parametrize("sop_scans", [0, 1])
+def test_scans_share_the_errors_of_the_scan_that_the_sop_is_from(sop_scans):
+    """20,000 references of eight scans, whose log is off by its own bias less that of the scan of the SOP."""
+    rng, count = np.random.default_rng(5), 8
+    bias = rng.normal(0.0, 1.0, (20_000, count + 1 - sop_scans))
+    errors = bias[:, bias.shape[1] - count :] - bias[:, :1]
+    names = ("tilt_east", "heading", "range_bias")
+    shared = SharedParameters(names, ("rad", "rad", "m"), np.zeros(3), np.eye(3) / count, np.zeros(3))
+    reference = replace(
+        Reference.from_elevation(GRID, "1", np.zeros(GRID.shape)),
+        shared=shared, scan_ids=tuple("abcdefgh"), sop_scans=sop_scans,
+    )  # fmt: skip
+    variance = np.diag(errors_on_map(reference).covariance)
+    assert variance[0] == pytest.approx(errors.mean(axis=1).var(), rel=0.03)
+    assert variance[1] == pytest.approx(errors.mean(axis=1).var() / errors[:, -1].var(), rel=0.03)
+    assert variance[2] == 1 / count
+    assert errors_on_map(replace(reference, sop_scans=None)) is shared
