@@ -174,13 +174,12 @@ class ClassCourse:
     def rate_errors(self, systematic_m2: Floats) -> CourseErrors:
         """Return the variances of the mean rate of the class since the day began, at cells (n,) of it.
 
-        It is the difference of two levels, or the filtered rate of stable ground.
+        It is the difference of two levels. On stable ground the rates of the cells do not follow the course.
         """
-        if self.shares is None:
+        if self.shares is None or not self._has_wave:
             return CourseErrors(0.0, 0.0, np.zeros_like(systematic_m2))
-        estimate = int(self._has_wave)
         process, random, systematic = (
-            float(self.shares.rate_variances(matrix)[estimate, estimate])
+            float(self.shares.rate_variances(matrix)[1, 1])
             for matrix in (self.shares.process, self.shares.random, self.shares.systematic)
         )
         return CourseErrors(process, random, systematic * systematic_m2)

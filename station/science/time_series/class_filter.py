@@ -107,11 +107,14 @@ class ClassFilter:
     def weight_of_difference(self) -> float:
         """The weight of the difference of levels in the rate of a day; that of the filtered rate is the rest.
 
-        It is that with the smallest variance, between 0 and 1. Source: equations.md, 6.12.
+        It is that with the smallest variance, between 0 and 1; of stable ground, without that of the process.
+        Source: equations.md, 6.12.
         """
         if self.shares is None or not self.shares.elapsed_d:
             return 0.0
-        (filtered, covariance), (_, difference) = self.shares.rate_variances(self.shares.total)
+        shares = self.shares
+        counted = shares.total - shares.process if self.is_stable else shares.total
+        (filtered, covariance), (_, difference) = shares.rate_variances(counted)
         filtered += self.missing_rate[1]
         disagreement = max(filtered + difference - 2 * covariance, TINY_M2_D2)
         return float(np.clip((filtered - covariance) / disagreement, 0.0, 1.0))

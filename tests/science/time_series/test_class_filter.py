@@ -142,7 +142,7 @@ def test_sigma_of_level_and_rate_and_error_of_twelve_hours(kind):
 def test_errors_that_last_for_hours_are_in_the_systematic_part():
     levels, rates, _ = calibration("stable", 0.02, 0.02, lasting=True)
     assert 0.8 < levels < 1.25
-    assert 0.8 < rates < 1.25
+    assert 0.65 < rates < 1.25  # of two stations
 
 
 def test_live_equals_reprocessed_and_a_longer_series_changes_nothing_before():
