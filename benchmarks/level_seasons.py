@@ -227,7 +227,8 @@ def main() -> None:
         rows.append(row(kind, seeds, options.lasting))
         print(*rows[-1], sep="; ", flush=True)
     if options.markdown:
-        title = f"{DAYS} d of hourly scans, seeds {seeds[0]} to {seeds[-1]}, {options.lasting:.0%} lasting"
+        share = f"{100 * options.lasting:.0f} % of the variance of shared errors lasts"
+        title = f"{DAYS} d of hourly scans, seeds {seeds[0]} to {seeds[-1]}; {share}"
         write_tables(options.markdown, "level_seasons", title, [(HEADS, rows)])
 
 
