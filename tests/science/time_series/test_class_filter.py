@@ -60,6 +60,36 @@ def test_errors_of_the_rate_of_a_day_are_those_of_simulated_surfaces():
     assert expected[0, 0] < 0.5 * shares.total[1, 1]  # of the rate at the end of the day
 
 
+def advanced(course_m, random_m=0.03):
+    """A class of cells that do the same (t,), after hourly scans; the day begins with the first."""
+    rng, ground = RNG(3), ClassFilter(SAMPLE_CELLS)
+    for index, level_m in enumerate(course_m):
+        change_m = level_m + random_m * rng.standard_normal(SAMPLE_CELLS)
+        random_m2 = np.full(SAMPLE_CELLS, random_m**2)
+        ground.advance(HOUR_D if index else 0.0, change_m, random_m2, 0.01 * random_m2)
+        if index == 0:
+            ground.begin_day()
+    return ground
+
+
+def test_weights_of_the_rate_of_a_day_have_the_smallest_variance():
+    ground = advanced(np.zeros(25))
+    filtered, difference, covariance = ground.shares.rate_variances(ground.shares.total)[[0, 1, 0], [0, 1, 1]]
+    filtered += ground.missing_rate[1]
+    weight = np.linspace(0, 1, 10_001)
+    variance = (1 - weight) ** 2 * filtered + weight**2 * difference + 2 * weight * (1 - weight) * covariance
+    assert ground.weight_of_difference == pytest.approx(weight[np.argmin(variance)], abs=1e-3)
+    assert 0 < ground.weight_of_difference < 1
+
+
+def test_what_a_class_gained_at_once_is_in_the_rate_of_the_day():
+    ground = advanced(np.where(np.arange(13) < 9, 0.0, 0.4))
+    assert ground.shares.elapsed_d == pytest.approx(0.5)
+    assert ground.missing_rate[0] == pytest.approx(0.4 / 0.5, rel=0.03)
+    ground.begin_day()
+    assert ground.missing_rate[0] == 0
+
+
 def season(kind, random_m, systematic_m, seed, *, lasting=False, cells=600, days=12):
     """True levels (t, n), true mean rates over the last day, and hourly observations with gaps."""
     rng = RNG(seed)
