@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from benchmarks import event_stations, events
+from benchmarks import event_stations, events, level_seasons
 from benchmarks.accuracy_measures import RECORD, SCALES, summarise
 from benchmarks.accuracy_rows import ROWS
 from benchmarks.accuracy_table import missed, write_markdown
@@ -239,9 +239,18 @@ def test_filter_of_levels_is_as_good_as_a_plain_one_and_keeps_steps():
         }
         for kind in ("quiet", "avalanche")
     )
-    assert quiet["station"] == pytest.approx(quiet["plain Kalman"], rel=0.15)
+    assert quiet["station"] < 1.1 * quiet["plain Kalman"]
     assert quiet["station"] < quiet["single scans"] / 3
-    assert avalanche["station"] < avalanche["plain Kalman"] / 3
+    assert avalanche["station"] < avalanche["plain Kalman"] / 2  # the first scan shows it to neither
+
+
+@pytest.mark.integration
+def test_a_season_of_melt_makes_a_row_of_the_table_of_levels():
+    kind, levels, rates, _, _ = level_seasons.row("melt", range(1, 2), 1.0)
+    z = [float(value) for value in f"{levels} / {rates}".split(" / ")]
+    assert kind == "melt"
+    assert len(z) == 6
+    assert 0.5 < min(z) < max(z) < 1.6  # one season
 
 
 @pytest.mark.integration

@@ -17,7 +17,7 @@ from station.quantities import Bools, Floats, Floats32, Reference
 from station.queries.blocks import BlockQueries, mean_covariances
 from station.science.time_series.cell_filter import CellFilter, Motion, ProcessNoise
 from station.science.time_series.class_filter import SAMPLE_CELLS, ClassFilter
-from station.science.time_series.filter_errors import filter_errors
+from station.science.time_series.filter_errors import day_rates, filter_errors
 
 Cells = NDArray[np.int32]  # indices in the flattened grid
 Array = np.ndarray[Any, Any]
@@ -85,10 +85,21 @@ class LevelFilter:
         """Take the epochs of the next day in order of time; `progress` is called after each."""
         self._seen[:] = 0
         self._epoch_count = len(epochs)
+        if not np.isnan(self._time_s):
+            self._begin_day()
         for epoch in epochs:
+            is_first = np.isnan(self._time_s)
             self._advance(epoch)
+            if is_first:
+                self._begin_day()
             progress()
         self._common_share = self._common_share_of(epochs)
+
+    def _begin_day(self) -> None:
+        """Let the day begin whose rates are given: with its first epoch, or the last of the day before."""
+        self._filter.begin_day()
+        for ground in self._classes:
+            ground.begin_day()
 
     def _advance(self, epoch: EpochRef) -> None:
         days = 0.0 if np.isnan(self._time_s) else (epoch.time_s - self._time_s) / DAY_S
@@ -114,7 +125,8 @@ class LevelFilter:
             yield slice(first, min(first + BLOCK_CELLS, len(self._cell)))
 
     def _part(self, block: slice) -> CellFilter:
-        return CellFilter(self._filter.cells[block], self._filter.outlier_m[block])
+        whole = self._filter
+        return CellFilter(whole.cells[block], whole.outlier_m[block], whole.begin_m[block])
 
     def _read(self, epoch: EpochRef) -> _Observations:
         rasters = [open_raster(epoch.path, name, epoch.index) for name in (CHANGE, RANDOM, TOTAL)]
@@ -164,25 +176,26 @@ class LevelFilter:
 
     def _columns(self, band: slice) -> dict[str, Floats]:
         part = self._part(band)
-        state, unseen_d = part.estimates(), part.unseen_d
+        state, moved_m, unseen_d = part.estimates(), part.moved_m, part.unseen_d
         random_m2, systematic_m2 = part.last_variances()
-        variances = np.full((4, len(unseen_d)), np.nan)
+        rate_m_d, variances = np.full(len(unseen_d), np.nan), np.full((4, len(unseen_d)), np.nan)
         for number in np.unique(self._class[band]).tolist():
-            inside = self._class[band] == number
+            inside, ground = self._class[band] == number, self._classes[number]
             errors = filter_errors(
                 state.take(inside),
+                moved_m[inside],
                 unseen_d[inside],
                 random_m2[inside],
                 systematic_m2[inside] * (1 - self._common_share),
-                self._classes[number],
+                ground,
             )
+            rate_m_d[inside] = day_rates(state.take(inside), moved_m[inside], ground)
             variances[:, inside] = list(vars(errors).values())
         variances[0] += self._reference_m2[band]
         variances[1] += self._common_share * systematic_m2
         sigmas = np.sqrt(variances)
-        missing_m_d = np.array([ground.missing_rate[0] for ground in self._classes])[self._class[band]]
         coverage = self._seen[band] / max(self._epoch_count, 1)
-        values = (state.level_m, *sigmas[:2], state.rate_m_d + missing_m_d, *sigmas[2:], coverage)
+        values = (state.level_m, *sigmas[:2], rate_m_d, *sigmas[2:], coverage)
         never = np.isnan(state.level_m)
         return {name: np.where(never, np.nan, v) for name, v in zip(LEVEL_NAMES, values, strict=True)}
 
@@ -203,7 +216,9 @@ class LevelFilter:
         """Continue from the state of the whole grid; cells outside the area are left out."""
         outlier_m = np.full(len(arrays["cells"]), np.nan, np.float32)
         outlier_m[arrays["outlier"]] = arrays["outlier_m"]
-        self._filter = CellFilter(arrays["cells"][self._position], outlier_m[self._position])
+        cells = arrays["cells"][self._position]
+        begin_m = cells["level_m"].copy()  # of the next day
+        self._filter = CellFilter(cells, outlier_m[self._position], begin_m)
         self._time_s, self._common_share = arrays["scalars"].tolist()
         for number, ground in enumerate(self._classes):
             ground.restore({name: arrays[f"{name}_{number}"] for name in ground.to_arrays()})

@@ -68,7 +68,7 @@ LEVEL_VARIABLES = (
 )
 LEVEL_NAMES = tuple(variable.name for variable in LEVEL_VARIABLES)
 RATE_COMMENTS = {
-    "day": "over the last day, with its snowfall, without steps such as avalanches",
+    "day": "mean since the end of the day before, with snowfall, without steps such as avalanches",
     "month": "mean since the end of the month before, steps included",
 }
 EPOCH_COUNT = Variable("epoch_count", ("time",), "f8", "number of epochs of the period", "1")

@@ -97,8 +97,9 @@ def shifted(state: LevelRate, motion: Motion) -> LevelRate:
     so far, as when snow begins to fall, the cell moves as the class. Source: equations.md, 6.12.
     """
     uncertain = state.rate_m2_d2 + motion.lag_m_d**2
+    typical_m_d = motion.mean_rate_m_d - motion.lag_m_d
     with np.errstate(invalid="ignore"):
-        share = (motion.mean_rate_m_d * state.rate_m_d + uncertain) / (motion.mean_rate_m_d**2 + uncertain)
+        share = (typical_m_d * state.rate_m_d + uncertain) / (typical_m_d**2 + uncertain)
     share = np.clip(share, 0.0, MAX_SHARE)
     return replace(
         state,
@@ -125,23 +126,58 @@ def update(state: LevelRate, change_m: Floats, variance_m2: Floats) -> LevelRate
     )
 
 
+def contradicts(
+    state: LevelRate, change_m: Floats, variance_m2: Floats, outlier_m: Floats
+) -> tuple[Bools, Bools]:
+    """Return where an observation contradicts the level, and where it confirms the outlier before as a step.
+
+    `outlier_m` is the observation before where that contradicted the level, else NaN.
+
+    Source: equations.md, 6.12.
+    """
+    innovation_m = change_m - state.level_m
+    with np.errstate(invalid="ignore"):
+        is_outlier = innovation_m**2 > STEP_SIGMAS**2 * (state.level_m2 + variance_m2)
+        is_step = is_outlier & ((change_m - outlier_m) ** 2 < CONFIRMED_SIGMAS**2 * 2 * variance_m2)
+        is_step &= np.sign(outlier_m - state.level_m) == np.sign(innovation_m)
+    return np.asarray(is_outlier), np.asarray(is_step)
+
+
+def step_estimate(state: LevelRate, change_m: Floats, variance_m2: Floats, outlier_m: Floats) -> LevelRate:
+    """Return level and rate after a step that two observations of like variance show."""
+    mean_m = (change_m + outlier_m) / 2
+    return replace(state, level_m=mean_m, level_m2=variance_m2 / 2, covariance_m2_d=np.zeros_like(mean_m))
+
+
 class CellFilter:
     """Level and rate of cells (n,), of which a scan observes some.
 
     `cells` is the state, 20 bytes per cell, with NaN levels where a cell was never seen. `outlier_m` is the
-    last observation of the cells where it contradicted the level, else NaN: only few cells have one. Both are
-    changed in place.
+    last observation of the cells where it contradicted the level, else NaN: only few cells have one.
+    `begin_m` is the level at the begin of the day, and the steps since; NaN in cells that were first seen
+    later. All are changed in place.
     """
 
-    def __init__(self, cells: NDArray[np.void], outlier_m: NDArray[np.float32]) -> None:
-        self.cells, self.outlier_m = cells, outlier_m
+    def __init__(
+        self, cells: NDArray[np.void], outlier_m: NDArray[np.float32], begin_m: NDArray[np.float32]
+    ) -> None:
+        self.cells, self.outlier_m, self.begin_m = cells, outlier_m, begin_m
 
     @classmethod
     def empty(cls, count: int) -> CellFilter:
         """Return the filter of cells that were never seen."""
         cells = np.zeros(count, CELL_DTYPE)
         cells["level_m"] = np.nan
-        return cls(cells, np.full(count, np.nan, np.float32))
+        return cls(cells, *np.full((2, count), np.nan, np.float32))
+
+    def begin_day(self) -> None:
+        """Let the day begin of which `moved_m` tells."""
+        self.begin_m[:] = self.cells["level_m"]
+
+    @property
+    def moved_m(self) -> Floats:
+        """How far each cell (n,) moved since the day began, without steps [m]; NaN if that is not known."""
+        return np.asarray(self.cells["level_m"].astype(np.float64) - self.begin_m)
 
     def estimates(self) -> LevelRate:
         """Return level and rate of the cells (n,)."""
@@ -186,22 +222,17 @@ class CellFilter:
         variance_m2 = random_m2 + systematic_m2
         observed = np.isfinite(change_m) & np.isfinite(variance_m2)
         is_first = observed & np.isnan(state.level_m)
-        innovation_m = change_m - state.level_m
-        with np.errstate(invalid="ignore"):
-            is_outlier = innovation_m**2 > STEP_SIGMAS**2 * (state.level_m2 + variance_m2)
-            is_step = is_outlier & ((change_m - self.outlier_m) ** 2 < CONFIRMED_SIGMAS**2 * 2 * variance_m2)
-            is_step &= np.sign(self.outlier_m - state.level_m) == np.sign(innovation_m)
-        mean_m = (change_m + self.outlier_m) / 2
+        before_m = self.outlier_m.astype(np.float64)
+        is_outlier, is_step = contradicts(state, change_m, variance_m2, before_m)
         usual = update(state, change_m, variance_m2)
-        stepped = replace(
-            state, level_m=mean_m, level_m2=variance_m2 / 2, covariance_m2_d=np.zeros_like(mean_m)
-        )
+        stepped = step_estimate(state, change_m, variance_m2, before_m)
         choices = (
             (observed & ~is_outlier, usual),
             (is_step, stepped),
             (is_first, first_estimate(change_m, variance_m2)),
         )
         self._store(state, choices)
+        self.begin_m[is_step] += (stepped.level_m - state.level_m)[is_step]
         unseen_min = self.cells["unseen_min"] + days * 1440
         self.cells["unseen_min"] = np.where(observed, 0, np.minimum(np.rint(unseen_min), MAX_UNSEEN_MIN))
         for name, last_m2 in (("random_sigma_m", random_m2), ("systematic_sigma_m", systematic_m2)):

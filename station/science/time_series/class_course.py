@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from itertools import product
 
 import numpy as np
 
@@ -17,17 +16,16 @@ from station.science.time_series.cell_filter import (
     STEP_SIGMAS,
     LevelRate,
     Motion,
-    ProcessNoise,
     first_estimate,
     predict,
     update,
 )
-from station.science.time_series.error_shares import ErrorShares
+from station.science.time_series.error_shares import LEVEL, ErrorShares
+from station.science.time_series.noise_candidates import NoiseCandidates
 
 LEVEL_NOISES_M2_D = (1e-9, 1e-6, 1e-5, 1e-4)
 STABLE_RATE_NOISES_M2_D3 = (1e-9, 1e-7)
 MOVING_RATE_NOISES_M2_D3 = (1e-6, 1e-5, 1e-4, 1e-3, 1e-2, 1e-1)  # the sun may let melt begin within hours
-MEMORY_D = 10.0  # after which the likelihood of a scan has lost 63 % of its weight
 LEAST_CELLS = 20  # of a class, for its course
 LEAST_SCANS, LEAST_SPAN_D = 6, 0.25  # within a day, for a daily wave
 MEDIAN_VARIANCE = np.pi / 2  # of the median over that of the mean, for normal errors
@@ -48,11 +46,9 @@ class ClassCourse:
     def __init__(self, *, stable: bool) -> None:
         self._has_wave = not stable
         rate_noises = STABLE_RATE_NOISES_M2_D3 if stable else MOVING_RATE_NOISES_M2_D3
-        self._candidates = np.array(list(product(LEVEL_NOISES_M2_D, rate_noises))).T
-        count = self._candidates.shape[1]
-        self._states = first_estimate(np.zeros(count), np.zeros(count))
-        self._likelihood = np.zeros(count)
-        self._best = LEVEL_NOISES_M2_D.index(1e-5) * len(rate_noises) + len(rate_noises) // 2
+        self._candidates = NoiseCandidates(LEVEL_NOISES_M2_D, rate_noises, len(rate_noises) // 2)
+        unknown = np.zeros(len(self._candidates))
+        self._states = first_estimate(unknown, unknown)
         self._day = np.zeros((2, 1))  # times [d] before now, and levels [m], of the last day and before it
         self.mean_rate_m_d = 0.0  # over the last day; 0 if there is no daily wave
         self._ahead_m = 0.0  # of the levels of its cells, most of which have followed it
@@ -62,8 +58,8 @@ class ClassCourse:
         """Return everything that the next scan is filtered with, by name."""
         return {
             "course_states": np.stack(list(vars(self._states).values())),
-            "course_likelihood": self._likelihood,
-            "course_best": np.array([self._best, self.mean_rate_m_d, self._ahead_m]),
+            "course_noise": self._candidates.to_array(),
+            "course_scalars": np.array([self.mean_rate_m_d, self._ahead_m]),
             "course_day": self._day,
             "course_shares": ErrorShares.to_array(self.shares),
         }
@@ -71,9 +67,8 @@ class ClassCourse:
     def restore(self, arrays: Mapping[str, Floats]) -> None:
         """Continue from what `to_arrays` returned."""
         self._states = LevelRate(*arrays["course_states"])
-        self._likelihood = arrays["course_likelihood"]
-        best, self.mean_rate_m_d, self._ahead_m = arrays["course_best"].tolist()
-        self._best = int(best)
+        self._candidates.restore(arrays["course_noise"])
+        self.mean_rate_m_d, self._ahead_m = arrays["course_scalars"].tolist()
         self._day = arrays["course_day"]
         self.shares = ErrorShares.from_array(arrays["course_shares"])
 
@@ -82,31 +77,33 @@ class ClassCourse:
 
         The variances are those of a cell in this scan. With too few cells the class goes on as before.
         """
-        noises = ProcessNoise(*self._candidates)
-        states = predict(self._states, days, noises)
-        noise = ProcessNoise(*self._candidates[:, self._best])
-        shares = None if self.shares is None else self.shares.moved(days, noise)
-        surge_m = common_error_m = 0.0
+        states = predict(self._states, days, self._candidates.all)
+        shares, surge_m, common_error_m = self.shares, 0.0, 0.0
         if len(moved_m) >= LEAST_CELLS:
             median_m2 = MEDIAN_VARIANCE * random_m2 / len(moved_m)
-            variance_m2 = np.full(len(self._likelihood), median_m2 + systematic_m2)
+            variance_m2 = np.full(len(self._candidates), median_m2 + systematic_m2)
             observed_m = np.full_like(variance_m2, np.median(moved_m) - self._ahead_m)
             innovation_m, expected_m2 = observed_m - states.level_m, states.level_m2 + variance_m2
-            is_first = shares is None
-            if is_first or innovation_m[self._best] ** 2 > STEP_SIGMAS**2 * expected_m2[self._best]:
-                surge_m = 0.0 if is_first else float(innovation_m[self._best])
+            if shares is not None:
+                self._candidates.learn(days, innovation_m[:, None], expected_m2[:, None])
+                shares = shares.moved(days, self._candidates.likeliest)
+            best = self._candidates.best
+            if shares is None or innovation_m[best] ** 2 > STEP_SIGMAS**2 * expected_m2[best]:
                 states = replace(
                     states, level_m=observed_m, level_m2=variance_m2, covariance_m2_d=0 * variance_m2
                 )
-                shares = ErrorShares.first(median_m2, systematic_m2)
+                if shares is None:
+                    shares = ErrorShares.first(median_m2, systematic_m2)
+                else:
+                    surge_m = float(innovation_m[best])
+                    shares = shares.replaced(median_m2, systematic_m2)
             else:
-                loss = np.minimum(innovation_m**2 / expected_m2, STEP_SIGMAS**2) + np.log(expected_m2)
-                self._likelihood = self._likelihood * np.exp(-days / MEMORY_D) - loss / 2
                 states = update(states, observed_m, variance_m2)
-                common_error_m = float(observed_m[0] - states.level_m[self._best])
-                assert shares is not None  # noqa: S101 - not the first scan
+                common_error_m = float(observed_m[0] - states.level_m[best])
                 shares = shares.updated(median_m2, systematic_m2)
-        went_m = float(states.level_m[self._best])
+        elif shares is not None:
+            shares = shares.moved(days, self._candidates.likeliest)
+        went_m = float(states.level_m[self._candidates.best])
         wave_m, mean_rate_m_d = self._remember(days, went_m, surge_m)
         before_m_d, rate_m_d = self.mean_rate_m_d, mean_rate_m_d
         motion = Motion(
@@ -117,9 +114,8 @@ class ClassCourse:
             common_error_m=common_error_m,
         )
         self._ahead_m += went_m
-        # the next scan is compared with the best candidate
         self._states = replace(states, level_m=states.level_m - went_m)
-        self._best, self.mean_rate_m_d, self.shares = int(np.argmax(self._likelihood)), rate_m_d, shares
+        self.mean_rate_m_d, self.shares = rate_m_d, shares
         return motion
 
     def follow(self, moved_m: Floats) -> None:
@@ -157,18 +153,33 @@ class ClassCourse:
         levels_m = np.concatenate([[np.interp(-span_d, -age_d, level_m)], level_m[inside]])
         return float(np.trapezoid(levels_m, time_d)) / span_d
 
-    def errors(self, index: int, systematic_m2: Floats) -> CourseErrors:
-        """Return the variances of the level (index 0) or the mean rate (1) of the class, at cells (n,) of it.
+    def begin_day(self) -> None:
+        """Let the day begin whose rates are given."""
+        if self.shares is not None:
+            self.shares = self.shares.begun()
+
+    def level_errors(self, systematic_m2: Floats) -> CourseErrors:
+        """Return the variances of the level of the class, at cells (n,) of it.
 
         `systematic_m2` is that of a scan at these cells.
         """
         if self.shares is None:
             return CourseErrors(0.0, 0.0, np.zeros_like(systematic_m2))
-        factor = 1.0
-        if index == 1 and self._has_wave:
-            index, factor = 0, 2.0  # the difference of the levels of two days
         process, random, systematic = (
-            factor * float(matrix[index, index])
+            float(matrix[LEVEL, LEVEL])
+            for matrix in (self.shares.process, self.shares.random, self.shares.systematic)
+        )
+        return CourseErrors(process, random, systematic * systematic_m2)
+
+    def rate_errors(self, systematic_m2: Floats) -> CourseErrors:
+        """Return the variances of the mean rate of the class since the day began, at cells (n,) of it.
+
+        It is the difference of two levels. On stable ground the rates of the cells do not follow the course.
+        """
+        if self.shares is None or not self._has_wave:
+            return CourseErrors(0.0, 0.0, np.zeros_like(systematic_m2))
+        process, random, systematic = (
+            float(self.shares.rate_variances(matrix)[1, 1])
             for matrix in (self.shares.process, self.shares.random, self.shares.systematic)
         )
         return CourseErrors(process, random, systematic * systematic_m2)

@@ -13,11 +13,16 @@ from station.science.time_series.cell_filter import ProcessNoise, first_estimate
 CORRELATION_D = REFRACTION_CORRELATION_S / 86_400
 
 
+LEVEL, RATE, BEGIN, MOVED = range(4)  # rows of the matrices
+
+
 @dataclass(frozen=True)
 class ErrorShares:
-    """Covariance matrices (2, 2) of level and rate [m, m/d] of a cell that every scan observes.
+    """Covariance matrices (4, 4) of errors in a cell that every scan observes.
 
-    `systematic` and `cross` (2,), its covariance with the present error, are for a systematic error of 1 m.
+    The rows are level [m], rate [m/d], the level at the begin of the day [m], and how much further than its
+    rate tells the surface moved since [m]. `systematic` and `cross` (4,), its covariance with the present
+    error, are for a systematic error of 1 m. `elapsed_d` is the time since the begin of the day.
     """
 
     total: Floats
@@ -25,15 +30,16 @@ class ErrorShares:
     process: Floats
     systematic: Floats
     cross: Floats
+    elapsed_d: float
 
     @classmethod
     def first(cls, random_m2: float, systematic_m2: float) -> ErrorShares:
-        """Return the matrices after the first scan."""
+        """Return the matrices after the first scan, with which the day begins."""
         first = first_estimate(np.zeros(1), np.full(1, random_m2 + systematic_m2))
-        unit = np.diag([1.0, 0.0])
-        rate = np.diag([0.0, first.rate_m2_d2[0]])
-        total = np.diag([first.level_m2[0], first.rate_m2_d2[0]])
-        return cls(total, unit * random_m2, rate, unit, np.array([1.0, 0.0]))
+        unit, rate = np.zeros((2, 4, 4))
+        unit[LEVEL, LEVEL], rate[RATE, RATE] = 1.0, first.rate_m2_d2[0]
+        total = first.level_m2[0] * unit + rate
+        return cls(total, random_m2 * unit, rate, unit, unit[LEVEL], 0.0).begun()
 
     @staticmethod
     def to_array(shares: ErrorShares | None) -> Floats:
@@ -46,21 +52,35 @@ class ErrorShares:
         """Return the matrices in an array of `to_array`."""
         if not len(values):
             return None
-        total, random, process, systematic = values[:16].reshape(4, 2, 2)
-        return cls(total, random, process, systematic, values[16:])
+        total, random, process, systematic = values[:64].reshape(4, 4, 4)
+        return cls(total, random, process, systematic, values[64:68], float(values[68]))
+
+    def begun(self) -> ErrorShares:
+        """Return the matrices at the begin of a day."""
+        begin = np.zeros((4, 4))
+        begin[LEVEL, LEVEL] = begin[RATE, RATE] = begin[BEGIN, LEVEL] = 1.0
+        total, random, process, systematic = (
+            begin @ matrix @ begin.T for matrix in (self.total, self.random, self.process, self.systematic)
+        )
+        return ErrorShares(total, random, process, systematic, begin @ self.cross, 0.0)
 
     def moved(self, days: float, noise: ProcessNoise) -> ErrorShares:
         """Return the matrices some days later, without an observation."""
-        step = np.array([[1.0, days], [0.0, 1.0]])
+        elapsed_d = self.elapsed_d + days
+        step = np.eye(4)
+        step[LEVEL, RATE] = days
         level, rate = float(noise.level_m2_d), float(noise.rate_m2_d3)
         wander = np.array([[level * days + rate * days**3 / 3, rate * days**2 / 2], [0, rate * days]])
         wander[1, 0] = wander[0, 1]
+        effect = np.array([[-1.0, 0.0], [0.0, -1.0], [0.0, 0.0], [1.0, -elapsed_d]])
+        wander = effect @ wander @ effect.T
         return ErrorShares(
             step @ self.total @ step.T + wander,
             step @ self.random @ step.T,
             step @ self.process @ step.T + wander,
             step @ self.systematic @ step.T,
             step @ self.cross * np.exp(-days / CORRELATION_D),
+            elapsed_d,
         )
 
     def updated(self, random_m2: float, systematic_m2: float) -> ErrorShares:
@@ -68,13 +88,40 @@ class ErrorShares:
 
         Source: equations.md, 6.12.
         """
-        gain = self.total[:, :1] / (self.total[0, 0] + random_m2 + systematic_m2)
-        kept = np.eye(2) - gain @ np.array([[1.0, 0.0]])
+        variance_m2 = random_m2 + systematic_m2
+        gain = np.zeros((4, 1))
+        gain[: RATE + 1, 0] = self.total[: RATE + 1, LEVEL] / (self.total[LEVEL, LEVEL] + variance_m2)
+        return self._corrected(gain, random_m2, systematic_m2)
+
+    def replaced(self, random_m2: float, systematic_m2: float) -> ErrorShares:
+        """Return the matrices after an observation that the level is set to."""
+        return self._corrected(np.eye(4)[:, :1], random_m2, systematic_m2)
+
+    def _corrected(self, gain: Floats, random_m2: float, systematic_m2: float) -> ErrorShares:
+        kept = np.eye(4)
+        kept[:, :1] -= gain
         shared = kept @ self.cross[:, None] @ gain.T
+        squared = gain @ gain.T
         return ErrorShares(
-            kept @ self.total,
-            kept @ self.random @ kept.T + gain @ gain.T * random_m2,
+            kept @ self.total @ kept.T + squared * (random_m2 + systematic_m2),
+            kept @ self.random @ kept.T + squared * random_m2,
             kept @ self.process @ kept.T,
-            kept @ self.systematic @ kept.T + shared + shared.T + gain @ gain.T,
+            kept @ self.systematic @ kept.T + shared + shared.T + squared,
             kept @ self.cross + gain[:, 0],
+            self.elapsed_d,
         )
+
+    def rate_variances(self, matrix: Floats) -> Floats:
+        """Return the covariance (2, 2) of the errors of two estimates of the mean rate of the day [m²/d²].
+
+        They are the filtered rate, and the difference of the levels over the time between them. The part of
+        their errors is that of a matrix of the shares.
+
+        Source: equations.md, 6.12.
+        """
+        weights = np.zeros((2, 4))
+        weights[0, RATE] = 1.0
+        if self.elapsed_d > 0:
+            weights[0, MOVED] = -1 / self.elapsed_d
+            weights[1, LEVEL], weights[1, BEGIN] = 1 / self.elapsed_d, -1 / self.elapsed_d
+        return np.asarray(weights @ matrix @ weights.T)

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from station.quantities import Bools, Floats
-from station.science.time_series.events import WIDESPREAD_SHARE, Region, distance_blocks, overlaps
+from station.science.time_series.events import BEFORE, WIDESPREAD_SHARE, Region, distance_blocks, overlaps
 
 REST_SCANS = 3  # an event that so many scans no longer show has come to rest
 GROWN = 1.2  # factor of the volume by which an event has grown
@@ -52,10 +52,15 @@ class Track:
         return is_edge and overlaps(self.blocks, blocks)
 
     def has_reached(self, other: Track, scan: int) -> bool:
-        """Return True if another event turns out to be part of this one, which spread over its ground."""
-        if not other.is_open(scan) or other.sign != self.sign:
+        """Return True if another event turns out to be part of this one, which spread over its ground.
+
+        A local loss may have come to rest, but not before the scans that this one was compared with.
+        """
+        if other.sign != self.sign:
             return False
-        return self.front if other.widespread else self.spreads_to(other.blocks, other.depth_m)
+        if other.widespread:
+            return self.front and other.is_open(scan)
+        return scan - other.last <= BEFORE and self.spreads_to(other.blocks, other.depth_m)
 
     def add(self, region: Region, scan: int, many: float) -> None:
         """Add a region; the event has grown if its volume is a fifth above the largest so far.

@@ -1,4 +1,4 @@
-"""Random and systematic errors of the filtered level and rate of cells."""
+"""Level and rate of a day, and the random and systematic errors of both."""
 
 from __future__ import annotations
 
@@ -6,9 +6,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from station.quantities import Floats
+from station.quantities import Bools, Floats
 from station.science.time_series.cell_filter import LevelRate
+from station.science.time_series.class_course import CourseErrors
 from station.science.time_series.class_filter import ClassFilter
+from station.science.time_series.error_shares import LEVEL, RATE
 
 TINY_M2 = 1e-12  # against division by zero
 OWN_PROCESS = 0.5  # share of what a cell does besides its class that the cells around it do not do
@@ -30,10 +32,39 @@ class FilterErrors:
     rate_systematic_m2_d2: Floats
 
 
+@dataclass(frozen=True)
+class _Parts:
+    """Variances of the errors of cells (n,): random ones, the process, and a systematic error of 1 m."""
+
+    random: Floats
+    process: Floats
+    systematic: Floats
+
+
+def day_rates(state: LevelRate, moved_m: Floats, ground: ClassFilter) -> Floats:
+    """Return the mean rate (n,) of cells of a class since the day began, without steps [m/d].
+
+    `moved_m` is how far the levels moved since, NaN where that is not known.
+
+    Source: equations.md, 6.12.
+    """
+    filtered_m_d = state.rate_m_d + ground.missing_rate[0]
+    if ground.shares is None or not ground.shares.elapsed_d:
+        return filtered_m_d
+    weight = _weights(moved_m, ground)
+    difference_m_d = np.nan_to_num(moved_m) / ground.shares.elapsed_d
+    return np.asarray(weight * difference_m_d + (1 - weight) * filtered_m_d)
+
+
 def filter_errors(
-    state: LevelRate, unseen_d: Floats, random_m2: Floats, systematic_m2: Floats, ground: ClassFilter
+    state: LevelRate,
+    moved_m: Floats,
+    unseen_d: Floats,
+    random_m2: Floats,
+    systematic_m2: Floats,
+    ground: ClassFilter,
 ) -> FilterErrors:
-    """Return the errors of the estimates of cells (n,) of a class, last seen some days ago.
+    """Return the errors of levels and day rates of cells (n,) of a class, last seen some days ago.
 
     `random_m2` and `systematic_m2` are the variances of the last observation. A cell that is as certain as
     the class has the shares of the class. One that was first seen lately, or stepped, has those of a single
@@ -41,49 +72,82 @@ def filter_errors(
 
     Source: equations.md, 6.12.
     """
-    shares = ground.shares
+    shares, course = ground.shares, ground.course
     if shares is None:  # no cell of the class was seen yet
         unknown = np.full_like(unseen_d, np.nan)
         return FilterErrors(unknown, unknown, unknown, unknown)
-    random, systematic = (_moved(matrix, unseen_d) for matrix in (shares.random, shares.systematic))
+    weight, is_seen = _weights(moved_m, ground), unseen_d == 0
     single = random_m2 / np.maximum(random_m2 + systematic_m2, TINY_M2)
-    is_seen = unseen_d == 0
-    parts: list[Floats] = []
-    one, zero = np.ones_like(single), np.zeros_like(single)
-    for index, (variance, first_random, first_process, first_shared) in enumerate(
-        ((state.level_m2, single, zero, one), (state.rate_m2_d2, zero, one, zero))
-    ):
-        total = shares.total[index, index]
-        settled = np.minimum(total / np.maximum(variance, TINY_M2), 1.0)
+    kinds = shares.total, shares.random, shares.process, shares.systematic
 
-        def share(part: float, first: Floats, settled: Floats = settled) -> Floats:
-            return np.asarray(settled * part + (1 - settled) * first)
+    level_m2, *levels = (np.full_like(single, matrix[LEVEL, LEVEL]) for matrix in kinds)
+    first = _Parts(single, np.zeros_like(single), np.ones_like(single))
+    seen = _seen(state.level_m2, level_m2, _Parts(*levels), first, ground)
+    later = _unseen(state.level_m2, _moved(shares.random, unseen_d), _moved(shares.systematic, unseen_d))
+    level = _chosen(is_seen, seen, later)
 
-        process = 0.0 if ground.is_stable else shares.process[index, index] / total
-        random_part = np.where(
-            is_seen,
-            share(shares.random[index, index] / total, first_random) * variance,
-            np.minimum(random[index], variance),
-        )
-        process_part = np.where(is_seen, share(process, first_process) * variance, variance - random_part)
-        process_part += ground.missing_rate[1] * index  # of the rate
-        shared = np.where(is_seen, share(shares.systematic[index, index], first_shared), systematic[index])
-        course = ground.course.errors(index, systematic_m2)
-        course_process = 0.0 if ground.is_stable else course.process
-        parts += [
-            random_part + OWN_PROCESS * process_part,
-            np.maximum.reduce(
-                [
-                    (1 - OWN_PROCESS) * process_part + course_process,
-                    shared * systematic_m2,
-                    course.systematic,
-                ]
-            )
-            + course.random,
-        ]
-    return FilterErrors(*parts)
+    rate_m2_d2, *rates = (_combined(shares.rate_variances(matrix), weight) for matrix in kinds)
+    settled_m2_d2 = shares.total[RATE, RATE]
+    uncertainty = weight * state.level_m2 / level_m2 + (1 - weight) * state.rate_m2_d2 / settled_m2_d2
+    variance_m2_d2 = rate_m2_d2 * uncertainty
+    first = _Parts(weight * single, 1 - weight, weight)
+    seen = _seen(variance_m2_d2, rate_m2_d2, _Parts(*rates), first, ground)
+    rate = _chosen(is_seen, seen, _unseen(variance_m2_d2, rates[0], rates[2]))
+    missing_m2_d2 = (1 - weight) ** 2 * ground.missing_rate[1]
+    rate = _Parts(rate.random, rate.process + missing_m2_d2, rate.systematic)
+    return FilterErrors(
+        *_random_and_systematic(level, course.level_errors(systematic_m2), systematic_m2, ground),
+        *_random_and_systematic(rate, course.rate_errors(systematic_m2), systematic_m2, ground),
+    )
 
 
-def _moved(matrix: Floats, days: Floats) -> tuple[Floats, Floats]:
-    """Return the variances of level and rate some days (n,) after an error covariance (2, 2)."""
-    return matrix[0, 0] + days * (2 * matrix[0, 1] + days * matrix[1, 1]), matrix[1, 1] + 0 * days
+def _weights(moved_m: Floats, ground: ClassFilter) -> Floats:
+    return np.where(np.isfinite(moved_m), ground.weight_of_difference, 0.0)
+
+
+def _combined(variances: Floats, weight: Floats) -> Floats:
+    """Return the variance (n,) of a weighted mean of two estimates with a covariance (2, 2)."""
+    (filtered, covariance), (_, difference) = variances
+    return np.asarray(
+        (1 - weight) ** 2 * filtered + weight**2 * difference + 2 * weight * (1 - weight) * covariance
+    )
+
+
+def _seen(variance: Floats, total: Floats, of_class: _Parts, first: _Parts, ground: ClassFilter) -> _Parts:
+    """Return the parts of a variance (n,) as in the class; what exceeds its total as in a first scan."""
+    settled = np.minimum(total / np.maximum(variance, TINY_M2), 1.0)
+    process = np.zeros_like(total) if ground.is_stable else of_class.process
+    return _Parts(
+        (settled * of_class.random / total + (1 - settled) * first.random) * variance,
+        (settled * process / total + (1 - settled) * first.process) * variance,
+        settled * of_class.systematic + (1 - settled) * first.systematic,
+    )
+
+
+def _unseen(variance: Floats, random: Floats, systematic: Floats) -> _Parts:
+    """Return the parts of a variance (n,) in cells that the last scan did not see."""
+    random = np.minimum(random, variance)
+    return _Parts(random, variance - random, systematic)
+
+
+def _chosen(is_seen: Bools, seen: _Parts, unseen: _Parts) -> _Parts:
+    pairs = zip(vars(seen).values(), vars(unseen).values(), strict=True)
+    return _Parts(*(np.where(is_seen, *pair) for pair in pairs))
+
+
+def _random_and_systematic(
+    parts: _Parts, course: CourseErrors, systematic_m2: Floats, ground: ClassFilter
+) -> tuple[Floats, Floats]:
+    """Return the variances of random and of systematic errors of cells (n,)."""
+    shared = (
+        (1 - OWN_PROCESS) * parts.process + (0.0 if ground.is_stable else course.process),
+        parts.systematic * systematic_m2,
+        course.systematic,
+    )
+    return parts.random + OWN_PROCESS * parts.process, np.maximum.reduce(shared) + course.random
+
+
+def _moved(matrix: Floats, days: Floats) -> Floats:
+    """Return the variance of the level some days (n,) after the error covariance of level and rate."""
+    covariance, rate = matrix[LEVEL, RATE], matrix[RATE, RATE]
+    return np.asarray(matrix[LEVEL, LEVEL] + days * (2 * covariance + days * rate))

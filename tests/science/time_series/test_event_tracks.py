@@ -3,7 +3,7 @@
 import numpy as np
 
 from station.science.time_series.event_tracks import REST_SCANS, pair_tracks, track_events
-from station.science.time_series.events import Region
+from station.science.time_series.events import BEFORE, Region
 
 SHAPE = 40, 50
 OBSERVED = SHAPE[0] * SHAPE[1]
@@ -75,6 +75,16 @@ def test_local_loss_at_the_edge_of_widespread_loss_is_part_of_it_unless_it_is_de
     assert {(track.first, track.last, track.widespread) for track in tracks} == {(3, 5, True), (3, 4, False)}
     snow = region(slice(4, 36), slice(0, 50), widespread=True)
     assert len(track_events([(3, [region(slice(5, 8), slice(5, 9))]), (4, [snow])], OBSERVED)) == 2
+
+
+def test_local_loss_is_where_widespread_loss_began_if_that_was_compared_with_scans_before_it():
+    begin, melt = (
+        region(slice(5, 8), slice(5, 9), sign=-1, mean_m=0.1),
+        region(slice(4, 36), slice(0, 50), sign=-1, widespread=True),
+    )
+    (track,) = track_events([(3, [begin]), (3 + BEFORE, [melt])], OBSERVED)
+    assert (track.first, track.last) == (3, 3 + BEFORE)
+    assert len(track_events([(3, [begin]), (4 + BEFORE, [melt])], OBSERVED)) == 2
 
 
 def test_a_deposit_is_paired_with_the_nearest_scar_above():
