@@ -141,6 +141,7 @@ def write_site(folder: Path, scenario: Scenario, grid: Grid) -> None:
         east=grid.west_m + grid.nx * grid.cell_m,
         north=grid.north_m,
         cell=grid.cell_m,
+        brightness=('"decibel"' if scenario.brightness == "decibel" else '"auto"').ljust(23),
         model=f'"{SCANNER_MODELS[scenario.wavelength_nm]}"'.ljust(27),
         divergence=scenario.beam_divergence_mrad,
         range_sigma=max(scenario.range_noise_m, 0.001),
@@ -186,6 +187,7 @@ data = "data"                      # everything the station writes
 inbox = "inbox"                    # where scans and their logs arrive; never changed
 name = "%y%m%d_%H%M%S"             # start of the scan in UTC
 frame = "scanner"                  # points are in the scanner's own frame
+intensity = {brightness}# how a file tells brightness; decibels must be declared
 settle_s = 2                       # a file that has not grown for this long is complete
 expected_every_s = 3600
 

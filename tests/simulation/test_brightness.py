@@ -108,3 +108,10 @@ def test_air_is_that_of_the_wavelength():
         assert actual_ppm == pytest.approx(expected_ppm, abs=0.001)
     air = Station(replace(small(), wavelength_nm=1550)).conditions(0).air
     assert air.wavelength_um == 1.55
+
+
+@pytest.mark.parametrize(("brightness", "declared"), [("linear", "auto"), ("decibel", "decibel")])
+def test_the_site_file_declares_decibels(tmp_path, brightness, declared):
+    scenario = replace(small(hours=1), brightness=brightness)
+    files.write_site(tmp_path, scenario, grid_of(scenario))
+    assert tomllib.loads((tmp_path / "site.toml").read_text())["scans"]["intensity"] == declared
