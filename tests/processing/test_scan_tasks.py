@@ -482,7 +482,7 @@ def test_scan_without_brightness_is_degraded_and_uses_steep_ground_only(folder):
     assert np.nanmedian(np.degrees(np.arctan(rise[steep]))) > 50
     assert np.nanmedian(np.degrees(np.arctan(rise[stable & ~steep]))) < 50
 
-    no_intensity, _ = process(folder, ("[scans]", '[scans]\nintensity = "none"'))
+    no_intensity, _ = process(folder, ('intensity = "auto"', 'intensity = "none"'))
     assert no_intensity.reason == NO_BRIGHTNESS
 
 
@@ -495,7 +495,7 @@ def stable_ground(site, result):
 @pytest.mark.integration
 def test_brightness_in_decibels_is_recognised_as_such(folder):
     """The same scans with the intensity as PDAL writes reflectance, and the site file that says so."""
-    site = edited_site(folder, ("[scans]", '[scans]\nintensity = "decibel"'))
+    site = edited_site(folder, ('intensity = "auto"', 'intensity = "decibel"'))
     scans = sorted(site.scans.inbox.glob("*.laz"))
     for scan in scans:
         rewrite(scan, to_decibels)
