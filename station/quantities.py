@@ -360,7 +360,7 @@ class Reference:
     components: VarianceComponents  # of the station, estimated from its scans
     visibility: Floats32  # (ny, nx) share of its scans that observed the cell; NaN where unknown
     time_s: float = np.nan  # mean start of its scans, since 1970; NaN if unknown
-    sop_scans: int | None = None  # those of its scans whose tilt the SOP contains; None if that is of no scan
+    sop_scan_count: int | None = None  # of its scans that an SOP is from; None if tilt counts from none
 
     @classmethod
     def from_elevation(

@@ -191,8 +191,8 @@ def _write(
     create_file(file, series, title, None, parameters, _heights_m(reference))
     file.setncatts({"reference_version": reference.version, "scan_ids": " ".join(reference.scan_ids)})
     file.setncattr("mean_time", reference.time_s)
-    if reference.sop_scans is not None:
-        file.setncattr("sop_scan_count", reference.sop_scans)
+    if reference.sop_scan_count is not None:
+        file.setncattr("sop_scan_count", reference.sop_scan_count)
     file.setncatts({"base": provenance.base, "science_hash": provenance.science_hash})
     file.setncatts({"replaces": " ".join(provenance.replaces)})
     file.setncatts({"scan_provenance": json.dumps(provenance.scan_provenance)})
@@ -362,7 +362,7 @@ def _reference_from_file(file: h5py.File, path: Path, series: Series) -> Referen
         scan_ids=tuple(text_attribute(file, "scan_ids").split()),
         time_s=float(file.attrs["mean_time"].item()),
         components=_read_components(file),
-        sop_scans=int(file.attrs["sop_scan_count"].item()) if "sop_scan_count" in file.attrs else None,
+        sop_scan_count=int(file.attrs["sop_scan_count"].item()) if "sop_scan_count" in file.attrs else None,
         **rasters,
     )
 

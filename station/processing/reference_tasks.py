@@ -104,7 +104,7 @@ def _build_and_store(site: Site, scans: list[ScanFile], version: str, progress: 
     geometry = stacked[-1].inputs.geometry
     components = _estimate_components(surface.components, stacked)
     reference = centre_reference(surface, stack, geometry.position_m, components)
-    reference = replace(_with_mean_state(reference, stacked), sop_scans=_sop_scans(site, scans))
+    reference = replace(_with_mean_state(reference, stacked), sop_scan_count=_sop_scan_count(site, scans))
     scan_provenance = tuple(scan.provenance.to_attrs() for scan in stacked)
     write_reference(
         series_for(site),
@@ -221,7 +221,7 @@ def _with_mean_state(reference: Reference, stacked: list[_StackedScan]) -> Refer
     return replace(reference, shared=replace(shared, estimate=estimate))
 
 
-def _sop_scans(site: Site, scans: list[ScanFile]) -> int | None:
+def _sop_scan_count(site: Site, scans: list[ScanFile]) -> int | None:
     """Return how many scans an SOP was determined from; None if tilt does not count from that of a scan."""
     if site.inclination is None or site.inclination.mode == "absolute" or site.registration is not None:
         return None

@@ -142,13 +142,13 @@ def test_the_reference_reads_back_and_its_older_versions_remain(series):
             scan_ids=("a", "b"),
             components=VarianceComponents(tilt_rad=0.0002),
             visibility=visibility,
-            sop_scans=1,
+            sop_scan_count=1,
         )
         reference_files.write_reference(series, reference)
     actual = reference_files.read_reference(series)
     assert actual.version == "2"
     assert actual.scan_ids == ("a", "b")
-    assert actual.sop_scans == 1
+    assert actual.sop_scan_count == 1
     assert np.array_equal(actual.elevation_m, elevation, equal_nan=True)
     assert actual.random_variance_m2 == pytest.approx(variance, rel=0.01, nan_ok=True)
     assert actual.shared.covariance[0, 0] == 3e-11

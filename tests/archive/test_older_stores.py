@@ -90,5 +90,5 @@ def test_a_reference_of_an_older_version_keeps_its_refraction_over_ice(series):
     read = reference_files.read_reference(series, "1")
     assert read.components.refraction_ice == pytest.approx(0.017)
     assert read.shared.names == reference.shared.names
-    assert read.sop_scans is None  # older versions do not say it
+    assert read.sop_scan_count is None  # older versions do not say it
     assert reference_files.read_variance_components(series) == read.components

@@ -4,7 +4,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from station.processing.reference_tasks import _sop_scans
+from station.processing.reference_tasks import _sop_scan_count
 
 SCANS = [SimpleNamespace(name=f"a/250715_0{hour}0000.laz") for hour in range(3)]
 
@@ -25,4 +25,4 @@ def test_scans_of_the_sop_are_counted_where_tilt_counts_from_one(mode, named, ex
         registration=None,
         sop=[SimpleNamespace(scan=scan) for scan in named],
     )
-    assert _sop_scans(site, SCANS) == expected
+    assert _sop_scan_count(site, SCANS) == expected

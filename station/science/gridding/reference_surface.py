@@ -86,9 +86,9 @@ def errors_on_map(reference: Reference) -> SharedParameters | None:
     scan, and of its inclination log, in common. Change does not: they cancel. Source: equations.md, 6.20.
     """
     shared, count = reference.shared, len(reference.scan_ids)
-    if shared is None or reference.sop_scans is None or not count:
+    if shared is None or reference.sop_scan_count is None or not count:
         return shared
-    others = count - reference.sop_scans
+    others = count - reference.sop_scan_count
     ratio, factors = others * (others + 1) / count, np.ones(len(shared.names))
     factors[[name.startswith(LOG_PARAMETERS) for name in shared.names]] = max(ratio, 1.0)
     factors[[name.startswith(MOTION_PARAMETERS) for name in shared.names]] = max(ratio / 2, 1.0)

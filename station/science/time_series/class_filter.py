@@ -53,7 +53,7 @@ class ClassFilter:
         self._outlier_m = empty
         self._used = self._candidates.best
         self.course = ClassCourse(stable=stable)
-        self._surges = np.zeros(3)  # of the day: sum of heights, and of the scatter of the cells [m, m, m²]
+        self._surges = np.zeros(3)  # of the day: gained at once [m], scatter [m], its square [m²]
         self.shares: ErrorShares | None = None  # None before the first scan with a cell of the sample
 
     def to_arrays(self) -> dict[str, Floats]:

@@ -11,8 +11,6 @@ from station.science.gridding.reference_surface import REFRACTION_CORRELATION_S
 from station.science.time_series.cell_filter import ProcessNoise, first_estimate
 
 CORRELATION_D = REFRACTION_CORRELATION_S / 86_400
-
-
 LEVEL, RATE, BEGIN, MOVED = range(4)  # rows of the matrices
 
 

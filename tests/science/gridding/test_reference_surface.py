@@ -124,20 +124,20 @@ def test_refraction_of_consecutive_scans_is_correlated():
     assert hourly.time_s == 3.5 * 3600
 
 
-@pytest.mark.parametrize("sop_scans", [0, 1])
-def test_scans_share_the_errors_of_the_scan_that_the_sop_is_from(sop_scans):
+@pytest.mark.parametrize("sop_scan_count", [0, 1])
+def test_scans_share_the_errors_of_the_scan_that_the_sop_is_from(sop_scan_count):
     """20,000 references of eight scans, whose log is off by its own bias less that of the scan of the SOP."""
     rng, count = np.random.default_rng(5), 8
-    bias = rng.normal(0.0, 1.0, (20_000, count + 1 - sop_scans))
+    bias = rng.normal(0.0, 1.0, (20_000, count + 1 - sop_scan_count))
     errors = bias[:, bias.shape[1] - count :] - bias[:, :1]
     names = ("tilt_east", "heading", "range_bias")
     shared = SharedParameters(names, ("rad", "rad", "m"), np.zeros(3), np.eye(3) / count, np.zeros(3))
     reference = replace(
         Reference.from_elevation(GRID, "1", np.zeros(GRID.shape)),
-        shared=shared, scan_ids=tuple("abcdefgh"), sop_scans=sop_scans,
+        shared=shared, scan_ids=tuple("abcdefgh"), sop_scan_count=sop_scan_count,
     )  # fmt: skip
     variance = np.diag(errors_on_map(reference).covariance)
     assert variance[0] == pytest.approx(errors.mean(axis=1).var(), rel=0.03)
     assert variance[1] == pytest.approx(errors.mean(axis=1).var() / errors[:, -1].var(), rel=0.03)
     assert variance[2] == 1 / count
-    assert errors_on_map(replace(reference, sop_scans=None)) is shared
+    assert errors_on_map(replace(reference, sop_scan_count=None)) is shared

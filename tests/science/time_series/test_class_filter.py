@@ -162,9 +162,8 @@ def calibration(kind, random_m, systematic_m, **options):
 def test_sigma_of_level_and_rate_and_error_of_twelve_hours(kind):
     levels, rates, change = calibration(kind, 0.03, 0.003)
     assert 0.8 < levels < 1.25
-    assert (
-        0.6 < rates < 1.25
-    )  # cells move at a rate that is constant but for their class: better than it says
+    # Cells move at a rate that is constant but for their class: rates are better than their sigma says.
+    assert 0.6 < rates < 1.25
     assert change < 1 / 3
 
 
