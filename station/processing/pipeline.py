@@ -33,6 +33,7 @@ from station.science.adjustment.patches import (
     distance_along_line,
     line_length,
 )
+from station.science.analysis import verdict
 from station.science.geometry.pose import ScannerToMap, TimedRotation, timed_rotation
 from station.science.geometry.robust_statistics import nmad
 from station.science.gridding.cell_estimates import CellEstimator, estimate_cells
@@ -183,20 +184,26 @@ def usual_motion(reference: Reference, time_s: float) -> VarianceComponents:
 def snow_test(gridder: Gridder, scan_geometry: ScanGeometry, viewing: ViewingGeometry) -> SnowTest:
     """Return the test of a gridded scan for snow on stable ground."""
     intensity, reference = _stable_intensity(gridder, viewing, CellClass.STEEP)
-    return ground_classes.snow_test(intensity, reference, scan_geometry.scanner.wavelength_um)
+    _, stable_reference = _stable_intensity(gridder, viewing)
+    wavelength_um = scan_geometry.scanner.wavelength_um
+    return ground_classes.snow_test(intensity, reference, stable_reference, wavelength_um)
 
 
-def has_brightness(gridder: Gridder, viewing: ViewingGeometry | None) -> bool:
-    """Return True if brightness can tell whether snow lies on stable ground.
+def no_brightness(gridder: Gridder, scan_geometry: ScanGeometry, viewing: ViewingGeometry | None) -> str:
+    """Return why brightness cannot tell whether snow lies on stable ground; empty if it can.
 
-    For that it must be known, in scan and reference, for most of the stable cells that the scan observed.
+    For that it must be known, in scan and reference, for most of the stable cells that the scan observed, and
+    be on a scale that tells snow from rock.
     """
-    if viewing is None:
-        return gridder.has_intensity
-    intensity, reference = _stable_intensity(gridder, viewing)
-    if not len(intensity):
-        return gridder.has_intensity
-    return bool(np.mean(np.isfinite(intensity) & np.isfinite(reference)) > MIN_BRIGHTNESS_SHARE)
+    known = np.zeros(0, bool)
+    if viewing is not None:
+        intensity, reference = _stable_intensity(gridder, viewing)
+        known = np.isfinite(intensity) & np.isfinite(reference)
+    if not (known.mean() > MIN_BRIGHTNESS_SHARE if len(known) else gridder.has_intensity):
+        return verdict.NO_BRIGHTNESS
+    if viewing is None or np.isfinite(snow_test(gridder, scan_geometry, viewing).gain):
+        return ""
+    return verdict.BRIGHT_GROUND
 
 
 def _stable_intensity(

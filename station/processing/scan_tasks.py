@@ -22,7 +22,7 @@ from station.inbox.journal_reader import JournalReader
 from station.inbox.listing import ScanFile
 from station.processing.epoch_recorder import EpochRecorder
 from station.processing.epoch_scalars import air_key, log_metrics, scalar_variables
-from station.processing.pipeline import has_brightness, holdout_statistics, measure, usual_motion
+from station.processing.pipeline import holdout_statistics, measure, no_brightness, usual_motion
 from station.processing.scans.adjusted_scan import grid_and_adjust, is_usable, load_viewing_geometry
 from station.processing.scans.epoch_inputs import load_scan_inputs
 from station.processing.scans.open_scans import open_scan_for
@@ -215,7 +215,7 @@ def _compute_epoch(
         scan_on_grid = grid_and_adjust(site, opened, inputs, viewing, progress)
         inputs, viewing, gridder = scan_on_grid.inputs, scan_on_grid.viewing, scan_on_grid.gridder
         point_counts, adjustment = (opened.point_count, scan_on_grid.point_count), scan_on_grid.adjustment
-    brightness_known = not site.adjusts or has_brightness(gridder, viewing)
+    brightness_fault = no_brightness(gridder, inputs.geometry, viewing) if site.adjusts else ""
     flag = exclusion_reason(site, start.timestamp(), end.timestamp())
     attempt = adjustment[1] if adjustment else None
     registration, registration_warnings = registration_difference(site, scan, attempt)
@@ -252,7 +252,7 @@ def _compute_epoch(
         attempt,
         scalars.get("stable_z_std", 0.0) if adjustment else None,
         inputs.faults,
-        has_brightness=brightness_known,
+        no_brightness=brightness_fault,
         airborne_echo_share=gridder.airborne_echo_share,
         usual=components,
     )

@@ -492,16 +492,24 @@ def stable_ground(site, result):
         return (np.ma.filled(file["quality"][0], 0).astype(int) & Quality.STABLE_GROUND) > 0
 
 
+BRIGHT_GROUND = (
+    "no brightness: stable ground is too bright for a linear scale; if it is in decibels, set scans.intensity"
+)
+
+
 @pytest.mark.integration
-def test_brightness_in_decibels_is_recognised_as_such(folder):
-    """The same scans with the intensity as PDAL writes reflectance, and the site file that says so."""
-    site = edited_site(folder, ('intensity = "auto"', 'intensity = "decibel"'))
+@pytest.mark.parametrize(
+    ("declared", "expected"), [("decibel", ("good", "")), ("auto", ("degraded", BRIGHT_GROUND))]
+)
+def test_brightness_in_decibels_counts_only_if_it_is_declared(folder, declared, expected):
+    """The same scans with the intensity as PDAL writes reflectance; nothing in such a file says so."""
+    site = edited_site(folder, ('intensity = "auto"', f'intensity = "{declared}"'))
     scans = sorted(site.scans.inbox.glob("*.laz"))
     for scan in scans:
         rewrite(scan, to_decibels)
     reference_tasks.build_reference_version(site, [scan_file(site, scans[0])], "1", lambda: None)
     result, _ = process(folder)
-    assert (result.verdict, result.reason) == ("good", "")
+    assert (result.verdict, result.reason) == expected
 
 
 def to_decibels(las):

@@ -24,6 +24,7 @@ BRIGHT_SNOW_RATIOS = (0.5, 1.25)
 DARK_SNOW_RATIOS = (0.55, 1 / 0.55)
 MAX_GAIN_CHANGE = 0.15  # of the receiver, usually 5 % from scan to scan; beyond, the ground has changed
 MIN_GAIN_CELLS = 50
+MAX_GROUND_INTENSITY = 0.5  # of the scale; snow of twice that would not be on it
 # At 1064 nm ice and snow reflect 0.5 to 0.9 of the light, rock 0.2 to 0.3 (Deems et al., 2013; Warren, 1982).
 ICE_RATIO = 1.5  # of the brightness of ice or snow to that of rock, and of dark snow the inverse
 ICE_RANGE_M = 500.0  # rings within which brightness is compared: it may fall with the distance
@@ -65,7 +66,8 @@ def holds_no_snow(elevation_m: Floats, grid: Grid) -> Bools:
 class SnowTest:
     """Tells by brightness where snow has come or gone since the reference.
 
-    `gain` is the common factor of all intensities, between `ratios` of intensity nothing has changed.
+    `gain` is the common factor of all intensities, between `ratios` of intensity nothing has changed. The
+    gain is NaN if intensity does not tell snow from rock.
     """
 
     gain: float
@@ -74,27 +76,38 @@ class SnowTest:
     def changed(self, intensity: Floats32, reference: Floats32, steep: Bools) -> Bools:
         """Return True for cells (n,) where snow came or went, or, unless they are `steep`, may have.
 
-        Snow at 1064 nm makes a cell brighter, at 1550 nm darker. Where either intensity is NaN, only the
-        slope tells.
+        Snow at 1064 nm makes a cell brighter, at 1550 nm darker. Where either intensity is NaN, or the gain,
+        only the slope tells.
         """
         ratio = _ratio(intensity, reference) / np.float32(self.gain)
         lowest, highest = self.ratios
         return np.where(np.isfinite(ratio), (ratio < lowest) | (ratio > highest), ~steep)
 
 
-def snow_test(intensity: Floats32, reference: Floats32, wavelength_um: float) -> SnowTest:
+def snow_test(
+    intensity: Floats32, reference: Floats32, stable_reference: Floats32, wavelength_um: float
+) -> SnowTest:
     """Return the test of a scan, from the intensity of stable cells (n,) that are too steep to hold snow.
 
     Their median ratio is the gain, unless it is too large for one: then they have changed themselves. Flatter
     cells would not do, because the gain must not absorb the snow that lies on most of them.
 
+    Brightness that is above half of its scale without snow is not linear, but for example in decibels that
+    the site file does not declare, or of white walls: snow is hardly brighter. If too few cells are steep,
+    those of all stable ground tell, `stable_reference` (m,).
+
     The limits follow from the reflectance of snow by wavelength and grain size: Warren (1982), Deems et al.
     (2013).
     """
-    ratios = BRIGHT_SNOW_RATIOS if wavelength_um < DARK_SNOW_UM else DARK_SNOW_RATIOS
+    is_snow_bright = wavelength_um < DARK_SNOW_UM
+    ratios = BRIGHT_SNOW_RATIOS if is_snow_bright else DARK_SNOW_RATIOS
     ratio = _ratio(intensity, reference)
-    ratio = ratio[np.isfinite(ratio)]
-    gain = float(np.median(ratio)) if len(ratio) >= MIN_GAIN_CELLS else 1.0
+    known = np.isfinite(ratio)
+    is_gain_known = np.count_nonzero(known) >= MIN_GAIN_CELLS
+    bare = reference[known] if is_gain_known else stable_reference[np.isfinite(stable_reference)]
+    if is_snow_bright and len(bare) and np.median(bare) > MAX_GROUND_INTENSITY:
+        return SnowTest(np.nan, ratios)
+    gain = float(np.median(ratio[known])) if is_gain_known else 1.0
     return SnowTest(gain if abs(gain - 1) <= MAX_GAIN_CHANGE else 1.0, ratios)
 
 

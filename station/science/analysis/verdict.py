@@ -32,6 +32,9 @@ MIN_STABLE_CELLS = 20
 MAX_MISFIT_CELLS = 100_000  # larger sets are thinned for the misfit
 MAX_AIRBORNE_ECHO_SHARE = 0.00125  # of the points on the grid; more are not from a few particles in clear air
 NO_BRIGHTNESS = "no brightness: snow on stable ground cannot be recognised"
+BRIGHT_GROUND = (
+    "no brightness: stable ground is too bright for a linear scale; if it is in decibels, set scans.intensity"
+)
 
 
 @dataclass(frozen=True)
@@ -157,7 +160,7 @@ def assess(
     stable_z_std: float | None,
     faults: Sequence[str] = (),
     *,
-    has_brightness: bool = True,
+    no_brightness: str = "",
     airborne_echo_share: float = 0.0,
     usual: VarianceComponents | None = None,
 ) -> tuple[str, str]:
@@ -165,14 +168,14 @@ def assess(
 
     Unusable: flagged by a person, a fault of the inputs, no usable view, or a sigma that does not cover the
     error. Degraded: any other warning. `adjustment` is the adjustment of the scan even if it was not used in
-    the end; `stable_z_std` is given only if it was used. `faults` are those of the inputs. `has_brightness`
-    is False if the scan, or its reference, does not tell by brightness where snow lies; that degrades a scan
+    the end; `stable_z_std` is given only if it was used. `faults` are those of the inputs. `no_brightness` is
+    why the brightness of the scan, or of its reference, does not tell where snow lies; that degrades a scan
     only if its change is measured: first scans make the reference. `airborne_echo_share` is that of the
-    points on the grid that are echoes of the air. `usual` is the motion to expect of the
-    scanner since the reference; by default that of a scan soon after it.
+    points on the grid that are echoes of the air. `usual` is the motion to expect of the scanner since the
+    reference; by default that of a scan soon after it.
     """
     fatal = [*([f"flagged: {flag}"] if flag else []), *faults]
-    reasons = [*warnings, *([] if has_brightness or viewing is None else [NO_BRIGHTNESS])]
+    reasons = [*warnings, *([no_brightness] if no_brightness and viewing is not None else [])]
     if viewing is not None and airborne_echo_share > MAX_AIRBORNE_ECHO_SHARE:
         reasons.append(
             f"{airborne_echo_share:.2%} of the echoes are not from the ground: snow, rain or dust?"
@@ -188,5 +191,5 @@ def assess(
     elif viewing is not None and viewing.reference.shared is not None:
         fatal += stable_ground_misfit(measurement, viewing.select(CellClass.STABLE))
     verdict = "unusable" if fatal else "degraded" if reasons else "good"
-    remarks = [] if has_brightness or viewing is not None else [NO_BRIGHTNESS]
+    remarks = [no_brightness] if no_brightness and viewing is None else []
     return verdict, "; ".join([*fatal, *reasons, *remarks])

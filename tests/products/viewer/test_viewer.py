@@ -154,7 +154,7 @@ def test_values_under_the_pointer_are_those_of_the_store(tab, address, series, s
     # since an earlier scan: the difference, without the error of the reference
     slider = "document.getElementById('since')"
     tab.run(f"{slider}.value = 1; {slider}.dispatchEvent(new Event('input'))")
-    assert "left out of σ" in tab.run("document.getElementById('map-key').textContent")
+    tab.await_("document.getElementById('map-key').textContent.includes('left out of σ')")
     change, half = value_under_the_pointer(tab, east_m + 0.1, north_m)
     expected_m, bound_m = change_m[-1] - change_m[1], np.hypot(sigma_m[-1], sigma_m[1])
     pair_m = (bound_m**2 - 2 * REFERENCE_M**2) ** 0.5

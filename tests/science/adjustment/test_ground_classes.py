@@ -70,7 +70,7 @@ NEAR_INFRARED_UM, SHORT_WAVE_UM = 1.064, 1.55
 def changed(wavelength_um, now, then, *, gain=1.0, steep=FLAT):
     """Return whether ground of reflectance `then` counts as changed when it reflects `now`."""
     cells = np.full(100, 0.3, np.float32)
-    test = ground_classes.snow_test(np.float32(gain) * cells, cells, wavelength_um)
+    test = ground_classes.snow_test(np.float32(gain) * cells, cells, cells, wavelength_um)
     pair = (np.array([gain * now], np.float32), np.array([then], np.float32))
     return test.changed(*pair, steep).tolist() == [True]
 
@@ -115,13 +115,36 @@ def test_gain_is_the_common_factor_of_the_receiver_but_not_of_snow(snow_share, c
     snow = rng.random(2000) < snow_share
     now = then * common * rng.normal(1, 0.02, 2000) * np.where(snow, 2.5, 1.0)
     then[::7] = np.nan
-    test = ground_classes.snow_test(now.astype(np.float32), then, NEAR_INFRARED_UM)
+    test = ground_classes.snow_test(now.astype(np.float32), then, then, NEAR_INFRARED_UM)
     assert test.gain == pytest.approx(expected, abs=0.03)
 
 
 def test_a_few_cells_tell_no_gain():
     few = np.full(49, 0.3, np.float32)
-    assert ground_classes.snow_test(few * np.float32(1.1), few, NEAR_INFRARED_UM).gain == 1.0
+    assert ground_classes.snow_test(few * np.float32(1.1), few, few, NEAR_INFRARED_UM).gain == 1.0
+
+
+def decibel_field(reflectance):
+    """Return reflectances as `intensity` of -25 to 5 dB, read as if it were linear."""
+    return ((10 * np.log10(reflectance) + 25) / 30).astype(np.float32)
+
+
+@pytest.mark.parametrize("is_steep", [True, False])
+@pytest.mark.parametrize("snow_share", [0.0, 0.5, 1.0])
+def test_decibels_that_nobody_declared_do_not_tell_snow_from_rock(snow_share, is_steep):
+    rng = np.random.default_rng(4)
+    rock, snow = rng.uniform(0.15, 0.35, 2000), rng.random(2000) < snow_share
+    pair = np.where(snow, 0.85, rock), rock
+    known = slice(None) if is_steep else slice(0)
+
+    def tested(now, then):
+        return ground_classes.snow_test(now[known], then[known], then, NEAR_INFRARED_UM)
+
+    now, then = map(decibel_field, pair)
+    assert tested(now, then).changed(now, then, np.zeros(2000, bool)).all()
+    assert not tested(now, then).changed(now, then, np.ones(2000, bool)).any()
+    now, then = (values.astype(np.float32) for values in pair)
+    assert (tested(now, then).changed(now, then, np.zeros(2000, bool)) == snow).all()
 
 
 def test_noise_classes_start_at_zero_and_group_similar_range_and_slope():

@@ -177,10 +177,10 @@ def test_unusually_many_echoes_of_the_air_are_reported():
 
 def test_missing_brightness_degrades_the_verdict():
     result = measurement(0.0, 0.1, RANGE_M < 100, None)
-    actual = verdict.assess("", ("a",), result, None, None, None, has_brightness=False)
     no_brightness = "no brightness: snow on stable ground cannot be recognised"
+    actual = verdict.assess("", ("a",), result, None, None, None, no_brightness=no_brightness)
     assert actual == ("degraded", f"a; {no_brightness}")
-    first = verdict.assess("", (), result, None, None, None, has_brightness=False)
+    first = verdict.assess("", (), result, None, None, None, no_brightness=no_brightness)
     assert first == ("good", no_brightness)  # else a station without brightness would never get a reference
 
 
