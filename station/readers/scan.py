@@ -49,6 +49,7 @@ _RUST_OS_ERROR = re.compile(r"Os \{ code: (\d+)")  # how a panic prints the syst
 MAX_SCAN_S = 86_400.0
 TEXT = ".xyz"  # the suffix whose reader reads text
 TEXT_SUFFIXES = (".csv", ".txt", ".dat")  # of text too, but also of logs: scans only if scans.suffix says so
+RANGE_TOLERANCE = 0.01  # of the range: the last echoes have errors, and makers round
 MIN_TURN = 0.5  # of the head, net over total; more turning to and fro is no head that scans line by line
 MAX_CLOCK_DIFFERENCE_S = 900.0  # between name and GPS times of a scan; names are up to minutes early
 
@@ -192,7 +193,7 @@ def require_in_range(xyz_m: Floats, range_max_m: float | None) -> None:
     if range_max_m is None:
         return
     farthest_m = float(np.sqrt((xyz_m**2).sum(axis=0).max()))
-    if farthest_m > range_max_m:
+    if farthest_m > range_max_m * (1 + RANGE_TOLERANCE):
         raise ScanError(
             f"an echo {farthest_m:,.0f} m away, beyond scanner.range_max_m = {range_max_m:g}:"
             " corrupt, or not of the unit, frame or scanner that the site file states"
