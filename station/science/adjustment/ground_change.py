@@ -1,11 +1,11 @@
 """Change of the ground since the reference, as unknowns of the adjustment.
 
 Moving ground changes by trends over all of it (mean, east, north, distance, squared distance, height) and
-smoothly between knots. Bare ground that is not known to be stable has trends and knots of its own: melt ends
-at the edge of the ice, as the refraction of cold air does, and snow does not. Stable ground is not quite at
-rest: it heaves, as a whole and by blocks, and where moving ground rises it may be under thin snow. The sizes
-of trends and of the change between knots are not known. A model is one choice of them, and of whether bare
-ground has trends; an adjustment weighs all models by their likelihood.
+smoothly between knots. Nothing is presumed of the mean. Bare ground that is not known to be stable has trends
+and knots of its own: melt ends at the edge of the ice, as the refraction of cold air does, and snow does not.
+Stable ground is not quite at rest: it heaves, as a whole and by blocks, and where moving ground rises it may
+be under thin snow. The sizes of trends and of the change between knots are not known. A model is one choice
+of them, and of whether bare ground has trends; an adjustment weighs all models by their likelihood.
 Source: equations.md, 6.3; adjustment.md, 5.
 """
 
@@ -26,20 +26,19 @@ from station.science.uncertainty.parameters import GLOBAL, TILT_KNOT_RAD
 CHANGE_AZIMUTH_KNOTS = 4  # sight-tilt knots between two knots of the change
 CHANGE_RANGE_BINS = 3  # range bins between two knots of the change
 CHANGE_STEPS_M = tuple(float(step) for step in np.geomspace(0.5 / 2**11, 0.5, 12))
-TREND_SIZES_M = tuple(float(size) for size in np.geomspace(0.0005, 2.0, 8))
+TREND_SIZES_M = tuple(float(size) for size in np.geomspace(0.0003, 1.0, 8))
+MEAN_SIGMA_M = 2.0  # of the mean change: more than snow or melt between two scans
 TRENDS = 6
 KINDS = 2  # of moving ground: ice and snow, bare ground
 STABLE = KINDS  # kind of all other ground
 KIND_SPACING = 10_000  # of the azimuth knots of two kinds, so that they are not correlated
 MIN_SHARE = 1e-6  # of a kind of ground in a patch; less is rounding
-# Of a trend's size to that of the mean: melt from zero to twice the mean, or snow that falls everywhere.
-TREND_RATIOS = (0.6, 0.15)
 # Sigma of the change that neighbouring knots share, in sigmas of one knot: no, some or strong correlation.
 CORRELATED_CHANGE_RATIOS = (0.0, 3.0, 10.0)
 # Log prior odds against each. Smooth errors of the air look like correlated change too, but raise its log
 # likelihood by tens at most; a smooth snowfall raises it by hundreds.
 CORRELATION_LOG_PRIORS = (0.0, 12.0, 24.0)
-UNIFORM_LOG_PRIOR = 2.0  # against trends that are small against the mean
+RISING_ICE_LOG_PRIOR = 12.0  # against ice that rises while bare ground beside it does not: snow falls on both
 SMALL_TREND_LOG_PRIOR = 2.0  # against each factor e by which trends are smaller than the change between knots
 CORRELATION_AZIMUTH_KNOTS, CORRELATION_RANGE_KNOTS = 4.0, 2.5  # correlation lengths, in knots
 # Where moving ground rises, stable ground may be under snow too thin to change its intensity.
@@ -53,17 +52,15 @@ MIN_HEAVE_M = 1e-5
 
 
 class ChangeModel(NamedTuple):
-    """Indices into `CORRELATED_CHANGE_RATIOS`, `CHANGE_STEPS_M`, `TREND_SIZES_M` and `TREND_RATIOS`.
+    """Indices into `CORRELATED_CHANGE_RATIOS`, `CHANGE_STEPS_M` and `TREND_SIZES_M`.
 
-    `bare` is 1 if bare ground has trends of the same size as ice and snow, 0 if it has none. `uniform` is 1
-    if trends are small against the mean.
+    `bare` is 1 if bare ground has trends of the same size as ice and snow, 0 if it has none.
     """
 
     ratio: int
     step: int
     trend: int
     bare: int = 0
-    uniform: int = 0
 
     @property
     def step_m(self) -> float:
@@ -72,15 +69,14 @@ class ChangeModel(NamedTuple):
 
     @property
     def size_m(self) -> float:
-        """One sigma of the change of moving ground [m]."""
+        """One sigma of the change of moving ground about its mean [m]."""
         return float(np.hypot(self.step_m, TREND_SIZES_M[self.trend]))
 
     @property
     def log_prior(self) -> float:
-        """Logarithm of the prior odds: correlation, uniform change and small trends need evidence."""
+        """Logarithm of the prior odds: correlation and small trends need evidence."""
         below = max(float(np.log(self.step_m / TREND_SIZES_M[self.trend])), 0.0)
-        evidence = CORRELATION_LOG_PRIORS[self.ratio] + UNIFORM_LOG_PRIOR * self.uniform
-        return -evidence - SMALL_TREND_LOG_PRIOR * below
+        return -CORRELATION_LOG_PRIORS[self.ratio] - SMALL_TREND_LOG_PRIOR * below
 
     def with_ratio(self, ratio: int) -> ChangeModel:
         """Return the model of another correlation with about the same change between knots."""
@@ -89,7 +85,7 @@ class ChangeModel(NamedTuple):
 
     def neighbours(self, *, bare: bool, ratios: bool = False) -> list[ChangeModel]:
         """Return the models that differ by one index: step, trend, with `bare` and `ratios` also these."""
-        sizes = {"step": len(CHANGE_STEPS_M), "trend": len(TREND_SIZES_M), "uniform": len(TREND_RATIOS)}
+        sizes = {"step": len(CHANGE_STEPS_M), "trend": len(TREND_SIZES_M)}
         if bare:
             sizes["bare"] = 2
         if ratios:
@@ -109,7 +105,8 @@ START_MODEL = ChangeModel(0, len(CHANGE_STEPS_M) // 2, len(TREND_SIZES_M) // 2)
 class GroundChange:
     """Unknown change of patches (n,): trends, knots, depths of thin snow, heave, in this order.
 
-    Snow depths are free if `surface_rises`. A patch of moving ground is of the kind that has most of it.
+    `mean_m` is the estimated mean of moving ground; snow depths are free if it rises. A patch of moving
+    ground is of the kind that has most of it.
     """
 
     design: sparse.csr_array  # (n, k)
@@ -121,17 +118,26 @@ class GroundChange:
     snow_columns: int
     heave_columns: int
     heave_m: float
-    surface_rises: bool = True
+    mean_m: float = THIN_SNOW_M
 
     @property
     def moving(self) -> Bools:
         """Whether patches are moving ground (n,)."""
         return np.asarray(self.kind != STABLE)
 
+    def log_prior(self, model: ChangeModel) -> float:
+        """Return the logarithm of the prior odds of a model."""
+        is_ice_alone = self.bare_columns > 0 and not model.bare and self.mean_m > THIN_SNOW_M
+        return model.log_prior - RISING_ICE_LOG_PRIOR * is_ice_alone
+
+    def size_m(self, model: ChangeModel) -> float:
+        """Return one sigma of the change of moving ground, with its mean [m]."""
+        return float(np.hypot(model.size_m, self.mean_m))
+
     def precision_at(self, model: ChangeModel) -> tuple[Floats, float]:
         """Return the precision (k, k) of a model, and log |precision⁻¹|."""
-        snow_m = min(model.size_m, THIN_SNOW_M) if self.surface_rises else NO_CHANGE_M
-        trend_m = TREND_SIZES_M[model.trend] * np.array([1.0] + [TREND_RATIOS[model.uniform]] * (TRENDS - 1))
+        snow_m = min(self.size_m(model), THIN_SNOW_M) if self.mean_m > 0 else NO_CHANGE_M
+        trend_m = np.array([MEAN_SIGMA_M] + [TREND_SIZES_M[model.trend]] * (TRENDS - 1))
         bare_m = trend_m if model.bare else np.full(TRENDS, NO_CHANGE_M)
         knots, step_m = len(self.knot_precisions[model.ratio]), CHANGE_STEPS_M[model.step]
         first, last = self.trend_columns, self.trend_columns + knots
@@ -151,18 +157,18 @@ class GroundChange:
         return precision, float(log_determinant + 2 * np.log(sigma_m).sum())
 
     def updated(self, estimate_m: Floats, heave_variance_m2: Floats) -> GroundChange:
-        """Return this change with the size of heave that an estimate (k,) shows, and whether snow may lie.
+        """Return this change with the size of heave that an estimate (k,) shows, and the mean change.
 
         Its variance is the mean of estimate squared plus posterior variance (heave_columns,), shrunk towards
         the start value (expectation-maximisation).
         """
-        rises = float((self.design @ estimate_m)[self.moving].mean()) > 0 if self.moving.any() else False
+        mean_m = float((self.design @ estimate_m)[self.moving].mean()) if self.moving.any() else 0.0
         heave_m = HEAVE_M
         if self.heave_columns:
             second_moment_m2 = float(np.sum(estimate_m[-self.heave_columns :] ** 2 + heave_variance_m2))
             second_moment_m2 += PRIOR_HEAVE_BLOCKS * HEAVE_M**2
             heave_m = max(np.sqrt(second_moment_m2 / (PRIOR_HEAVE_BLOCKS + self.heave_columns)), MIN_HEAVE_M)
-        return replace(self, heave_m=heave_m, surface_rises=rises)
+        return replace(self, heave_m=heave_m, mean_m=mean_m)
 
     def polar_mean(self, patches: Patches, estimate_m: Floats) -> Floats:
         """Return the mean estimated change of moving ground by azimuth sector and range ring."""

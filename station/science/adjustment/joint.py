@@ -180,7 +180,7 @@ def adjust_scan(
         params,
         state,
         posterior,
-        mixture.size_m,
+        float(np.hypot(mixture.size_m, change.mean_m)),
         robust_weight[~moving],
         leverage_m2,
         _mean_sigma(patches, moving, posterior),

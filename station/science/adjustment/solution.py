@@ -34,7 +34,7 @@ class Mixture:
     """Mean of the unknowns (m,) over all models, and the normal matrix with the covariance of the mixture.
 
     `change_bias` (k, k) times the block of N⁻¹ between change and state is a factor of the part of the
-    state's covariance that comes from the change. `size_m` is the mean sigma of the change.
+    state's covariance that comes from the change. `size_m` is the mean sigma of the change about its mean.
     """
 
     estimate: Floats
@@ -60,12 +60,12 @@ class Solution:
         """Return the logarithm of a model's posterior odds, up to a constant."""
         if model not in self._log_odds:
             if not len(self._rhs):
-                return model.log_prior
+                return self._change.log_prior(model)
             cholesky, determinant = self._factor(model)
             change_m = linalg.cho_solve((cholesky, True), self._rhs, check_finite=False)
             half_log_determinant = (log_determinant(cholesky) + determinant) / 2
             self._log_odds[model] = float(self._rhs @ change_m / 2 - half_log_determinant)
-            self._log_odds[model] += model.log_prior
+            self._log_odds[model] += self._change.log_prior(model)
         return self._log_odds[model]
 
     def select(self, previous: ChangeModel | None) -> None:
