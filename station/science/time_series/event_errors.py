@@ -5,7 +5,6 @@ Source: equations.md, 6.11.
 
 from __future__ import annotations
 
-from dataclasses import replace
 from functools import cached_property
 from typing import TypeGuard
 
@@ -15,9 +14,11 @@ from scipy import ndimage, sparse
 from station.quantities import Bools, Floats, Ints, Reals, SharedParameters
 from station.science.analysis.calibration import SparseJacobian, group_means
 from station.science.geometry.robust_statistics import MEDIAN_ABSOLUTE_NORMAL
+from station.science.time_series.contrast_errors import ContrastErrors
 from station.science.time_series.events import BlockErrors
 from station.science.time_series.surroundings import SURROUNDING_TILES, TILE
-from station.science.uncertainty.jacobian import HeightJacobian
+from station.science.uncertainty.jacobian import HeightJacobian, line_tilt_variance
+from station.science.uncertainty.parameters import knot_interpolation
 
 LEAST_SQUARES = 30  # around a region, in any position, for their scatter
 
@@ -33,7 +34,7 @@ class SystematicErrors:
         self._jacobian, self._observed, self._rock = jacobian, observed, rock
 
     def of_scan(self, newest: SharedParameters | None, oldest: SharedParameters | None) -> BlockErrors:
-        """Return the variances of a scan less the newest, and less the oldest, of the scans before it."""
+        """Return the errors of a scan less the newest, and less the oldest, of the scans before it."""
         return BlockErrors(self.of_blocks(newest), self.against_surroundings(newest), self.of_blocks(oldest))
 
     def of_blocks(self, difference: SharedParameters | None) -> Floats:
@@ -42,22 +43,19 @@ class SystematicErrors:
             return np.zeros(self._observed.shape)
         return self._placed(self._jacobian.variance(difference))
 
-    def against_surroundings(self, difference: SharedParameters | None) -> Floats:
-        """Return the variance of each block (by, bx) less the mean of what surrounds it [m²].
-
-        With j the Jacobian of the block, g that of its surroundings: (j - g) C (j - g)ᵀ. The line tilts of
-        the surroundings average out.
-        """
+    def against_surroundings(self, difference: SharedParameters | None) -> ContrastErrors | Floats:
+        """Return the errors of the blocks less those of what surrounds them, or zeros (by, bx) [m²]."""
         if self._jacobian is None or not self._are_known(difference):
             return np.zeros(self._observed.shape)
-        design, around, group = self._surroundings
-        weighted = around @ difference.covariance
-        entries = design.data * weighted[group[design.row], design.col]
-        common_m2 = np.bincount(design.row, entries, len(group))
-        around_m2 = np.sum(weighted * around, axis=1)[group]
-        line_m2 = self._jacobian.variance(replace(difference, covariance=0 * difference.covariance))
-        own_m2 = self._jacobian.variance(difference)
-        return self._placed(np.maximum(own_m2 - 2 * common_m2 + around_m2, line_m2))
+        params = self._jacobian.params
+        return ContrastErrors(
+            self._observed,
+            *self._surroundings,
+            difference.covariance,
+            np.asarray(self._jacobian.sight_tilt, np.float64),
+            self._jacobian.line,
+            knot_interpolation(params).residual_projector ** 2 @ line_tilt_variance(params, difference),
+        )
 
     def of_sum(self, weights: Floats, difference: SharedParameters | None) -> float:
         """Return the variance of a weighted sum (by, bx) [m²]."""
@@ -79,7 +77,7 @@ class SystematicErrors:
         return placed
 
     @cached_property
-    def _surroundings(self) -> tuple[sparse.coo_array, Floats, Ints]:
+    def _surroundings(self) -> tuple[sparse.csr_array, Floats, Ints]:
         """Jacobian (n, p), its mean (g, p) over the surroundings of each tile and ground, and which is whose.
 
         The last (n,) has the row of the second for each block.
@@ -94,7 +92,7 @@ class SystematicErrors:
         apart = np.abs(tiles[1:, :, None] - tiles[1:, None, :]).max(axis=0)
         near = (apart <= SURROUNDING_TILES // 2) & (tiles[0][:, None] == tiles[0])
         shares = sparse.csr_array(near / near.sum(axis=1, keepdims=True))
-        return sparse.coo_array(design), np.asarray(shares @ (group_means(group) @ design).toarray()), group
+        return design, np.asarray(shares @ (group_means(group) @ design).toarray(), np.float64), group
 
 
 def like_regions_variance(members: Bools, usable: Bools, change_m: Floats, random_m2: Floats) -> float:

@@ -16,6 +16,7 @@ from scipy import ndimage
 from station.quantities import Bools, Floats
 from station.science.analysis.change_detection import threshold_sigmas
 from station.science.geometry.robust_statistics import MEDIAN_ABSOLUTE_NORMAL
+from station.science.time_series.contrast_errors import ContrastErrors
 from station.science.time_series.surroundings import NEIGHBOURS, TILE, nanmedian, surroundings, tiles_of
 from station.science.time_series.window_scores import (
     BlockChange,
@@ -52,10 +53,13 @@ class BlockLevels:
 
 @dataclass(frozen=True)
 class BlockErrors:
-    """Variances of the systematic errors of a scan against those before it (by, bx) [m²]."""
+    """Systematic errors of a scan against those before it: variances of blocks (by, bx) [m²].
+
+    Those of a block less what surrounds it may have a model, by which the blocks of the scan show them.
+    """
 
     systematic_m2: Floats
-    contrast_m2: Floats  # of a block less what surrounds it
+    contrast: Floats | ContrastErrors  # of a block less what surrounds it
     oldest_m2: Floats  # of a block, against the oldest scans instead
 
 
@@ -145,7 +149,7 @@ def _changes(
     """Return the change of the blocks of a scan, and their change less that of their surroundings.
 
     By how much the latter differs from block to block beyond the errors, as melt and drifts of snow do, is a
-    random error of the former.
+    random error of the former. The systematic errors that it shows are taken off.
     """
     change_m = levels.change_m - base.change_m
     random_m2 = levels.random_m2 + base.random_m2
@@ -153,10 +157,12 @@ def _changes(
     spread_m = surroundings(np.abs(excess_m), rock) / MEDIAN_ABSOLUTE_NORMAL
     usual_m2 = surroundings(np.where(np.isfinite(change_m), random_m2, np.nan), rock)
     patchy_m2 = np.nan_to_num(np.maximum(spread_m**2 - usual_m2, 0.0))
-    return (
-        BlockChange(change_m, random_m2 + PATCH_BLOCKS * patchy_m2, errors.systematic_m2),
-        BlockChange(excess_m, random_m2, errors.contrast_m2),
-    )
+    patched_m2 = random_m2 + PATCH_BLOCKS * patchy_m2
+    absolute = BlockChange(change_m, patched_m2, errors.systematic_m2)
+    if not isinstance(errors.contrast, ContrastErrors):
+        return absolute, BlockChange(excess_m, random_m2, errors.contrast)
+    error_m, contrast_m2 = errors.contrast.estimate(excess_m, patched_m2)
+    return absolute, BlockChange(excess_m - error_m, random_m2, contrast_m2)
 
 
 def _local_regions(

@@ -18,7 +18,7 @@ from station.archive.series.virtual import build_series
 from station.quantities import Grid, Quality, Reference
 from station.queries.blocks import BlockQueries
 from station.science.time_series.event_errors import SystematicErrors, like_regions_variance
-from station.science.time_series.surroundings import surrounding_weights
+from station.science.time_series.surroundings import surrounding_weights, surroundings
 
 GRID = Grid(west_m=632_000.0, north_m=5_186_000.0, cell_m=10.0, nx=57, ny=93)
 SHARED = random_shared(1, GRID)
@@ -54,6 +54,42 @@ def errors_of(blocks):
     return SystematicErrors(blocks.jacobian, blocks.observed, ROCK & blocks.observed)
 
 
+def stated_m2(blocks, shared):
+    """Variances of blocks less what surrounds them, where the blocks themselves tell nothing."""
+    contrast = errors_of(blocks).against_surroundings(shared)
+    change_m = np.where(blocks.observed, 0.0, np.nan)
+    error_m, variance_m2 = contrast.estimate(change_m, np.full(change_m.shape, 1e9))
+    assert not error_m.any()
+    return variance_m2
+
+
+def test_a_scan_shows_its_own_errors_and_what_is_left_has_its_sigma(blocks):
+    """Drawn errors of parameters and lines, noise of 5 mm, and a deposit, which is no error."""
+    rng = np.random.default_rng(4)
+    shared, jacobian, rock = blocks.shared, blocks.jacobian, ROCK & blocks.observed
+    contrast = errors_of(blocks).against_surroundings(shared)
+    stated_m = np.sqrt(stated_m2(blocks, shared)[blocks.observed])
+    root = np.linalg.cholesky(shared.covariance + 1e-18 * np.eye(len(shared.names)))
+    deposit_m = np.zeros(GRID.shape)
+    deposit_m[40:43, 30:33] = 0.5
+    z, left_m, kept_m = [], [], []
+    for _ in range(12):
+        tilt_rad = np.sqrt(contrast.line_rad2) * rng.normal(size=len(contrast.line_rad2))
+        drawn_m = jacobian.effect(root @ rng.normal(size=len(root)))
+        errors_m = np.full(GRID.shape, np.nan)
+        errors_m[blocks.observed] = drawn_m + contrast.line_effect * tilt_rad[contrast.line]
+        true_m = errors_m - surroundings(errors_m, rock)
+        noisy_m = true_m + 0.005 * rng.normal(size=GRID.shape) + deposit_m
+        estimate_m, variance_m2 = contrast.estimate(noisy_m, np.full(GRID.shape, 2.5e-5))
+        left = (true_m - estimate_m)[blocks.observed]
+        z.append(left / np.sqrt(variance_m2[blocks.observed]))
+        left_m.append(left)
+        kept_m.append(np.nanmean((noisy_m - estimate_m)[40:43, 30:33]))
+    assert 0.8 < np.sqrt(np.mean(np.square(z))) < 1.25
+    assert np.sqrt(np.mean(np.square(left_m))) < np.sqrt(np.mean(stated_m**2)) / 2
+    assert np.mean(kept_m) == pytest.approx(0.5, abs=0.05)
+
+
 def test_a_block_less_its_surroundings_has_the_variance_of_dense_algebra(blocks):
     jacobian, shared = blocks.jacobian, blocks.shared
     dense = np.stack([jacobian.effect(unit) for unit in np.eye(len(shared.names))], axis=1)
@@ -61,7 +97,7 @@ def test_a_block_less_its_surroundings_has_the_variance_of_dense_algebra(blocks)
     tile = np.stack([row, column], axis=1) // TILE
     rock = ROCK[column]
     no_lines = replace(shared, line_tilt_variance=0 * shared.line_tilt_variance)
-    actual_m2 = errors_of(blocks).against_surroundings(no_lines)[blocks.observed]
+    actual_m2 = stated_m2(blocks, no_lines)[blocks.observed]
     for block in range(0, len(row), 97):
         near = (np.abs(tile - tile[block]).max(axis=1) <= REACH) & (rock == rock[block])
         tiles = np.unique(tile[near], axis=0)
@@ -73,7 +109,7 @@ def test_a_block_less_its_surroundings_has_the_variance_of_dense_algebra(blocks)
 def test_a_block_keeps_the_tilt_of_its_own_line(blocks):
     lines = replace(blocks.shared, covariance=0 * blocks.shared.covariance)
     errors = errors_of(blocks)
-    assert np.array_equal(errors.against_surroundings(lines), errors.of_blocks(lines))
+    assert stated_m2(blocks, lines) == pytest.approx(errors.of_blocks(lines), rel=1e-5)
     assert errors.of_blocks(lines)[blocks.observed].min() > 0
     assert not errors.against_surroundings(None).any()
 
@@ -100,5 +136,8 @@ def test_patches_of_any_size_are_in_the_variance_of_a_region(patch_blocks):
 def test_a_scan_that_saw_nothing_has_no_errors(blocks):
     nothing = np.zeros_like(blocks.observed)
     errors = SystematicErrors(blocks.jacobian.take(slice(0)), nothing, nothing)
-    assert not errors.against_surroundings(blocks.shared).any()
+    unseen_m = np.full(nothing.shape, np.nan)
+    error_m, variance_m2 = errors.against_surroundings(blocks.shared).estimate(unseen_m, 0 * unseen_m)
+    assert not error_m.any()
+    assert not variance_m2.any()
     assert not errors.of_blocks(blocks.shared).any()
