@@ -1,11 +1,12 @@
 """Change of the ground since the reference, as unknowns of the adjustment.
 
 Moving ground changes by trends over all of it (mean, east, north, distance, squared distance, height) and
-smoothly between knots. Nothing is presumed of the mean. Bare ground that is not known to be stable has trends
-and knots of its own: melt ends at the edge of the ice, as the refraction of cold air does, and snow does not.
-Stable ground is not quite at rest: it heaves, as a whole and by blocks, and where moving ground rises it may
-be under thin snow. The sizes of trends and of the change between knots are not known. A model is one choice
-of them, and of whether bare ground has trends; an adjustment weighs all models by their likelihood.
+smoothly between knots. Bare ground that is not known to be stable has trends and knots of its own: melt ends
+at the edge of the ice, as the refraction of cold air does, and snow does not. Stable ground is not quite at
+rest: it heaves, as a whole and by blocks, and where moving ground rises it may be under thin snow. The sizes
+of trends and of the change between knots are not known. A model is one choice of them, of whether the mean is
+as large as the trends or free, and of whether bare ground has trends; an adjustment weighs all models by
+their likelihood.
 Source: equations.md, 6.3; adjustment.md, 5.
 """
 
@@ -27,7 +28,8 @@ CHANGE_AZIMUTH_KNOTS = 4  # sight-tilt knots between two knots of the change
 CHANGE_RANGE_BINS = 3  # range bins between two knots of the change
 CHANGE_STEPS_M = tuple(float(step) for step in np.geomspace(0.5 / 2**11, 0.5, 12))
 TREND_SIZES_M = tuple(float(size) for size in np.geomspace(0.0003, 1.0, 8))
-MEAN_SIGMA_M = 2.0  # of the mean change: more than snow or melt between two scans
+MEAN_RATIO = 1 / 0.6  # of the mean's size to that of a trend: melt from zero to twice the mean
+EVEN_SIGMA_M = 0.5  # of the mean of even change, which may exceed the trends by far
 TRENDS = 6
 KINDS = 2  # of moving ground: ice and snow, bare ground
 STABLE = KINDS  # kind of all other ground
@@ -38,6 +40,8 @@ CORRELATED_CHANGE_RATIOS = (0.0, 3.0, 10.0)
 # Log prior odds against each. Smooth errors of the air look like correlated change too, but raise its log
 # likelihood by tens at most; a smooth snowfall raises it by hundreds.
 CORRELATION_LOG_PRIORS = (0.0, 12.0, 24.0)
+# For even change, whose mean may be any of half a metre: as likely as one of 25 mm.
+EVEN_LOG_PRIOR = 3.0
 RISING_ICE_LOG_PRIOR = 12.0  # against ice that rises while bare ground beside it does not: snow falls on both
 SMALL_TREND_LOG_PRIOR = 2.0  # against each factor e by which trends are smaller than the change between knots
 CORRELATION_AZIMUTH_KNOTS, CORRELATION_RANGE_KNOTS = 4.0, 2.5  # correlation lengths, in knots
@@ -54,13 +58,15 @@ MIN_HEAVE_M = 1e-5
 class ChangeModel(NamedTuple):
     """Indices into `CORRELATED_CHANGE_RATIOS`, `CHANGE_STEPS_M` and `TREND_SIZES_M`.
 
-    `bare` is 1 if bare ground has trends of the same size as ice and snow, 0 if it has none.
+    `bare` is 1 if bare ground has trends of the same size as ice and snow, 0 if it has none. `even` is 1 if
+    the mean is free, 0 if it is as large as the trends.
     """
 
     ratio: int
     step: int
     trend: int
     bare: int = 0
+    even: int = 0
 
     @property
     def step_m(self) -> float:
@@ -76,7 +82,8 @@ class ChangeModel(NamedTuple):
     def log_prior(self) -> float:
         """Logarithm of the prior odds: correlation and small trends need evidence."""
         below = max(float(np.log(self.step_m / TREND_SIZES_M[self.trend])), 0.0)
-        return -CORRELATION_LOG_PRIORS[self.ratio] - SMALL_TREND_LOG_PRIOR * below
+        evidence = CORRELATION_LOG_PRIORS[self.ratio] + SMALL_TREND_LOG_PRIOR * below
+        return EVEN_LOG_PRIOR * self.even - evidence
 
     def with_ratio(self, ratio: int) -> ChangeModel:
         """Return the model of another correlation with about the same change between knots."""
@@ -85,7 +92,7 @@ class ChangeModel(NamedTuple):
 
     def neighbours(self, *, bare: bool, ratios: bool = False) -> list[ChangeModel]:
         """Return the models that differ by one index: step, trend, with `bare` and `ratios` also these."""
-        sizes = {"step": len(CHANGE_STEPS_M), "trend": len(TREND_SIZES_M)}
+        sizes = {"step": len(CHANGE_STEPS_M), "trend": len(TREND_SIZES_M), "even": 2}
         if bare:
             sizes["bare"] = 2
         if ratios:
@@ -137,7 +144,8 @@ class GroundChange:
     def precision_at(self, model: ChangeModel) -> tuple[Floats, float]:
         """Return the precision (k, k) of a model, and log |precision⁻¹|."""
         snow_m = min(self.size_m(model), THIN_SNOW_M) if self.mean_m > 0 else NO_CHANGE_M
-        trend_m = np.array([MEAN_SIGMA_M] + [TREND_SIZES_M[model.trend]] * (TRENDS - 1))
+        trend_m = np.full(TRENDS, TREND_SIZES_M[model.trend])
+        trend_m[0] = EVEN_SIGMA_M if model.even else MEAN_RATIO * trend_m[0]
         bare_m = trend_m if model.bare else np.full(TRENDS, NO_CHANGE_M)
         knots, step_m = len(self.knot_precisions[model.ratio]), CHANGE_STEPS_M[model.step]
         first, last = self.trend_columns, self.trend_columns + knots

@@ -152,9 +152,8 @@ def test_changing_ground_has_little_leverage():
         adjust_scan(make_patches(noise_m + change_m, ground_class), NO_TILT, PRIOR, None).leverage_m2
         for change_m in (0.0, snow_m)
     )
-    assert unchanged[1] < changed[1] < 8 * SIGMA_M**2  # stable ground has more where the rest has changed
-    # nothing is presumed of the mean of moving ground, so that its noise has none
-    assert min(unchanged[0], changed[0]) > 1000 * changed[1]
+    assert max(unchanged) < 8 * SIGMA_M**2  # the trends of moving ground absorb some
+    assert changed[0] > 10 * max(changed[1], SIGMA_M**2)
 
 
 def test_leverage_depends_on_ground_class_and_noise():
