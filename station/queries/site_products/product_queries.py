@@ -36,7 +36,12 @@ from station.quantities import Bools, Floats, Ints
 from station.queries.aggregates import Aggregates
 from station.queries.site_products.profile_lines import Line
 from station.queries.site_products.quantities_along_lines import contour, profile
-from station.queries.site_products.quantities_of_places import NEW_SNOW_H, CountedFrom, place_quantities
+from station.queries.site_products.quantities_of_places import (
+    NEW_SNOW_H,
+    CountedFrom,
+    deciding_cells,
+    place_quantities,
+)
 from station.queries.site_products.surface_scans import SurfaceScans
 from station.science.analysis.product_estimates import Estimate
 from station.sections.product import ProductSection, SurfaceTime
@@ -129,6 +134,8 @@ class ProductQueries(Aggregates):
         def compute(row: int) -> Row:
             if base and not surface:
                 cells = np.logical_or.reduce(list(product.places.values()))
+                if product.section.kind == "volume_budget":
+                    cells = deciding_cells(cells)
                 surface.append(SurfaceScans(self, base, cells))
             others = [None if index == NONE else self._epochs[index] for index in partners[row].tolist()]
             return self._compute(

@@ -203,6 +203,47 @@ def test_a_volume_budget_closes_and_has_the_covariance_of_its_classes(base, stor
     assert np.abs(closure.values[np.isfinite(closure.values)]).max() < 1e-6
 
 
+def test_cells_that_may_have_gained_or_lost_have_their_systematic_error_in_both(base, stored):
+    """Places of one cell amid changes of the size of their errors, by dense matrices.
+
+    The mean of the cells around decides, also of those outside the place. A quarter of the cells is certain.
+    """
+    height_m = stored.elevation.values[LAST].astype(float)
+    random_m2 = independent_m2(stored, LAST, reference_random_m2(base))
+    reference = random_parameters(7, 0.5)
+    wave_m = 0.2 * np.sin(np.arange(GRID.nx) / 3.0)
+    values_m = wave_m + np.random.default_rng(5).normal(0, 0.05, GRID.shape)
+    seen = np.isfinite(height_m)
+    places, expected = {}, []
+    for row, column in np.argwhere(seen)[::23]:
+        cell, window = np.zeros(GRID.shape, bool), np.zeros(GRID.shape, bool)
+        cell[row, column] = True
+        window[max(row - 2, 0) : row + 3, max(column - 2, 0) : column + 3] = True
+        around = window & seen & ~cell
+        value_m, own_m2 = values_m[row, column], random_m2[row, column]
+        total_m2 = dense_variance(stored, 1.0 * cell, LAST, random_m2=random_m2, reference=reference)
+        deciding_m, deciding_m2 = values_m[around].mean(), random_m2[around].sum() / around.sum() ** 2
+        if value_m**2 > 16 * own_m2:
+            deciding_m, deciding_m2 = value_m, own_m2
+        is_certain = deciding_m**2 > 1.959964**2 * (deciding_m2 + total_m2 - own_m2)
+        chosen, other = (own_m2, total_m2), (0.0, 0.0)
+        if not is_certain:
+            other = deciding_m2, deciding_m2 + total_m2 - own_m2
+        places[f"{row} {column}"] = cell
+        expected.append((value_m, is_certain, *((chosen, other) if deciding_m > 0 else (other, chosen))))
+    assert 0.15 < np.mean([is_certain for _, is_certain, *_ in expected]) < 0.85
+    budget, _ = computed(
+        base, places, kind="volume_budget", surface="before.tif", rasters={"surface": height_m - values_m}
+    )
+    for index, (value_m, _, *parts) in enumerate(expected):
+        place = budget.isel(place=index)
+        assert float(place.net_change[LAST]) == pytest.approx(100.0 * value_m, abs=0.1)
+        for name, (random, total) in zip(("deposition", "erosion"), parts, strict=True):
+            assert float(place[f"{name}_uncertainty"][LAST]) == pytest.approx(100 * total**0.5, rel=1e-3)
+            actual = float(place[f"{name}_random_uncertainty"][LAST])
+            assert actual == pytest.approx(100 * random**0.5, rel=1e-3)
+
+
 ENDS = [(GRID.x_m[4], GRID.y_m[ROW]), (GRID.x_m[34], GRID.y_m[ROW])]  # it climbs by a quarter
 
 
