@@ -7,7 +7,7 @@ from datetime import UTC, timedelta
 import numpy as np
 import pytest
 import xarray as xr
-from support.processed_station import REFERENCE, ProcessedStation, product_of, rms
+from support.processed_station import REFERENCE, ProcessedStation, crossing_m, product_of, rms
 
 from station.queries.site_products.profile_lines import sample_line
 from station.simulation.scenario import named
@@ -118,17 +118,6 @@ def lines_of(processed, ground_m):
         if seen[line.cells].mean() > 0.9:
             lines.append((ends, line, float(ground_m[row, column])))
     return lines
-
-
-def crossing_m(line, heights_m, level_m):
-    """Return where a true profile crosses a level, between two of its samples; NaN if it does not."""
-    above = heights_m > level_m
-    changes = np.flatnonzero(above[1:] != above[:-1])
-    if not len(changes):
-        return np.nan
-    first = changes[0]
-    share = (level_m - heights_m[first]) / (heights_m[first + 1] - heights_m[first])
-    return line.distance_m[first] + share * (line.distance_m[first + 1] - line.distance_m[first])
 
 
 def test_contours_lie_and_move_and_profiles_change_as_the_ground_does(stations):

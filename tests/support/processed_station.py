@@ -92,3 +92,14 @@ def product_of(processed, places=None, **settings):
     product = Product(section, places or {"product": line.cells}, {"product": line} if line else {})
     update_products(series, [product], [section.key], lambda: None)
     return station.product(series.folder, "product")
+
+
+def crossing_m(line, heights_m, level_m):
+    """Return where a true profile crosses a level, between two of its samples; NaN if it does not."""
+    above = heights_m > level_m
+    changes = np.flatnonzero(above[1:] != above[:-1])
+    if not len(changes):
+        return np.nan
+    first = changes[0]
+    share = (level_m - heights_m[first]) / (heights_m[first + 1] - heights_m[first])
+    return line.distance_m[first] + share * (line.distance_m[first + 1] - line.distance_m[first])
