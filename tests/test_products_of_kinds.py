@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import xarray as xr
-from support.processed_station import REFERENCE, ProcessedStation, crossing_m, product_of, rms
+from support.processed_station import REFERENCE, ProcessedStation, crossing_m, product_of, rms, squares_of
 
 from station.queries.site_products.profile_lines import sample_line
 from station.simulation.kinds import beach, low_cost_snow, rockfall
@@ -62,17 +62,6 @@ def z_of(product, name, true):
     return (product[name].values - true)[known] / sigma[known]
 
 
-def squares_of(processed, side):
-    """Return places of `side` x `side` cells off the stable ground that all scans saw."""
-    seen, places = np.isfinite(processed.error()).all(axis=0) & ~processed.stable, {}
-    for top, left in np.ndindex(*(size // 4 for size in seen.shape)):
-        cells = np.zeros(seen.shape, bool)
-        cells[4 * top :, 4 * left :][:side, :side] = True
-        if seen[cells].all():
-            places[f"{top} {left}"] = cells
-    return dict(list(places.items())[:: max(len(places) // 60, 1)])
-
-
 def later_less_earlier(values, days):
     """Return values (t, n) less those of some scans before, NaN for the first scans."""
     differences = np.full(values.shape, np.nan)
@@ -115,7 +104,7 @@ def test_gain_of_few_cells_is_as_far_from_the_truth_as_sigma_says(kind_and_stati
         pytest.skip("only snow falls everywhere")
     z, area_m2 = defaultdict(list), stations[0].site.grid.cell_m ** 2
     for processed in stations:
-        places = squares_of(processed, side)
+        places = squares_of(processed, side, 4)
         budget = product_of(processed, places, kind="volume_budget")
         for name, part in (("deposition", np.maximum), ("erosion", np.minimum)):
             true_m3 = [

@@ -50,7 +50,7 @@ HOUR_S = 3600.0
 TIME_TOLERANCE = 1 / 12  # of the hours of new snow: 2 h of 24 h
 SURFACE_SCANS = 24  # of a time span at most: more of them make a mean hardly better
 NONE = -1  # no such epoch
-FORMAT = "3"  # of the computation, part of the recipe
+FORMAT = "4"  # of the computation, part of the recipe
 
 Row = dict[str, Floats]
 
