@@ -24,7 +24,7 @@ from station.processing.pipeline import (
     new_gridder,
     reference_viewing_geometry,
 )
-from station.quantities import Bools, Floats, Grid, Reference, ScanGeometry
+from station.quantities import Air, Bools, Floats, Grid, Reference, ScanGeometry
 from station.science.adjustment import prior
 from station.science.adjustment.normal_equations import LineInclination
 from station.science.gridding.gridder import Gridder
@@ -128,7 +128,7 @@ def _inputs(
     azimuth_rad = params.line_azimuth_rad
     modes_rad = np.radians(0.0015) * np.stack([np.cos(azimuth_rad), np.sin(azimuth_rad)], axis=-1)
     log = LineInclination(tilt_rad, np.full(params.line_groups, np.radians(0.008) ** -2), modes_rad)
-    return AdjustmentInputs(params, lines, np.zeros((3, params.line_groups)), log, 0.0, weather_known=True)
+    return AdjustmentInputs(params, lines, np.zeros((3, params.line_groups)), log, 0.0, Air(2.0, 700.0, 50.0))
 
 
 if __name__ == "__main__":

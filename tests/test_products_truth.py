@@ -7,7 +7,7 @@ from datetime import UTC, timedelta
 import numpy as np
 import pytest
 import xarray as xr
-from support.processed_station import REFERENCE, ProcessedStation, product_of, rms
+from support.processed_station import REFERENCE, ProcessedStation, crossing_m, product_of, rms, squares_of
 
 from station.queries.site_products.profile_lines import sample_line
 from station.simulation.scenario import named
@@ -37,18 +37,6 @@ def span_of(processed, scans=IN_SURFACE):
     return {"from": first - timedelta(minutes=20), "to": last + timedelta(minutes=20)}
 
 
-def places_of(processed, side):
-    """Return places of `side` x `side` cells on moving ground."""
-    seen = np.isfinite(processed.error()).all(axis=0) & ~processed.stable
-    places = {}
-    for top, left in np.ndindex(*(size // 10 for size in seen.shape)):
-        cells = np.zeros(seen.shape, bool)
-        cells[10 * top :, 10 * left :][:side, :side] = True
-        if seen[cells].all():
-            places[f"{top} {left}"] = cells
-    return dict(list(places.items())[:: max(len(places) // 40, 1)])
-
-
 def z_of(product, name, true):
     """Return error over sigma of a quantity (t, n) where it is known."""
     z = (product[name].values - true) / product[f"{name}_uncertainty"].values
@@ -73,7 +61,7 @@ def test_melt_and_depth_above_the_mean_of_scans(stations, side):
     """
     z, later = defaultdict(list), slice(IN_SURFACE, None)
     for processed in stations:
-        places = places_of(processed, side)
+        places = squares_of(processed, side, 10)
         true_m = np.array([[m[cells].mean() for cells in places.values()] for m in processed.true_change])
         for scans in (1, IN_SURFACE):
             above_m, span = true_m - true_m[:scans].mean(axis=0), span_of(processed, scans)
@@ -118,17 +106,6 @@ def lines_of(processed, ground_m):
         if seen[line.cells].mean() > 0.9:
             lines.append((ends, line, float(ground_m[row, column])))
     return lines
-
-
-def crossing_m(line, heights_m, level_m):
-    """Return where a true profile crosses a level, between two of its samples; NaN if it does not."""
-    above = heights_m > level_m
-    changes = np.flatnonzero(above[1:] != above[:-1])
-    if not len(changes):
-        return np.nan
-    first = changes[0]
-    share = (level_m - heights_m[first]) / (heights_m[first + 1] - heights_m[first])
-    return line.distance_m[first] + share * (line.distance_m[first + 1] - line.distance_m[first])
 
 
 def test_contours_lie_and_move_and_profiles_change_as_the_ground_does(stations):

@@ -10,6 +10,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from station.quantities import (
+    Air,
     Bools,
     Floats,
     Floats32,
@@ -137,8 +138,8 @@ class AdjustmentInputs:
     """Inputs of the adjustment other than residuals: line timing, tilt already applied, log and weather.
 
     `assumed_rad` (3, lines) is the tilt already applied to the points, about east, north and up. `log` is the
-    inclination log by lines, None without one; `time_s` is the start of the scan, since 1970; `weather_known`
-    is True if the weather was measured.
+    inclination log by lines, None without one; `time_s` is the start of the scan, since 1970; `air` is what
+    was measured at the scanner, None if nothing was.
     """
 
     params: ParameterLayout
@@ -146,7 +147,7 @@ class AdjustmentInputs:
     assumed_rad: Floats
     log: LineInclination | None
     time_s: float
-    weather_known: bool
+    air: Air | None
 
 
 def adjust_to_reference(
@@ -163,12 +164,14 @@ def adjust_to_reference(
 
     def adjusted(components: VarianceComponents) -> Adjustment:
         state_prior = prior.state_prior(
-            inputs.params, inputs.lines, components, weather_known=inputs.weather_known
+            inputs.params, inputs.lines, components, weather_known=inputs.air is not None
         )
         log = inputs.log
         if log is not None and reference_state is not None:
             log = log.relative_to(inputs.params, state_prior.reference_covariance(reference_state))
-        return adjust_scan(patches, inputs.assumed_rad, state_prior.relative_to(reference_state), log)
+        temperature_c = None if inputs.air is None else inputs.air.temperature_c
+        state_prior = state_prior.relative_to(reference_state)
+        return adjust_scan(patches, inputs.assumed_rad, state_prior, log, temperature_c)
 
     adjustment = adjusted(components)
     widened = variance_components.as_wide_as(components, adjustment.estimate)

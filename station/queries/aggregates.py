@@ -23,6 +23,7 @@ from station.queries.epoch_cells import (
     EpochMean,
     EpochReader,
     bounding_box,
+    layout_of_scanner,
     observed_in_all,
     read_cells_of,
 )
@@ -229,7 +230,7 @@ class Aggregates(EpochReader):
         gradient = smooth_gradient(elevation_m, grid.cell_m)
         variance_m2 = np.zeros(np.count_nonzero(cells))
         for scanner, shared in contributions:
-            params, position_m = self.parameter_layout_of(scanner)
+            params, position_m = layout_of_scanner(grid, scanner)
             jacobian = cell_jacobian(params, grid, position_m, elevation_m, gradient, cells)
             variance_m2 += jacobian.variance(shared)
         return variance_m2
@@ -351,7 +352,7 @@ class Aggregates(EpochReader):
 
     def _compute_jacobian(self, epoch_cells: EpochCells, cells: Bools) -> HeightJacobian:
         grid, elevation_m = self.grid, epoch_cells.reference.elevation_m
-        params, position_m = self.parameter_layout_of(epoch_cells.scanner)
+        params, position_m = layout_of_scanner(grid, epoch_cells.scanner)
         rows, columns = bounding_box(cells, MARGIN_CELLS)
         corner_m = grid.west_m + columns.start * grid.cell_m, grid.north_m - rows.start * grid.cell_m
         window_m = elevation_m[rows, columns]

@@ -33,7 +33,7 @@ from station.archive.netcdf_layout import Series
 from station.archive.series.index import SeriesIndex, references_and_usable
 from station.quantities import Bools, Floats, Ints, Reference, SharedParameters
 from station.queries.block_sums import Sums, cells_per_block, drop_epoch_sums, epoch_sums, reference_sums
-from station.queries.epoch_cells import EpochCells, EpochReader, read_window
+from station.queries.epoch_cells import EpochCells, EpochReader, layout_of_scanner, read_window
 from station.science.analysis.calibration import SparseJacobian
 from station.science.geometry.observation import Observation
 from station.science.geometry.terrain import GRADIENT_CELLS, smooth_gradient
@@ -229,7 +229,7 @@ class BlockQueries:
         observation = Observation.from_points(points, (east_m, north_m, height_m), east, north)
         jacobian = None
         if epoch_cells.shared is not None:
-            params, _ = self._reader.parameter_layout_of(epoch_cells.scanner)
+            params, _ = layout_of_scanner(grid, epoch_cells.scanner)
             jacobian = height_jacobian(params, observation.offset_m, east, north, rock=rock[known])
         return SurfaceBlocks(known, points, observation, sums["random_m2"][known] / count, jacobian)
 
@@ -247,7 +247,7 @@ class BlockQueries:
     ) -> HeightJacobian:
         """Return the Jacobian of the mean surfaces of the observed blocks."""
         east, north = self._gradient(surface, observed)
-        params, position_m = self._reader.parameter_layout_of(epoch_cells.scanner)
+        params, position_m = layout_of_scanner(self._series.grid, epoch_cells.scanner)
         count = sums["count"][observed]
         offset_m = (
             sums["x_m"][observed] / count - position_m[0],

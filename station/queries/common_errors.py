@@ -8,8 +8,8 @@ import numpy as np
 
 from station.archive.epochs import EpochRef
 from station.quantities import Bools, Floats, SharedParameters
-from station.queries.epoch_cells import EpochCells
-from station.science.gridding.reference_surface import errors_on_map
+from station.queries.epoch_cells import EpochCells, layout_of_scanner
+from station.science.gridding.reference_surface import errors_of_sop_scan, errors_on_map
 from station.science.uncertainty.common_mode import cross_covariance
 from station.science.uncertainty.propagation import difference_to_reference
 
@@ -24,13 +24,18 @@ def shared_of(
 ) -> SharedParameters | None:
     """Return the shared parameters of one of the epochs whose cells are summed; None if it has none.
 
-    Those of an adjusted epoch are relative to the reference, those of another one to the map. The errors of
-    the reference are added where it takes part and does not cancel.
+    Those of an adjusted epoch are relative to the reference, those of another one to the scan that the SOP is
+    from. The errors of the reference, or of that scan, are added where they take part and do not cancel.
     """
     shared, reference = epoch_cells.shared, epoch_cells.reference
-    if shared is None or len(epochs) > 1 or epoch_cells.adjusted != above_surface:
+    if shared is None or len(epochs) > 1:
         return shared
-    return difference_to_reference(shared, errors_on_map(reference) if above_surface else reference.shared)
+    if not above_surface:
+        return shared if epoch_cells.adjusted else difference_to_reference(shared, reference.shared)
+    params, _ = layout_of_scanner(reference.grid, epoch_cells.scanner)
+    if epoch_cells.adjusted:
+        return difference_to_reference(shared, errors_on_map(reference, params))
+    return shared + errors_of_sop_scan(shared, reference, params)
 
 
 def common_error_covariance(epochs: list[EpochCells]) -> Floats | None:

@@ -149,17 +149,18 @@ class EpochReader:
             )
             change_errors = ChangeErrors(*change_fields) if change_fields else None
             shared = SharedParameters(names, units, estimate, covariance, line_tilt_variance, change_errors)
-            self._shared_cache[epoch] = align_to(self.parameter_layout_of(scanner)[0], shared)
+            self._shared_cache[epoch] = align_to(layout_of_scanner(self.grid, scanner)[0], shared)
         return self._shared_cache[epoch]
 
-    def parameter_layout_of(
-        self, scanner: tuple[float, ...]
-    ) -> tuple[ParameterLayout, tuple[float, float, float]]:
-        """Return parameter layout and position [m] of a scanner."""
-        east_m, north_m, height_m, axis_east, axis_north = scanner
-        axis_up = float(np.sqrt(max(1 - axis_east**2 - axis_north**2, 0.0)))
-        position_m = east_m, north_m, height_m
-        return parameter_layout(self.grid, position_m, (axis_east, axis_north, axis_up)), position_m
+
+def layout_of_scanner(
+    grid: Grid, scanner: tuple[float, ...]
+) -> tuple[ParameterLayout, tuple[float, float, float]]:
+    """Return parameter layout and position [m] of a scanner, see `EpochCells`."""
+    east_m, north_m, height_m, axis_east, axis_north = scanner
+    axis_up = float(np.sqrt(max(1 - axis_east**2 - axis_north**2, 0.0)))
+    position_m = east_m, north_m, height_m
+    return parameter_layout(grid, position_m, (axis_east, axis_north, axis_up)), position_m
 
 
 def read_scanner(file: h5py.File, index: int, grid: Grid) -> tuple[float, ...]:

@@ -16,7 +16,7 @@ from station.grid_plane import MAP_PLANE
 from station.quantities import Bools, Floats
 from station.queries.aggregates import Aggregates, ObservedArea
 from station.queries.common_errors import common_error_covariance, shared_of
-from station.queries.epoch_cells import EpochCells, observed_in_all, read_cells_of
+from station.queries.epoch_cells import EpochCells, layout_of_scanner, observed_in_all, read_cells_of
 from station.science.analysis.voids import area_weights
 from station.science.analysis.volume import common_contributions, shared_contributions
 from station.science.uncertainty.point_covariance import shared_covariance, shot_covariance
@@ -198,7 +198,7 @@ class Volumes(Aggregates):
             raise StoreError(
                 f"{epoch.path}: no scanner pose is stored, because the scan is in map coordinates"
             )
-        params, position_m = self.parameter_layout_of(epoch_cells.scanner)
+        params, position_m = layout_of_scanner(self.grid, epoch_cells.scanner)
         offset_m = points_m - np.array(self.grid.plane.place_to_map(position_m))
         shot_m2 = shot_covariance(offset_m, np.array(params.axis), scanner)
         on_map = replace(params, plane=MAP_PLANE)

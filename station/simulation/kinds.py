@@ -93,7 +93,7 @@ def beach(hours: int = 24, seed: int = 1) -> Scenario:
         start=datetime(2025, 10, 15, tzinfo=UTC),
         hours=hours,
         kind="beach",
-        mark=Mark(52.0705, 4.2195, 85.0, 32631, 1003.0, SEA_AIR),
+        mark=Mark(52.0705, 4.2195, 85.0, 32631, 1003.0, SEA_AIR, temperature_c=12.0),
         terrain_step_m=1.0,
         roughness_m=0.03,
         roughness_length_m=10.0,

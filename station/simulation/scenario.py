@@ -47,6 +47,7 @@ class Mark:
     pressure_hpa: float = 688.0  # on average
     # Temperature [°C], pressure [hPa], humidity [%] set in the scanner: Voordendag et al. (2023), 3.1.2
     scanner_setting: tuple[float, float, float] = (-2.0, 684.0, 28.0)
+    temperature_c: float = 2.0  # on average
 
     @property
     def crs(self) -> str:

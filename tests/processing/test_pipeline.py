@@ -298,7 +298,7 @@ def test_adjustment_to_a_sample_of_stable_ground_agrees_with_all_of_it(monkeypat
         np.zeros((3, params.line_groups)),
         None,
         0.0,
-        weather_known=True,
+        Air(2.0, 700.0, 50.0),
     )
     reference = replace(truth(), components=VarianceComponents(translation_m=0.1))
     stable = np.ones(GRID.shape, bool)

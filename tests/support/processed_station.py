@@ -92,3 +92,28 @@ def product_of(processed, places=None, **settings):
     product = Product(section, places or {"product": line.cells}, {"product": line} if line else {})
     update_products(series, [product], [section.key], lambda: None)
     return station.product(series.folder, "product")
+
+
+def crossing_m(line, heights_m, level_m):
+    """Return where a true profile crosses a level, between two of its samples; NaN if it does not."""
+    above = heights_m > level_m
+    changes = np.flatnonzero(above[1:] != above[:-1])
+    if not len(changes):
+        return np.nan
+    first = changes[0]
+    share = (level_m - heights_m[first]) / (heights_m[first + 1] - heights_m[first])
+    return line.distance_m[first] + share * (line.distance_m[first + 1] - line.distance_m[first])
+
+
+def squares_of(processed, side, spacing):
+    """Return some 40 places of `side` x `side` cells, every `spacing` cells, off the stable ground.
+
+    All scans saw them.
+    """
+    seen, places = np.isfinite(processed.error()).all(axis=0) & ~processed.stable, {}
+    for top, left in np.ndindex(*(size // spacing for size in seen.shape)):
+        cells = np.zeros(seen.shape, bool)
+        cells[spacing * top :, spacing * left :][:side, :side] = True
+        if seen[cells].all():
+            places[f"{top} {left}"] = cells
+    return dict(list(places.items())[:: max(len(places) // 40, 1)])

@@ -112,7 +112,7 @@ def _inputs_of_positions(site: Site, scan: OpenScan, each: list[ScanInputs]) -> 
             np.zeros((3, params.line_groups)),
             None,
             scan.start.timestamp(),
-            weather_known=weather_known,
+            air if weather_known else None,
         ),
         None,
         air if weather_known else None,

@@ -173,7 +173,7 @@ def position_inputs(
         Pose(placed, tilt),
         covariance if registered is None else registered_covariance(site, covariance),
         AdjustmentInputs(
-            params, lines, assumed_rad, line_inclination, start.timestamp(), weather_known=weather_known
+            params, lines, assumed_rad, line_inclination, start.timestamp(), air if weather_known else None
         ),
         tilt_record,
         air if weather_known else None,
@@ -192,7 +192,7 @@ def inputs_in_map_frame(site: Site, start_s: float) -> ScanInputs:
         params = parameters.parameter_layout(geometry.grid, geometry.position_m)
         lines = prior.line_times(params, np.eye(3), None)
         adjustment_inputs = AdjustmentInputs(
-            params, lines, np.zeros((3, params.line_groups)), None, start_s, weather_known=False
+            params, lines, np.zeros((3, params.line_groups)), None, start_s, None
         )
         log_only_covariance = partial(
             prior.log_only_covariance,

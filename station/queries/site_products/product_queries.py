@@ -36,7 +36,12 @@ from station.quantities import Bools, Floats, Ints
 from station.queries.aggregates import Aggregates
 from station.queries.site_products.profile_lines import Line
 from station.queries.site_products.quantities_along_lines import contour, profile
-from station.queries.site_products.quantities_of_places import NEW_SNOW_H, CountedFrom, place_quantities
+from station.queries.site_products.quantities_of_places import (
+    NEW_SNOW_H,
+    CountedFrom,
+    deciding_cells,
+    place_quantities,
+)
 from station.queries.site_products.surface_scans import SurfaceScans
 from station.science.analysis.product_estimates import Estimate
 from station.sections.product import ProductSection, SurfaceTime
@@ -45,7 +50,7 @@ HOUR_S = 3600.0
 TIME_TOLERANCE = 1 / 12  # of the hours of new snow: 2 h of 24 h
 SURFACE_SCANS = 24  # of a time span at most: more of them make a mean hardly better
 NONE = -1  # no such epoch
-FORMAT = "3"  # of the computation, part of the recipe
+FORMAT = "4"  # of the computation, part of the recipe
 
 Row = dict[str, Floats]
 
@@ -129,6 +134,8 @@ class ProductQueries(Aggregates):
         def compute(row: int) -> Row:
             if base and not surface:
                 cells = np.logical_or.reduce(list(product.places.values()))
+                if product.section.kind == "volume_budget":
+                    cells = deciding_cells(cells)
                 surface.append(SurfaceScans(self, base, cells))
             others = [None if index == NONE else self._epochs[index] for index in partners[row].tolist()]
             return self._compute(

@@ -14,8 +14,9 @@ from station.queries.epoch_cells import EpochCells
 from station.queries.site_products.profile_lines import Line
 from station.queries.site_products.quantities_of_places import CountedFrom, datum_of
 from station.science.analysis.product_estimates import Estimate, crest, crossing
-from station.science.gridding.reference_surface import errors_on_map
+from station.science.gridding.reference_surface import errors_of_sop_scan, errors_on_map
 from station.science.uncertainty.jacobian import HeightJacobian
+from station.science.uncertainty.parameters import ParameterLayout
 from station.science.uncertainty.propagation import aggregate_variance
 
 HeightOrCrest = float | str | None
@@ -154,6 +155,7 @@ def _variances(
     cells[line.cells] = used
     weights, base_weights = weights[used], base_weights[used]
     jacobian = aggregates.jacobian(scan, cells)
+    params = jacobian.params
     errors: list[tuple[HeightJacobian, SharedParameters, Floats]] = [(jacobian, scan.shared, weights)]
     common = 0.0
     if base is not None and base.shared is not None:
@@ -167,10 +169,13 @@ def _variances(
             )
     of_reference = weights * scan.adjusted, base_weights * (base is None or base.adjusted)
     if base is None or base.reference.version == scan.reference.version:
-        errors.append((jacobian, _reference_errors(scan), of_reference[0] - of_reference[1]))
+        errors.append((jacobian, _reference_errors(scan, params), of_reference[0] - of_reference[1]))
     else:
-        errors.append((jacobian, _reference_errors(scan), of_reference[0]))
-        errors.append((jacobian, _reference_errors(base), of_reference[1]))
+        errors.append((jacobian, _reference_errors(scan, params), of_reference[0]))
+        errors.append((jacobian, _reference_errors(base, params), of_reference[1]))
+    if not scan.adjusted:
+        sop_errors = errors_of_sop_scan(scan.shared, scan.reference, params)
+        errors.append((jacobian, sop_errors, weights - base_weights))
     zeros = np.zeros(len(weights))
     total = sum(aggregate_variance(of, zeros, matrix, shared) for matrix, shared, of in errors)
     return random, max(total - 2 * common, 0.0)
@@ -189,13 +194,14 @@ def _base_variance(scan: EpochCells, base: EpochCells | None, cells: Bools) -> F
     return np.asarray(scan.reference.random_variance_m2[cells], np.float64)
 
 
-def _reference_errors(scan: EpochCells) -> SharedParameters:
+def _reference_errors(scan: EpochCells, params: ParameterLayout) -> SharedParameters:
     """Return the shared parameters of the reference of a scan; those of the scan if they are of another kind.
 
-    Without errors if the reference has none.
+    Without errors if the reference has none. Those on the map if the scan is adjusted: of another one, the
+    errors of the scan of the SOP count on their own.
     """
     assert scan.shared is not None  # noqa: S101 - the caller has looked
-    reference = errors_on_map(scan.reference)
+    reference = errors_on_map(scan.reference, params) if scan.adjusted else scan.reference.shared
     if reference is None:
         return scan.shared.scaled(0.0)
     return reference if reference.names == scan.shared.names else scan.shared

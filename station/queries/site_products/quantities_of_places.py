@@ -6,17 +6,26 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
+from scipy import ndimage
 
 from station.archive.epochs import EpochRef
 from station.quantities import Bools, Floats
 from station.queries.aggregates import Aggregates, ObservedArea
 from station.queries.epoch_cells import bounding_box
 from station.queries.site_products.surface_scans import SurfaceScans
-from station.science.analysis.product_estimates import Estimate, gained, thickness_between, water_equivalent
+from station.science.analysis.product_estimates import (
+    SIGN_WINDOW_CELLS,
+    Estimate,
+    SignOfChange,
+    sign_of_change,
+    thickness_between,
+    water_equivalent,
+)
 from station.sections.product import ProductSection
 
 NEW_SNOW_H = (24, 72)
-BUDGET = ("deposition", "erosion", "net_change")
+NET = "net_change"
+BUDGET = ("deposition", "erosion", NET)
 
 
 @dataclass(frozen=True)
@@ -124,21 +133,51 @@ def _volume_between(
 def _volume_budget(
     aggregates: Aggregates, cells: Bools, epoch: EpochRef, base: CountedFrom
 ) -> tuple[dict[str, Estimate], float]:
-    """Return gain, loss and net of an area; each cell counts in one class, so they close exactly."""
+    """Return gain, loss and net of an area; each cell counts in one class, so they close exactly.
+
+    The systematic error of cells that may have gained or lost is in both.
+    """
     area, counted = observe_change(aggregates, cells, epoch, base)
-    if area is None:
+    near, _ = observe_change(aggregates, deciding_cells(cells), epoch, base)
+    if area is None or near is None:
         return dict.fromkeys(BUDGET, Estimate()), 0.0
-    bounds = bounding_box(cells, 0)
-    observed = area.cells[bounds]
-    change_m, random_m = np.full((2, *observed.shape), np.nan)
-    change_m[observed], random_m[observed] = area.value_m, np.sqrt(np.sum(area.random_m2, axis=0))
-    is_gain = gained(change_m, random_m)[observed]
+    sign = _sign_of_change(aggregates, near, area.cells)
     count = np.count_nonzero(cells)
     size_m2, in_voids = count * aggregates.grid.cell_m**2, area.weights - 1 / count
     budget = {}
-    for name, chosen in zip(BUDGET, (is_gain, ~is_gain, np.ones_like(is_gain)), strict=True):
+    for name, chosen in zip(BUDGET, (sign.gained, ~sign.gained, np.ones_like(sign.gained)), strict=True):
         share = in_voids[chosen].sum() / in_voids.sum() if area.void_m2 else 0.0  # of the voids
-        weights = size_m2 * np.where(chosen, area.weights * counted, 0.0)
-        void_m6 = (share * size_m2) ** 2 * area.void_m2
-        budget[name] = _sum(aggregates, area, weights, area.value_m, void_m6)
+        weights, void_m6 = size_m2 * area.weights * counted, (share * size_m2) ** 2 * area.void_m2
+        chosen_sum = _sum(aggregates, area, np.where(chosen, weights, 0.0), area.value_m, void_m6)
+        possible = ~chosen & ~sign.certain
+        if name != NET and possible.any():
+            random, total = aggregates.sum_variance(area, np.where(chosen | possible, weights, 0.0))
+            chosen_sum = Estimate(
+                chosen_sum.value,
+                chosen_sum.random_variance + np.where(possible, weights**2, 0.0) @ sign.random_m2,
+                total - random + void_m6,
+            )
+        budget[name] = chosen_sum
     return budget, area.coverage
+
+
+def deciding_cells(cells: Bools) -> Bools:
+    """Return the cells (ny, nx) whose changes tell which cells of an area gained: it and those around."""
+    deciding, bounds = np.zeros_like(cells), bounding_box(cells, SIGN_WINDOW_CELLS // 2)
+    deciding[bounds] = ndimage.binary_dilation(cells[bounds], np.ones((SIGN_WINDOW_CELLS,) * 2, np.bool_))
+    return deciding
+
+
+def _sign_of_change(aggregates: Aggregates, near: ObservedArea, cells: Bools) -> SignOfChange:
+    """Return the sign of the change of some cells (n,) of an observed area."""
+    bounds = bounding_box(near.cells, 0)
+    change_m, random_m2, systematic_m2 = np.full((3, *near.cells[bounds].shape), np.nan)
+    for raster, values in (
+        (change_m, near.value_m),
+        (random_m2, np.sum(near.random_m2, axis=0)),
+        (systematic_m2, aggregates.cell_variances(near)[1]),
+    ):
+        raster[near.cells[bounds]] = values
+    sign = sign_of_change(change_m, random_m2, systematic_m2)
+    inside = cells[bounds]
+    return SignOfChange(sign.gained[inside], sign.certain[inside], sign.random_m2[inside])

@@ -21,6 +21,7 @@ from scipy import sparse
 from station.quantities import Bools, Floats, Ints, Reals
 from station.science.adjustment.normal_equations import ScaledCholesky
 from station.science.adjustment.patches import Patches
+from station.science.geometry.air import LAPSE_K_PER_M
 from station.science.uncertainty import common_mode
 from station.science.uncertainty.parameters import GLOBAL, TILT_KNOT_RAD
 
@@ -48,6 +49,9 @@ CORRELATION_AZIMUTH_KNOTS, CORRELATION_RANGE_KNOTS = 4.0, 2.5  # correlation len
 # Where moving ground rises, stable ground may be under snow too thin to change its intensity.
 THIN_SNOW_M = 0.005  # upper bound of sigma; the change of moving ground bounds it too
 NO_CHANGE_M = 1e-6
+# Of the air over thin snow. At most of the warmest places half of what falls at 2.4 °C is snow (Jennings et
+# al., 2018), and a thermometer in the sun shows up to 5 K too much.
+MAX_SNOW_C = 8.0
 MAX_SNOW_SLOPES = tuple(np.tan(np.radians((40.0, 50.0))))  # upper bounds (tan): full snow, some snow
 HEAVE_M = 0.002  # start value of sigma: frost and heat move rock by millimetres
 HEAVE_BLOCK_M = 500.0
@@ -186,13 +190,18 @@ class GroundChange:
         return common_mode.polar_mean(azimuth_rad, distance_m, (self.design @ estimate_m)[self.moving])
 
 
-def ground_change(patches: Patches, moving: Bools) -> GroundChange:
-    """Return the unknown change of patches, of which `moving` (n,) are moving ground."""
+def ground_change(patches: Patches, moving: Bools, temperature_c: float | None = None) -> GroundChange:
+    """Return the unknown change of patches, of which `moving` (n,) are moving ground.
+
+    `temperature_c` is that of the air at the scanner, None if it was not measured.
+    """
     shares = _shares(patches, moving)
     knot_design, precisions, log_determinants = _knots(patches, shares)
     trends = [_trends(patches, share) for share in shares]
     trend_design = sparse.hstack(trends, format="csr")
-    snow_design = _thin_snow(patches, moving) if moving.any() else sparse.csr_array((len(moving), 0))
+    snow_design = sparse.csr_array((len(moving), 0))
+    if moving.any():
+        snow_design = _thin_snow(patches, ~moving & _may_hold_snow(patches, temperature_c))
     heave_design = _heave(patches, ~moving)
     return GroundChange(
         sparse.hstack([trend_design, knot_design, snow_design, heave_design], format="csr"),
@@ -275,10 +284,20 @@ def _trends(patches: Patches, share: Floats) -> sparse.csr_array:
     return sparse.csr_array(trends * share[:, None])
 
 
-def _thin_snow(patches: Patches, moving: Bools) -> sparse.csr_array:
-    """Return the design matrix (n, 2) of thin snow: stable patches that hold snow, and that hold some."""
+def _may_hold_snow(patches: Patches, temperature_c: float | None) -> Bools:
+    """Return True for patches (n,) where it is cold enough for snow; everywhere if no temperature is known.
+
+    It falls with the height. Below the scanner it is taken to do so too: cold air collects in hollows.
+    """
+    if temperature_c is None:
+        return np.ones(len(patches), np.bool_)
+    return np.asarray(temperature_c - LAPSE_K_PER_M * np.abs(patches.height_m) < MAX_SNOW_C)
+
+
+def _thin_snow(patches: Patches, chosen: Bools) -> sparse.csr_array:
+    """Return the design matrix (n, 2) of thin snow: chosen patches that hold snow, and that hold some."""
     snow_class = np.digitize(patches.jacobian.tan_slope, MAX_SNOW_SLOPES)
-    return sparse.csr_array(np.stack([(snow_class == index) & ~moving for index in range(2)], axis=1) * 1.0)
+    return sparse.csr_array(np.stack([(snow_class == index) & chosen for index in range(2)], axis=1) * 1.0)
 
 
 def _heave(patches: Patches, stable: Bools) -> sparse.csr_array:

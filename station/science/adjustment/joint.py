@@ -124,18 +124,23 @@ def tilt_effect(jacobian: HeightJacobian, applied_rad: Floats) -> Reals:
 
 
 def adjust_scan(
-    patches: Patches, applied_rad: Floats, prior: StatePrior, log: LineInclination | None
+    patches: Patches,
+    applied_rad: Floats,
+    prior: StatePrior,
+    log: LineInclination | None,
+    temperature_c: float | None = None,
 ) -> Adjustment:
     """Return the scanner's state estimated from patches, inclination log and prior.
 
     `applied_rad` (3, lines) is the tilt already applied to the points, as a rotation about east, north and
-    up. Hold-out patches are not used. Source: adjustment.md, 5.
+    up. `temperature_c` is that of the air at the scanner, None if it was not measured. Hold-out patches are
+    not used. Source: adjustment.md, 5.
     """
     params = patches.jacobian.params
     patches = patches.take(patches.ground_class <= GroundClass.STABLE)
     moving = patches.ground_class == GroundClass.MOVING
     misclosure_m = patches.residual_m + tilt_effect(patches.jacobian, applied_rad)
-    change = ground_change(patches, moving)
+    change = ground_change(patches, moving, temperature_c)
     equations = NormalEquations(patches.jacobian, change.design, misclosure_m, prior, log)
     excess_m2 = np.full(len(patches), EXCESS_BOUNDS_M[0] ** 2)
     robust_weight = np.ones(len(patches))

@@ -12,6 +12,7 @@ import numpy as np
 from scipy import ndimage
 
 from station.quantities import Bools, Floats, Ints
+from station.science.gridding.significance import significant
 
 WATER_KG_M3 = 1000.0
 SIGN_WINDOW_CELLS = 5  # the neighbours that decide whether a cell lost or gained
@@ -57,18 +58,38 @@ def water_equivalent(thickness: Estimate, density_kg_m3: float, density_sigma_kg
     return replace(scaled, systematic_variance=scaled.systematic_variance + density_variance)
 
 
-def gained(change_m: Floats, random_m: Floats) -> Bools:
-    """Return True for the cells (ny, nx) of an area that gained material; NaN outside it.
+class SignOfChange(NamedTuple):
+    """Which cells gained material, of which this is certain, and the variance of what decides by noise."""
 
-    The neighbours decide, not the cell itself: then its noise is as often positive as negative in either
-    class, and sums over a class have no bias, without a level of detection. A change far beyond the noise
-    decides itself. Source: equations.md, 6.16.
+    gained: Bools
+    certain: Bools
+    random_m2: Floats
+
+
+def sign_of_change(change_m: Floats, random_m2: Floats, systematic_m2: Floats) -> SignOfChange:
+    """Return which cells (ny, nx) gained material, from their changes and both parts of their variance.
+
+    Changes are NaN where not observed. The mean of the neighbours decides, not the cell itself: then its
+    noise is as often positive as negative in either class, and sums over a class have no bias, without a
+    level of detection. A change far beyond the noise, or without neighbours, decides itself. Source:
+    equations.md, 6.16.
     """
     known = np.isfinite(change_m)
-    values = np.where(known, change_m, 0.0)
-    neighbours = ndimage.uniform_filter(values, SIGN_WINDOW_CELLS, mode="constant") * SIGN_WINDOW_CELLS**2
-    clear = known & (np.abs(values) > CLEAR_SIGMAS * np.where(known, random_m, np.inf))
-    return np.asarray(known & (np.where(clear, values, neighbours - values) > 0))
+    values, own_m2 = np.where(known, change_m, 0.0), np.where(known, random_m2, 0.0)
+    count = np.rint(_near(known * 1.0)) - known
+    alone = known & ((count == 0) | (np.abs(values) > CLEAR_SIGMAS * np.sqrt(own_m2)))
+    number = np.maximum(count, 1.0)
+    deciding_m = np.where(alone, values, (_near(values) - values) / number)
+    deciding_m2 = np.where(alone, own_m2, np.maximum(_near(own_m2) - own_m2, 0.0) / number**2)
+    certain = significant(deciding_m, np.sqrt(deciding_m2 + np.where(known, systematic_m2, 0.0)))
+    return SignOfChange(known & (deciding_m > 0), known & certain, deciding_m2)
+
+
+def _near(values: Floats) -> Floats:
+    """Return the sum of values (ny, nx) in the window around each cell."""
+    return np.asarray(
+        ndimage.uniform_filter(values, SIGN_WINDOW_CELLS, mode="constant") * SIGN_WINDOW_CELLS**2
+    )
 
 
 def thickness_between(height_m: Floats, low_m: Floats, high_m: Floats) -> tuple[Floats, Floats]:

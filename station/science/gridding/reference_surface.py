@@ -10,12 +10,12 @@ from station.quantities import Bools, Floats, Floats32, Reference, SharedParamet
 from station.science.adjustment import ground_classes
 from station.science.geometry.terrain import HALO_ROWS, fit_planes, row_blocks, smooth_gradient
 from station.science.gridding.scan_stack import ScanStack
+from station.science.uncertainty.parameters import ParameterLayout
+from station.science.uncertainty.propagation import restricted_to
 
 REFRACTION_CORRELATION_S = 6 * 3600.0  # of the refraction of the air, from scan to scan
 MAX_DEVIATION_SIGMAS = 3.0  # of a mean over many scans, on stable ground
 MAX_VARIANCE_FACTOR = 3.0  # empirical over modelled variance from scan to scan, on stable ground
-LOG_PARAMETERS = ("tilt_", "sight_tilt")  # whose errors are those of the inclination log …
-MOTION_PARAMETERS = ("heading", "translation_")  # … and of the motion since the SOP
 
 Position = tuple[float, float, float]
 
@@ -79,20 +79,34 @@ def build_surface(
     )
 
 
-def errors_on_map(reference: Reference) -> SharedParameters | None:
+def errors_on_map(reference: Reference, params: ParameterLayout) -> SharedParameters | None:
     """Return the shared parameters of a reference with the covariance of its errors on the map.
 
     All its scans are placed relative to the one that the SOP was determined from, and have the errors of that
-    scan, and of its inclination log, in common. Change does not: they cancel. Source: equations.md, 6.20.
+    scan, and of its inclination log, in common. Change does not: they cancel. `params` are those of a scan; a
+    reference with others, of a scanner that was relocated since, is returned as it is. Source: equations.md,
+    6.20.
     """
     shared, count = reference.shared, len(reference.scan_ids)
-    if shared is None or reference.sop_scan_count is None or not count:
+    if shared is None or reference.sop_scan_count is None or not count or shared.names != params.names:
         return shared
     others = count - reference.sop_scan_count
-    ratio, factors = others * (others + 1) / count, np.ones(len(shared.names))
-    factors[[name.startswith(LOG_PARAMETERS) for name in shared.names]] = max(ratio, 1.0)
-    factors[[name.startswith(MOTION_PARAMETERS) for name in shared.names]] = max(ratio / 2, 1.0)
+    ratio, factors = others * (others + 1) / count, np.ones(len(params.names))
+    factors[params.in_log] = max(ratio, 1.0)
+    factors[params.moves_unlogged] = max(ratio / 2, 1.0)
     return replace(shared, covariance=shared.covariance * np.sqrt(np.outer(factors, factors)))
+
+
+def errors_of_sop_scan(
+    shared: SharedParameters, reference: Reference, params: ParameterLayout
+) -> SharedParameters:
+    """Return the error on the map that a scan without adjustment has from the one of the SOP.
+
+    It is as large as that of the scan's own inclination log, which `shared` are the errors of; zero if the
+    tilt of the reference counts from no scan. Source: equations.md, 6.20.
+    """
+    counts = params.in_log & (reference.sop_scan_count is not None)
+    return replace(restricted_to(shared, counts), line_tilt_variance=np.zeros(len(counts)))
 
 
 def centre_reference(

@@ -116,8 +116,21 @@ class ParameterLayout:
     @property
     def moves_beam(self) -> Bools:
         """True for parameters (p,) that change the elevation at which beams reach the ground."""
-        chosen = np.array([name.startswith(("tilt", "refraction", "sight_tilt")) for name in self.names])
-        return np.asarray(chosen)
+        return self._named("tilt", "refraction", "sight_tilt")
+
+    @property
+    def in_log(self) -> Bools:
+        """True for parameters (p,) that an inclination log measures."""
+        return self._named("tilt", "sight_tilt")
+
+    @property
+    def moves_unlogged(self) -> Bools:
+        """True for parameters (p,) of motion that no inclination log measures."""
+        return self._named("heading", "translation")
+
+    def _named(self, *prefixes: str) -> Bools:
+        """Return True for parameters (p,) whose names begin with one of these."""
+        return np.array([name.startswith(prefixes) for name in self.names])
 
     def active_parameters(self, knot: Ints) -> Ints:
         """Return the indices (m, 16) of the non-zero columns of J just after sight-tilt knots (m,).

@@ -120,7 +120,7 @@ def weather(scenario: Scenario, time_utc_s: Floats) -> WeatherLog:
     quick = random_fourier(rng_for(scenario.seed, 40, 3), 0.25, 240, 3600)
     return WeatherLog(
         time_utc_s,
-        temperature_c=2.0 + 2.5 * daily + 1.2 * slow[0](series_s) + quick(series_s),
+        temperature_c=scenario.mark.temperature_c + 2.5 * daily + 1.2 * slow[0](series_s) + quick(series_s),
         pressure_hpa=scenario.mark.pressure_hpa + 1.8 * slow[1](series_s),
         humidity_pct=np.clip(62.0 - 10.0 * daily + 9.0 * slow[2](series_s), 5.0, 100.0),
     )

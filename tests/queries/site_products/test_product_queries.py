@@ -14,6 +14,7 @@ from support.plane_store import (
     make_reference,
     random_parameters,
     reference_random_m2,
+    shared_variance,
 )
 from support.series import copied, open_with_processing
 
@@ -203,6 +204,47 @@ def test_a_volume_budget_closes_and_has_the_covariance_of_its_classes(base, stor
     assert np.abs(closure.values[np.isfinite(closure.values)]).max() < 1e-6
 
 
+def test_cells_that_may_have_gained_or_lost_have_their_systematic_error_in_both(base, stored):
+    """Places of one cell amid changes of the size of their errors, by dense matrices.
+
+    The mean of the cells around decides, also of those outside the place. A quarter of the cells is certain.
+    """
+    height_m = stored.elevation.values[LAST].astype(float)
+    random_m2 = independent_m2(stored, LAST, reference_random_m2(base))
+    reference = random_parameters(7, 0.5)
+    wave_m = 0.2 * np.sin(np.arange(GRID.nx) / 3.0)
+    values_m = wave_m + np.random.default_rng(5).normal(0, 0.05, GRID.shape)
+    seen = np.isfinite(height_m)
+    places, expected = {}, []
+    for row, column in np.argwhere(seen)[::23]:
+        cell, window = np.zeros(GRID.shape, bool), np.zeros(GRID.shape, bool)
+        cell[row, column] = True
+        window[max(row - 2, 0) : row + 3, max(column - 2, 0) : column + 3] = True
+        around = window & seen & ~cell
+        value_m, own_m2 = values_m[row, column], random_m2[row, column]
+        total_m2 = dense_variance(stored, 1.0 * cell, LAST, random_m2=random_m2, reference=reference)
+        deciding_m, deciding_m2 = values_m[around].mean(), random_m2[around].sum() / around.sum() ** 2
+        if value_m**2 > 16 * own_m2:
+            deciding_m, deciding_m2 = value_m, own_m2
+        is_certain = deciding_m**2 > 1.959964**2 * (deciding_m2 + total_m2 - own_m2)
+        chosen, other = (own_m2, total_m2), (0.0, 0.0)
+        if not is_certain:
+            other = deciding_m2, deciding_m2 + total_m2 - own_m2
+        places[f"{row} {column}"] = cell
+        expected.append((value_m, is_certain, *((chosen, other) if deciding_m > 0 else (other, chosen))))
+    assert 0.15 < np.mean([is_certain for _, is_certain, *_ in expected]) < 0.85
+    budget, _ = computed(
+        base, places, kind="volume_budget", surface="before.tif", rasters={"surface": height_m - values_m}
+    )
+    for index, (value_m, _, *parts) in enumerate(expected):
+        place = budget.isel(place=index)
+        assert float(place.net_change[LAST]) == pytest.approx(100.0 * value_m, abs=0.1)
+        for name, (random, total) in zip(("deposition", "erosion"), parts, strict=True):
+            assert float(place[f"{name}_uncertainty"][LAST]) == pytest.approx(100 * total**0.5, rel=1e-3)
+            actual = float(place[f"{name}_random_uncertainty"][LAST])
+            assert actual == pytest.approx(100 * random**0.5, rel=1e-3)
+
+
 ENDS = [(GRID.x_m[4], GRID.y_m[ROW]), (GRID.x_m[34], GRID.y_m[ROW])]  # it climbs by a quarter
 
 
@@ -245,6 +287,50 @@ def test_a_contour_is_where_the_surface_crosses_the_height(base, stored):
     random = np.nansum(weights**2 * random_m2) + relief_m2 * relief @ relief
     total += relief_m2 * relief @ relief
     assert_sigmas(contour, "distance", LAST, random=random, total=total, rel=2e-3)  # heights are f4
+
+
+@pytest.mark.parametrize(("sop_scan_count", "share"), [(1, 1.0), (None, 0.0)])
+def test_heights_without_adjustment_have_the_error_of_the_scan_of_the_sop(tmp_path, sop_scan_count, share):
+    """As large as that of its own log. The movement of a contour has what both places do not share."""
+    series = Series(tmp_path, "hef", GRID, "EPSG:32632")
+    write_reference(series, replace(make_reference(), sop_scan_count=sop_scan_count))
+    shared = random_parameters(1, 1.0)
+    epochs.write_epoch(series, make_epoch(1, "none", shared))
+    build_series(series)
+    in_log = np.array([name.startswith(("tilt_", "sight_tilt_")) for name in shared.names])
+    assert 2 < in_log.sum() < len(in_log)
+    sop = replace(shared, covariance=share * np.where(np.outer(in_log, in_log), shared.covariance, 0.0),
+                  line_tilt_variance=0.0 * shared.line_tilt_variance)  # fmt: skip
+    with open_with_processing(series.folder) as ds:
+        stored = ds.load()
+    random_m2 = independent_m2(stored, 0, reference_random_m2(series))
+    cells = np.zeros(GRID.shape, bool)
+    cells[5:9, 10:14] = np.isfinite(stored.elevation_change.values[0, 5:9, 10:14])
+    point, _ = computed(series, {"stake": cells}, kind="point", at=(GRID.x_m[11], GRID.y_m[6]))
+    total = dense_variance(stored, cells / cells.sum(), 0, random_m2=random_m2, reference=sop)
+    assert float(point.elevation_uncertainty[0, 0]) == pytest.approx(total**0.5, rel=1e-4)
+    change = dense_variance(stored, cells / cells.sum(), 0, reference=random_parameters(7, 0.5))
+    assert float(point.elevation_change_uncertainty[0, 0]) == pytest.approx(change**0.5, rel=1e-4)
+
+    heights_m = stored.elevation.values[0, ROW, 4:35].astype(float)
+    level_m = np.nanmedian(heights_m)
+    contour, _ = computed(series, kind="contour", line=ENDS, height_m=float(level_m))
+    place = crossing(10.0 * np.arange(31), heights_m, random_m2[ROW, 4:35], level_m)
+    base_m = make_reference().elevation_m[ROW, 4:35]
+    base = crossing(10.0 * np.arange(31), base_m, reference_random_m2(series)[ROW, 4:35], level_m)
+    weights, base_weights = np.zeros((2, *GRID.shape))
+    weights[ROW, 4:35], base_weights[ROW, 4:35] = place[1], base[1]
+    own = dense_variance(stored, weights, 0, random_m2=0 * random_m2)
+    of_sop, apart = (
+        shared_variance(stored, a, 0, sop.covariance, sop.line_tilt_variance)
+        for a in (weights, weights - base_weights)
+    )
+    actual = float(contour.distance_systematic_uncertainty[0, 0]) ** 2
+    assert actual == pytest.approx(own + of_sop, rel=2e-3)
+    reference = random_parameters(7, 0.5)
+    of_base = shared_variance(stored, base_weights, 0, reference.covariance, reference.line_tilt_variance)
+    actual = float(contour.distance_change_systematic_uncertainty[0, 0]) ** 2
+    assert actual == pytest.approx(own + of_base + apart, rel=2e-3)
 
 
 def test_only_new_epochs_and_those_that_depend_on_them_are_computed(base, box, tmp_path):

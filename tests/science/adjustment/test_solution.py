@@ -43,9 +43,10 @@ def make_patches(seed, change_m, bare_share=0.0):
     return Patches(jacobian, range_bin, height_m, ground_class, residual_m, variance_m2, cells)
 
 
-def solve(seed, change_m, bare_share=0.0):
+def solve(seed, change_m, bare_share=0.0, temperature_c=None):
     patches = make_patches(seed, change_m, bare_share)
-    change = ground_change.ground_change(patches, patches.ground_class == GroundClass.MOVING)
+    moving = patches.ground_class == GroundClass.MOVING
+    change = ground_change.ground_change(patches, moving, temperature_c)
     equations = NormalEquations(patches.jacobian, change.design, patches.residual_m, PRIOR, None)
     reduced = equations.reduce(1 / patches.variance_m2)
     return patches, change, equations.size, solution.solve(reduced, equations.size, change, None)
@@ -55,6 +56,22 @@ def sigma_of(mixture, count):
     """Return sigma of the first unknowns."""
     half = mixture.factor.half_solve(np.eye(len(mixture.estimate))[:, :count])
     return np.sqrt(np.sum(half**2, axis=0))
+
+
+def test_thin_snow_lies_where_the_air_is_colder_than_8_degrees():
+    """At 10 °C at the scanner that is from 308 m below it, as far as cold air may collect there."""
+    patches, change, _, warm = solve(3, 0.2, temperature_c=10.0)
+    first = change.trend_columns + len(change.knot_precisions[0])
+    snow = change.design.toarray()[:, first : first + change.snow_columns].sum(axis=1)
+    stable = np.arange(COUNT) < STABLE
+    assert 3 < np.count_nonzero(snow) < STABLE
+    assert (snow == (stable & (patches.height_m < -2.0 / 0.0065))).all()
+    _, _, _, unknown = solve(3, 0.2)
+    _, _, _, cold = solve(3, 0.2, temperature_c=2.0)
+    _, _, _, hot = solve(3, 0.2, temperature_c=20.0)
+    up = 5
+    sigma_m = [sigma_of(solved.mixture(), up + 1)[up] for solved in (unknown, cold, warm, hot)]
+    assert sigma_m[0] == sigma_m[1] > 1.01 * sigma_m[2] > 1.01 * sigma_m[3]
 
 
 @pytest.fixture(scope="module")

@@ -3,12 +3,13 @@
 import numpy as np
 import pytest
 from scipy import ndimage
+from scipy.stats import norm
 
 from station.science.analysis.product_estimates import (
     Estimate,
     crest,
     crossing,
-    gained,
+    sign_of_change,
     thickness_between,
     water_equivalent,
 )
@@ -40,7 +41,7 @@ def test_a_budget_of_noise_has_no_bias_without_a_level_of_detection(true_m):
     gains, losses, naive, detected = [], [], [], []
     for _ in range(200):
         measured_m = change_m + rng.normal(0, sigma_m, shape)
-        gain = gained(measured_m, np.full(shape, sigma_m))
+        gain = sign_of_change(measured_m, np.full(shape, sigma_m**2), np.zeros(shape)).gained
         gains.append(measured_m[gain].sum())
         losses.append(measured_m[~gain].sum())
         naive.append(measured_m[measured_m > 0].sum())
@@ -59,7 +60,34 @@ def test_a_single_block_beyond_the_noise_decides_for_itself_and_its_window():
     change_m[3, 3], window[3, 3] = -1.0, False
     change_m[0, 0] = np.nan
     change_m[4, 4] = 2.0
-    assert (gained(change_m, np.full((9, 9), 0.05)) == window).all()
+    sign = sign_of_change(change_m, np.full((9, 9), 0.05**2), np.zeros((9, 9)))
+    assert (sign.gained == window).all()
+
+
+def test_a_cell_without_neighbours_decides_itself():
+    change_m = np.full((9, 9), np.nan)
+    change_m[0, 0], change_m[8, 8] = 0.02, -0.02
+    sign = sign_of_change(change_m, np.full((9, 9), 0.05**2), np.zeros((9, 9)))
+    assert np.argwhere(sign.gained).tolist() == [[0, 0]]
+    assert not sign.certain.any()
+    assert sign.random_m2[0, 0] == 0.05**2
+
+
+@pytest.mark.parametrize(("sigma_m", "common_m"), [(0.01, 0.004), (0.002, 0.01), (0.01, 0.0)])
+def test_the_sign_of_even_change_is_certain_as_often_as_a_normal_mean_exceeds_its_sigma(sigma_m, common_m):
+    """In the middle of 5 x 5 cells: the mean of 24 values decides, and is certain beyond 1.96 sigma."""
+    rng, shape, true_m = np.random.default_rng(4), (5, 5), 0.006
+    certain, gains = [], []
+    for _ in range(4000):
+        measured_m = true_m + rng.normal(0, sigma_m, shape) + rng.normal(0, common_m)
+        sign = sign_of_change(measured_m, np.full(shape, sigma_m**2), np.full(shape, common_m**2))
+        gains.append(sign.gained[2, 2])
+        certain.append(sign.certain[2, 2])
+    deciding_m = np.sqrt(sigma_m**2 / 24 + common_m**2)
+    assert sign.random_m2[2, 2] == pytest.approx(sigma_m**2 / 24)
+    z, tolerance = true_m / deciding_m, 0.025
+    assert np.mean(gains) == pytest.approx(norm.cdf(z), abs=tolerance)
+    assert np.mean(certain) == pytest.approx(norm.cdf(z - 1.96) + norm.cdf(-z - 1.96), abs=tolerance)
 
 
 def test_thickness_between_levels_is_clipped():

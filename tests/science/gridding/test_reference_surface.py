@@ -7,8 +7,14 @@ import pytest
 
 from station.quantities import Grid, Reference, SharedParameters, VarianceComponents
 from station.science.gridding.gridder import Gridder
-from station.science.gridding.reference_surface import build_surface, errors_on_map, update_reference
+from station.science.gridding.reference_surface import (
+    build_surface,
+    errors_of_sop_scan,
+    errors_on_map,
+    update_reference,
+)
 from station.science.gridding.scan_stack import ScanStack
+from station.science.uncertainty.parameters import ParameterLayout
 
 GRID = Grid(west_m=1000.0, north_m=2000.0, cell_m=10.0, nx=60, ny=50)
 POSITION = (0.0, 0.0, 3000.0)
@@ -130,14 +136,35 @@ def test_scans_share_the_errors_of_the_scan_that_the_sop_is_from(sop_scan_count)
     rng, count = np.random.default_rng(5), 8
     bias = rng.normal(0.0, 1.0, (20_000, count + 1 - sop_scan_count))
     errors = bias[:, bias.shape[1] - count :] - bias[:, :1]
-    names = ("tilt_east", "heading", "range_bias")
-    shared = SharedParameters(names, ("rad", "rad", "m"), np.zeros(3), np.eye(3) / count, np.zeros(3))
+    params = ParameterLayout(0.0, 5, full_circle=False)
+    zeros = np.zeros(len(params.names))
+    shared = SharedParameters(params.names, params.units, zeros, np.eye(len(zeros)) / count, zeros)
     reference = replace(
         Reference.from_elevation(GRID, "1", np.zeros(GRID.shape)),
         shared=shared, scan_ids=tuple("abcdefgh"), sop_scan_count=sop_scan_count,
     )  # fmt: skip
-    variance = np.diag(errors_on_map(reference).covariance)
-    assert variance[0] == pytest.approx(errors.mean(axis=1).var(), rel=0.03)
-    assert variance[1] == pytest.approx(errors.mean(axis=1).var() / errors[:, -1].var(), rel=0.03)
-    assert variance[2] == 1 / count
-    assert errors_on_map(replace(reference, sop_scan_count=None)) is shared
+    variance = dict(zip(params.names, np.diag(errors_on_map(reference, params).covariance), strict=True))
+    for name in ("tilt_east", "tilt_north", "sight_tilt_003.0"):
+        assert variance[name] == pytest.approx(errors.mean(axis=1).var(), rel=0.03)
+    for name in ("heading", "translation_up"):
+        assert variance[name] == pytest.approx(errors.mean(axis=1).var() / errors[:, -1].var(), rel=0.03)
+    for name in ("range_bias", "range_scale", "refraction", "refraction_ice", "cross_tilt_005.0"):
+        assert variance[name] == 1 / count
+    assert errors_on_map(replace(reference, sop_scan_count=None), params) is shared
+    assert errors_on_map(reference, ParameterLayout(0.0, 10, full_circle=False)) is shared
+
+
+def test_a_scan_that_is_not_adjusted_has_the_error_of_the_scan_that_the_sop_is_from():
+    """20,000 scans, whose log is off by its own bias less that of the scan of the SOP."""
+    rng, params = np.random.default_rng(6), ParameterLayout(0.0, 5, full_circle=False)
+    bias = rng.normal(0.0, 2.0, (20_000, 2))
+    zeros = np.zeros(len(params.names))
+    shared = SharedParameters(params.names, params.units, zeros, 4.0 * np.eye(len(zeros)), zeros + 1.0)
+    reference = replace(Reference.from_elevation(GRID, "1", np.zeros(GRID.shape)), sop_scan_count=1)
+    total = shared + errors_of_sop_scan(shared, reference, params)
+    variance = dict(zip(params.names, np.diag(total.covariance), strict=True))
+    assert variance["tilt_north"] == pytest.approx(np.diff(bias).var(), rel=0.03)
+    assert variance["heading"] == variance["range_bias"] == 4.0
+    assert (total.line_tilt_variance == 1.0).all()
+    unknown = errors_of_sop_scan(shared, replace(reference, sop_scan_count=None), params)
+    assert not unknown.covariance.any()
