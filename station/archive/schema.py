@@ -236,8 +236,8 @@ VARIABLES: tuple[Variable, ...] = (
         "1",
         None,
         3,
-        comment="divided by change_step; sectors of 15 degree clockwise from north, 12 rings of 500 m each;"
-        " the correlation of the patterns of two scans is the correlation of their change_errors",
+        comment="divided by its standard deviation about the mean; sectors of 15 degree clockwise from north,"
+        " 12 rings of 500 m each; the correlation of the patterns of two scans is that of change_errors",
     ),
     Variable("scan_id", TEXT, "S1", "name of the scan"),
     Variable(

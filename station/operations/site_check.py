@@ -48,6 +48,7 @@ from station.readers.polygons import mended_outlines
 from station.readers.sop import valid_sop
 from station.readers.weather import interpolate_air, log_files, read_weather
 from station.scan_names import name_below, scan_stem
+from station.science.analysis.verdict import BRIGHT_GROUND, NO_BRIGHTNESS
 from station.science.geometry import inclination
 from station.science.geometry.pose import ScannerToMap
 from station.sections.inputs import SopSection
@@ -378,7 +379,7 @@ def _newest_scan(site: Site) -> Iterator[Finding]:
     if not valid_versions(series_for(site)) and not isinstance(site.reference.scans, Path):
         message += " (no reference yet: once there is one, sigma is smaller)"
     yield _finding("ok" if verdict == "good" else "warning", "scan", message)
-    if "no brightness" in reason:
+    if any(fault in reason for fault in (NO_BRIGHTNESS, BRIGHT_GROUND)):
         yield _finding(
             "warning",
             "brightness",

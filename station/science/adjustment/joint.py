@@ -51,15 +51,15 @@ HEADING_CLOCKWISE = np.array([1.0, 1.0, -1.0])  # against a rotation about up
 class Adjustment:
     """Adjusted scanner state relative to the SOP: globals, tilt by line group, refraction, cross tilt.
 
-    `change_size_m` is one sigma of the change of moving ground. `stable_weights` (patches,) are the robust
-    weights of the stable patches, 0 to 1. `leverage_m2` holds the leverage variances of moving and stable
-    cells (see `leverage`). `mean_sigma_m` is the uncertainty of the mean height of moving ground that comes
-    from the state. `sigma` (p,) is that of each parameter; `redundancy` (p,) is the share of its prior
-    variance that the scan has removed: 0 if its value is the prior's, 1 if the observations alone determine
-    it. `log` is the inclination
-    log that was used, and `predicted_log_rad` (lines,) is what the adjustment predicts for it, without the
-    errors of the sensor. `unapplied_rad` (3,) is the estimated rotation about east, north and up that the
-    points lack, as a mean over the lines.
+    `change_size_m` is the size of the change of moving ground, from its mean and one sigma about it.
+    `stable_weights` (patches,) are the robust weights of the stable patches, 0 to 1. `leverage_m2` holds the
+    leverage variances of moving and stable cells (see `leverage`). `mean_sigma_m` is the uncertainty of the
+    mean height of moving ground that comes from the state. `sigma` (p,) is that of each parameter;
+    `redundancy` (p,) is the share of its prior variance that the scan has removed: 0 if its value is the
+    prior's, 1 if the observations alone determine it. `log` is the inclination log that was used, and
+    `predicted_log_rad` (lines,) is what the adjustment predicts for it, without the errors of the sensor.
+    `unapplied_rad` (3,) is the estimated rotation about east, north and up that the points lack, as a mean
+    over the lines.
     """
 
     params: ParameterLayout
