@@ -20,6 +20,7 @@ from station.science.time_series.contrast_errors import ContrastErrors
 from station.science.time_series.surroundings import NEIGHBOURS, TILE, nanmedian, surroundings, tiles_of
 from station.science.time_series.window_scores import (
     BlockChange,
+    block_weights,
     may_exceed,
     scan_differences,
     smaller_of_both,
@@ -169,9 +170,11 @@ def _local_regions(
     changes: Sequence[BlockChange], history_m: Floats, rock: Bools, sigmas: float
 ) -> Iterator[Region]:
     """Yield connected blocks whose change less that of their surroundings exceeds the threshold."""
-    shape = rock.shape
+    shape, weights = rock.shape, block_weights(changes, rock)
     sizes = [
-        size for size in WINDOWS if size <= min(shape) and may_exceed(changes, size, sigmas, MIN_DEPTH_M)
+        size
+        for size in WINDOWS
+        if size <= min(shape) and may_exceed(changes, size, weights, sigmas, MIN_DEPTH_M)
     ]
     if not sizes:
         return
@@ -179,7 +182,7 @@ def _local_regions(
     score, depth_m, source = np.zeros(shape), np.zeros(shape), np.zeros(shape, np.int64)
     windows: list[tuple[slice, slice]] = []
     for size in sizes:
-        mean_m, window_z = window_scores(changes, size, differences_m, rock)
+        mean_m, window_z = window_scores(changes, size, weights, differences_m, rock)
         hit = (np.abs(window_z) > sigmas) & (np.abs(mean_m) > MIN_DEPTH_M)
         for row, column in np.argwhere(hit).tolist():  # few
             window = slice(row, row + size), slice(column, column + size)
@@ -188,7 +191,7 @@ def _local_regions(
             depth_m[window][higher] = mean_m[row, column]
             source[window][higher] = len(windows)
             windows.append(window)
-    excess_m, block_z = window_scores(changes, 1, differences_m, rock)
+    excess_m, block_z = window_scores(changes, 1, weights, differences_m, rock)
     for sign in (1, -1):
         inside = sign * score > 0
         member = inside & (sign * excess_m > sign * depth_m / 2)

@@ -17,6 +17,7 @@ TAIL_QUANTILE, TAIL_SIGMAS = 0.99, 2.576  # two-sided, of a normal distribution
 OUTLIER_SIGMAS = 6.0  # beyond, a window has changed, and is no sample of the errors
 SCATTER_VARIANCE = 1.3  # of a scan less the median of six, over that of a scan
 SCATTER_QUANTILE, SCATTER_SIGMAS = 0.9, 1.645  # of absolute values, two-sided
+MIN_VARIANCE = 0.25  # that gives a block more weight, in units of that of the blocks around
 TINY = 1e-9
 
 
@@ -43,48 +44,61 @@ def scan_differences(history_m: Floats) -> Floats:
     return differences_m - around_m / np.maximum(share, TINY)
 
 
-def window_scatter(differences_m: Floats, size: int) -> Floats:
-    """Return the variance of the means of windows in one scan [m²], as consecutive scans differ.
+def block_weights(changes: Sequence[BlockChange], rock: Bools) -> Floats:
+    """Return the weights of blocks (by, bx) in the mean of a window: inverse to their random variance.
+
+    On rough rock it differs a hundredfold. No block counts as better than half of the sigma that is usual
+    around it, so that none is most of a window.
+    """
+    random_m2 = np.mean([change.random_m2 for change in changes], axis=0)
+    random_m2[random_m2 == 0] = np.nan
+    least_m2 = MIN_VARIANCE * surroundings(random_m2, rock)
+    return np.nan_to_num(least_m2 / np.maximum(random_m2, least_m2))
+
+
+def window_scatter(differences_m: Floats, size: int, weights: Floats) -> Floats:
+    """Return the variance of the weighted means of windows in one scan [m²], as consecutive scans differ.
 
     The shape is (by - size + 1, bx - size + 1). The tenth largest of a hundred differences is used: one event
     does not raise it, but an edge does, which beams hit in some scans only. Its neighbours are on the same
-    edge, so that a window has the largest variance of those around it.
+    edge, so that a window has at least the mean variance of those around it.
     """
     means_m = []
     for difference_m in differences_m:
-        observed = np.isfinite(difference_m)
-        count = _window_sums(observed, size)
-        count[count < MIN_OBSERVED * size**2] = np.nan
-        means_m.append(np.abs(_window_sums(np.where(observed, difference_m, 0.0), size)) / count)
+        seen = _Windows(np.isfinite(difference_m), size, weights)
+        means_m.append(np.abs(seen.mean(difference_m)))
     ordered = np.sort(means_m, axis=0)  # NaN last
     pairs = np.isfinite(ordered).sum(axis=0)
     rank = np.maximum(np.ceil(SCATTER_QUANTILE * pairs).astype(np.int64) - 1, 0)
     typical_m = np.nan_to_num(np.take_along_axis(ordered, rank[None], 0)[0])
-    return np.asarray(ndimage.maximum_filter(typical_m**2 / (2 * SCATTER_SIGMAS**2), 3))
+    variance_m2 = typical_m**2 / (2 * SCATTER_SIGMAS**2)
+    return np.maximum(variance_m2, ndimage.uniform_filter(variance_m2, 3))
 
 
-def may_exceed(changes: Sequence[BlockChange], size: int, sigmas: float, depth_m: float) -> bool:
+def may_exceed(
+    changes: Sequence[BlockChange], size: int, weights: Floats, sigmas: float, depth_m: float
+) -> bool:
     """Return True if windows exceed both thresholds by their stated errors, in both scans: few scans do."""
-    means, variances = zip(*(_window_means(change, size) for change in changes), strict=True)
+    means, variances = zip(*(_window_means(change, size, weights) for change in changes), strict=True)
     mean_m = np.abs(smaller_of_both(*means))
     return bool(((mean_m > depth_m) & (mean_m > sigmas * np.sqrt(np.fmin(*variances)))).any())
 
 
 def window_scores(
-    changes: Sequence[BlockChange], size: int, differences_m: Floats, rock: Bools
+    changes: Sequence[BlockChange], size: int, weights: Floats, differences_m: Floats, rock: Bools
 ) -> tuple[Floats, Floats]:
     """Return mean [m] and z of the windows (by - size + 1, bx - size + 1) that both scans confirm, else 0.
 
     The variance is that of the errors, or what the window scattered before, if that is more. If windows
     around it have a larger z than normal errors, so has this one.
     """
-    scatter_m2 = SCATTER_VARIANCE * window_scatter(differences_m, size)
+    scatter_m2 = SCATTER_VARIANCE * window_scatter(differences_m, size, weights)
     height, width = scatter_m2.shape
     middle = size // 2
     ground = rock[middle : middle + height, middle : middle + width]
     means, scores = [], []
     for change in changes:
-        mean_m, variance_m2 = _window_means(change, size)
+        mean_m, variance_m2 = _window_means(change, size, weights)
         z = mean_m / np.sqrt(np.maximum(variance_m2, scatter_m2))
         z /= np.fmax(surroundings(np.abs(z), ground) / MEDIAN_ABSOLUTE_NORMAL, 1.0)
         for kind in (ground, ~ground):
@@ -94,16 +108,32 @@ def window_scores(
     return smaller_of_both(*means), smaller_of_both(*scores)
 
 
-def _window_means(change: BlockChange, size: int) -> tuple[Floats, Floats]:
-    """Return the mean [m] and its variance of all windows, NaN where a window is hardly observed."""
-    observed = np.isfinite(change.change_m) & (change.random_m2 > 0)
-    count = _window_sums(observed, size)
-    count[count < MIN_OBSERVED * size**2] = np.nan
-    mean_m, random_m2, systematic_m2 = (
-        _window_sums(np.where(observed, values, 0.0), size) / count
-        for values in (change.change_m, change.random_m2, change.systematic_m2)
-    )
-    return mean_m, random_m2 / count + systematic_m2
+class _Windows:
+    """Windows of size × size blocks (by, bx) with weights, of which some are observed."""
+
+    def __init__(self, observed: Bools, size: int, weights: Floats) -> None:
+        self._weights, self._size = np.where(observed, weights, 0.0), size
+        self._total = _window_sums(self._weights, size)
+        self._total[_window_sums(observed, size) < MIN_OBSERVED * size**2] = np.nan
+        self._total[self._total < TINY] = np.nan
+
+    def mean(self, values: Floats) -> Floats:
+        """Return the weighted means of blocks (by, bx), NaN where a window is hardly observed."""
+        return self._sum(values) / self._total
+
+    def variance_of_mean(self, variances: Floats) -> Floats:
+        """Return the variance of the weighted means of blocks with independent errors."""
+        return self._sum(self._weights * variances) / self._total**2
+
+    def _sum(self, values: Floats) -> Floats:
+        return _window_sums(np.where(self._weights > 0, self._weights * values, 0.0), self._size)
+
+
+def _window_means(change: BlockChange, size: int, weights: Floats) -> tuple[Floats, Floats]:
+    """Return the weighted mean [m] and its variance of all windows, NaN where a window is hardly observed."""
+    seen = _Windows(np.isfinite(change.change_m) & (change.random_m2 > 0), size, weights)
+    variance_m2 = seen.variance_of_mean(change.random_m2) + seen.mean(change.systematic_m2)
+    return seen.mean(change.change_m), variance_m2
 
 
 def _tail_factor(absolute_z: Floats) -> float:
