@@ -72,7 +72,7 @@ def window_scatter(differences_m: Floats, size: int, weights: Floats) -> Floats:
     rank = np.maximum(np.ceil(SCATTER_QUANTILE * pairs).astype(np.int64) - 1, 0)
     typical_m = np.nan_to_num(np.take_along_axis(ordered, rank[None], 0)[0])
     variance_m2 = typical_m**2 / (2 * SCATTER_SIGMAS**2)
-    return np.maximum(variance_m2, ndimage.uniform_filter(variance_m2, 3))
+    return np.asarray(np.maximum(variance_m2, ndimage.uniform_filter(variance_m2, 3)))
 
 
 def may_exceed(

@@ -252,7 +252,7 @@ def test_scatter_beyond_sigma_averages_out_over_an_event_and_is_none_itself():
 
 @pytest.mark.integration
 def test_a_small_deposit_is_found_among_blocks_of_very_different_sigma():
-    """A third of the blocks has σ of 0.25 m. The plain mean of a window of four such has 0.07 m, z about 4."""
+    """A third of the blocks has σ of 0.25 m: with one of them the plain mean of four has 0.07 m."""
     found = seen = 0
     for seed in range(8):
         valley = Valley(seed)
@@ -263,7 +263,9 @@ def test_a_small_deposit_is_found_among_blocks_of_very_different_sigma():
         if deposit[~valley.unseen & ~uncertain].sum() < 0.5 * deposit.sum():
             continue
         scans = [
-            replace(valley.scan(valley.rng.normal(0, sigma_m) + (number >= 24) * deposit), random_m2=sigma_m**2)
+            replace(
+                valley.scan(valley.rng.normal(0, sigma_m) + (number >= 24) * deposit), random_m2=sigma_m**2
+            )
             for number in range(26)
         ]
         assert valley.regions(scans[:24]) == []
