@@ -230,48 +230,44 @@ def test_blocks_at_an_edge_raise_no_event():
         assert valley.regions(scans[:last]) == []
 
 
-def test_scatter_beyond_sigma_averages_out_over_an_event_and_is_none_itself():
-    """Rough rock, hit otherwise in each scan: blocks scatter by 0.1 m, three times their sigma and more."""
+def found_and_seen(seeds, deposit_of, scan_of):
+    """Return how many deposits are found, and how many are seen by 60 %; without them nothing is found."""
     found = seen = 0
-    for seed in range(6):
+    for seed in range(seeds):
         valley = Valley(seed)
         row, column = valley.rng.uniform(8, SHAPE[0] - 8), valley.rng.uniform(24, SHAPE[1] - 8)
-        deposit = disc(row, column, 3000, 0.4)
+        deposit = deposit_of(row, column)
         if deposit[~valley.unseen].sum() < 0.6 * deposit.sum():
             continue
-        scans = [
-            valley.scan(0.1 * valley.rng.normal(size=SHAPE) + (number >= 24) * deposit)
-            for number in range(26)
-        ]
+        scans = [scan_of(valley, (number >= 24) * deposit) for number in range(26)]
         assert valley.regions(scans[:24]) == []
         regions = valley.regions(scans)
         seen += 1
         found += len(regions) == 1 and overlaps(regions[0].blocks, deposit > 0.1)
+    return found, seen
+
+
+def test_scatter_beyond_sigma_averages_out_over_an_event_and_is_none_itself():
+    """Rough rock, hit otherwise in each scan: blocks scatter by 0.1 m, three times their sigma and more."""
+    found, seen = found_and_seen(
+        6,
+        lambda row, column: disc(row, column, 3000, 0.4),
+        lambda valley, surface_m: valley.scan(surface_m + 0.1 * valley.rng.normal(size=SHAPE)),
+    )
     assert found == seen >= 4
 
 
 @pytest.mark.integration
 def test_a_small_deposit_is_found_among_blocks_of_very_different_sigma():
-    """A third of the blocks has σ of 0.25 m: with one of them the plain mean of four has 0.07 m."""
-    found = seen = 0
-    for seed in range(8):
-        valley = Valley(seed)
-        uncertain = valley.rng.random(SHAPE) < 1 / 3
-        sigma_m = np.where(uncertain, 0.25, 0.03)
-        row, column = valley.rng.uniform(8, SHAPE[0] - 8), valley.rng.uniform(24, SHAPE[1] - 8)
-        deposit = disc(row, column, 500, 0.3)
-        if deposit[~valley.unseen & ~uncertain].sum() < 0.5 * deposit.sum():
-            continue
-        scans = [
-            replace(
-                valley.scan(valley.rng.normal(0, sigma_m) + (number >= 24) * deposit), random_m2=sigma_m**2
-            )
-            for number in range(26)
-        ]
-        assert valley.regions(scans[:24]) == []
-        regions = valley.regions(scans)
-        seen += 1
-        found += len(regions) == 1 and overlaps(regions[0].blocks, deposit > 0.1)
+    """Every third block has σ of 0.25 m: with one of them the plain mean of four has 0.07 m."""
+    sigma_m = np.where((ROW + 2 * COLUMN) % 3 == 0, 0.25, 0.03)
+    found, seen = found_and_seen(
+        8,
+        lambda row, column: disc(row, column, 500, 0.3),
+        lambda valley, surface_m: replace(
+            valley.scan(surface_m + valley.rng.normal(0, sigma_m)), random_m2=SIGMA_M**2 + sigma_m**2
+        ),
+    )
     assert found == seen >= 4
 
 
