@@ -1,6 +1,6 @@
 """Run the commands and the Python of README.md and docs/, page by page.
 
-A page runs in a folder of its own that holds `demo-station`, a simulated station of three hours, processed
+A page runs in a folder of its own that holds `station-demo`, a simulated station of three hours, processed
 once. Fenced blocks run in their order on the page:
 
     ```console              each line `$ command`, by bash; other lines are sample output and are not compared
@@ -93,9 +93,9 @@ def environment(tmp_path_factory):
 def demo_station(tmp_path_factory, environment):
     """Simulate and process a station; return its folder."""
     folder = tmp_path_factory.mktemp("docs")
-    run("station simulate demo-station --hours 3", folder, environment)
-    run("station process demo-station/site.toml demo-station/inbox/*.laz", folder, environment)
-    return folder / "demo-station"
+    run("station simulate station-demo --hours 3", folder, environment)
+    run("station process station-demo/site.toml station-demo/inbox/*.laz", folder, environment)
+    return folder / "station-demo"
 
 
 def run(command, folder, environment):
@@ -140,7 +140,7 @@ class Python:
 
 @pytest.mark.parametrize("page", [page for page in PAGES if blocks(page)], ids=str)
 def test_snippets_run(page, demo_station, environment, tmp_path):
-    shutil.copytree(demo_station, tmp_path / "demo-station")
+    shutil.copytree(demo_station, tmp_path / "station-demo")
     python = Python(tmp_path, environment)
     try:
         for block in blocks(page):
