@@ -17,7 +17,7 @@ TAIL_QUANTILE, TAIL_SIGMAS = 0.99, 2.576  # two-sided, of a normal distribution
 OUTLIER_SIGMAS = 6.0  # beyond, a window has changed, and is no sample of the errors
 SCATTER_VARIANCE = 1.3  # of a scan less the median of six, over that of a scan
 SCATTER_QUANTILE, SCATTER_SIGMAS = 0.9, 1.645  # of absolute values, two-sided
-MIN_VARIANCE = 0.25  # that gives a block more weight, in units of that of the blocks around
+MIN_VARIANCE = 0.25  # of a block, for its weight, over the usual variance around it
 TINY = 1e-9
 
 

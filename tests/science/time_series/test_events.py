@@ -19,7 +19,12 @@ from station.science.time_series.events import (
     overlaps,
 )
 from station.science.time_series.surroundings import surrounding_weights, surroundings
-from station.science.time_series.window_scores import scan_differences, window_scatter
+from station.science.time_series.window_scores import (
+    BlockChange,
+    block_weights,
+    scan_differences,
+    window_scatter,
+)
 
 SHAPE = 60, 80
 HOURS_PER_YEAR = 8766
@@ -215,6 +220,22 @@ def test_scatter_of_windows_is_that_of_consecutive_scans_whatever_the_trend():
         assert expected_m < np.median(np.sqrt(scatter_m2)) < 1.2 * expected_m
     edge = np.where(rng.random((24, 40, 50)) < 0.3, 0.6, 0.0)
     assert np.sqrt(window_scatter(scan_differences(noise + edge), 1, equal)).min() > 0.2
+
+
+def test_weighted_means_of_windows_scatter_as_means_of_least_variance_do():
+    """One block of four has ten times the σ: √(1 / (3 / σ² + 1 / (10 σ)²)), the plain mean 2.5 σ."""
+    sigma_m = np.where((ROW % 2 == 0) & (COLUMN % 2 == 0), 0.2, 0.02)
+    weights = block_weights([BlockChange(np.zeros(SHAPE), sigma_m**2, np.zeros(SHAPE))], ROCK)
+    noise = np.random.default_rng(0).normal(0, sigma_m, (25, *SHAPE))
+    scatter_m = np.sqrt(np.median(window_scatter(scan_differences(noise), 2, weights)))
+    assert 1.0 < scatter_m / (0.02 / np.sqrt(3.01)) < 1.2  # at least the mean of nine windows
+
+
+def test_no_block_is_most_of_a_window_because_its_stated_sigma_is_small():
+    sigma_m = np.full(SHAPE, 0.02)
+    sigma_m[30, 40] = 0.0002
+    weights = block_weights([BlockChange(np.zeros(SHAPE), sigma_m**2, np.zeros(SHAPE))], ROCK)
+    assert weights[30, 40] / weights[30, 41] == pytest.approx(4.0)
 
 
 def test_blocks_at_an_edge_raise_no_event():
