@@ -24,10 +24,12 @@ from station.archive.raster_io import Array
 from station.archive.reference_files import reference_path
 from station.archive.schema import FILL
 from station.quantities import Floats, Grid, Quality, Reference
+from station.science.time_series.events import BlockLevels
 
 FOLDER = ".block_sums"  # in the data folder
 MOST_SMALL_BLOCKS = 50_000  # of less than 10 m: they cost as much as those of a valley
-FORMAT = 2  # of the kept sums
+FORMAT = 3  # of the kept sums
+MIN_RANDOM_M = 0.001  # one sigma of a cell, for its weight
 QUALITY = "quality"
 ROCK = int(Quality.STABLE_GROUND | Quality.BARE_GROUND)
 
@@ -80,10 +82,14 @@ class EpochSummer:
         row, column = np.divmod(cell, grid.nx)
         width = int(self._columns[-1]) + 1
         height = -(-len(rasters[CHANGE]) // self._cells)
+        random_m2 = rasters[RANDOM].ravel()[cell].astype(np.float64) ** 2
+        weight = 1 / np.maximum(random_m2, MIN_RANDOM_M**2)
         fields = {
             "count": None,
             "change_m": change_m[cell],
-            "random_m2": rasters[RANDOM].ravel()[cell].astype(np.float64) ** 2,
+            "random_m2": random_m2,
+            "weight": weight,
+            "weighted_change_m": weight * change_m[cell],
             "rock": (rasters[QUALITY].ravel()[cell] & ROCK) > 0,
             "x_m": grid.x_m[column],
             "y_m": grid.y_m[self._top :][row],
@@ -151,6 +157,29 @@ def reference_sums(series: Series, reference: Reference) -> Sums:
     sums = {name: np.concatenate([band[name] for band in bands]) for name in bands[0]}
     _keep(path, source, sums)
     return sums
+
+
+def block_levels(epoch: Sums, reference: Sums) -> BlockLevels:
+    """Return the plain means over blocks of an epoch, as a volume needs them."""
+    count = np.maximum(epoch["count"], 1)
+    return _levels(epoch["change_m"] / count, epoch["random_m2"] / count**2, epoch, reference)
+
+
+def precise_levels(epoch: Sums, reference: Sums) -> BlockLevels:
+    """Return the means over blocks of an epoch with the smallest random variance: the weights are 1/σ²."""
+    weight = np.where(epoch["count"] > 0, epoch["weight"], 1.0)
+    return _levels(epoch["weighted_change_m"] / weight, 1 / weight, epoch, reference)
+
+
+def _levels(change_m: Floats, random_m2: Floats, epoch: Sums, reference: Sums) -> BlockLevels:
+    """Return levels without the variance of the reference, which is the same share of it in all cells."""
+    observed = (epoch["count"] > 0) & (reference["known"] > 0)
+    reference_m2 = epoch["count"] * reference["random_m2"] / np.maximum(reference["known"], 1)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        share = np.where(observed, 1 - reference_m2 / epoch["random_m2"], 0.0)
+    return BlockLevels(
+        np.where(observed, change_m, np.nan), np.where(observed, np.maximum(share, 0.0) * random_m2, 0.0)
+    )
 
 
 def drop_epoch_sums(series: Series, needed: Collection[str]) -> None:

@@ -11,7 +11,6 @@ from typing import Any
 
 import numpy as np
 import shapely
-from scipy import ndimage
 
 from station.archive.derived.event_table import (
     KEY_LENGTH,
@@ -28,13 +27,12 @@ from station.archive.epochs import EpochRef
 from station.archive.netcdf_layout import Series
 from station.archive.series.index import SeriesIndex, references_and_usable
 from station.errors import StoreError
-from station.quantities import Bools, Floats, Grid, Ints, SharedParameters
-from station.queries.block_sums import epoch_sums
+from station.quantities import Bools, Grid, Ints, SharedParameters
+from station.queries.block_sums import Sums, block_levels, epoch_sums, precise_levels
 from station.queries.blocks import BlockQueries, Blocks
 from station.queries.common_errors import common_error_covariance
 from station.queries.epoch_cells import EpochCells, EpochReader
-from station.science.analysis.voids import area_weights, void_variance
-from station.science.time_series import event_errors
+from station.science.time_series import event_errors, event_volumes
 from station.science.time_series.event_tracks import Track, pair_tracks, track_events
 from station.science.time_series.events import (
     BEFORE,
@@ -44,16 +42,13 @@ from station.science.time_series.events import (
     detect_regions,
     event_thresholds,
 )
-from station.science.time_series.surroundings import NEIGHBOURS, surrounding_weights
 
 HISTORY = 24  # scans before the two newest, which show how a block scatters
 LEAST_HISTORY = 8
 YEAR_S = 365.25 * 86_400
 CACHED_EPOCHS = 5  # whose shared parameters are in memory
 RETAINED_SIGMA = 0.02  # of the share of a change that cells with few points retain (accuracy.md)
-EDGE_BLOCKS = 2  # around what was detected: an event covers them in part
 SEARCHES_KEPT = 200  # at once: a long search of a whole series can be interrupted
-EDGE_SIGMAS = 3.0  # of a block at the edge that has changed the other way: it belongs to another event
 
 
 @dataclass(frozen=True)
@@ -194,16 +189,13 @@ class EventQueries:
 
     def _read_levels(self, scan: int) -> BlockLevels:
         """Return the levels of a scan: of its sums alone, which is all that most scans of a window need."""
+        return precise_levels(*self._sums(scan))
+
+    def _sums(self, scan: int) -> tuple[Sums, Sums]:
+        """Return the sums of a scan and of its reference."""
         is_needed_again = scan >= len(self._names) - 1 - HISTORY
         sums = epoch_sums(self._series, self._epoch(scan), keep=is_needed_again)
-        surface = self._queries.reference_blocks(self._version(scan))
-        count, known = np.maximum(sums["count"], 1), np.maximum(surface["known"], 1)
-        observed = (sums["count"] > 0) & (surface["known"] > 0)
-        random_m2 = sums["random_m2"] / count**2 - surface["random_m2"] / known / count
-        return BlockLevels(
-            np.where(observed, sums["change_m"] / count, np.nan),
-            np.where(observed, np.maximum(random_m2, 0.0), 0.0),
-        )
+        return sums, self._queries.reference_blocks(self._version(scan))
 
     def _read_shared(self, scan: int) -> EpochCells:
         return self._reader.read_shared(self._epoch(scan))
@@ -316,71 +308,25 @@ class EventQueries:
         return _Volume(*self._used[key])
 
     def _measure(self, track: Track, others: Bools, before: range, after: list[int]) -> list[float]:
-        """Return the volume of an event and its σ [m³], from the scans before and after it.
-
-        A widespread event counts in full, another one less what its surroundings did. Blocks within it that
-        were not observed are interpolated.
-        """
+        """Return the volume of an event and its σ [m³], from the scans before and after it."""
         newest = self._queries.read(self._epoch(after[-1]))
-        base = before_level([self._levels(scan) for scan in before])
-        level = _mean_level(self._levels(after[0]), self._levels(after[1]))
-        change_m, random_m2 = level.change_m - base.change_m, level.random_m2 + base.random_m2
-        known = np.isfinite(change_m) & newest.observed
-        core = track.blocks & known
-        if not core.any():
-            return [0.0, 0.0]
-        rock = newest.rock > 0.5
-        ground = rock if rock[core].mean() > 0.5 else ~rock
-        usable = known & ground & ~others
-        members = _members(track, core, known, usable, change_m, random_m2)
+        levels = [block_levels(*self._sums(scan)) for scan in (*after, *before)]
+        level, base = event_volumes.mean_level(*levels[:2]), before_level(levels[2:])
+        change_m = np.where(newest.observed, level.change_m - base.change_m, np.nan)
+        change = BlockLevels(change_m, level.random_m2 + base.random_m2)
         surface = self._queries.reference_blocks(self._version(after[-1]))["known"] > 0
-        if not track.widespread:
-            members |= ndimage.binary_closing(core, NEIGHBOURS, EDGE_BLOCKS) & ~known & surface
-        filled, distance = area_weights(members, known)
-        area_m2 = np.count_nonzero(members) * self.grid.cell_m**2
-        around = np.zeros_like(filled)
-        if not track.widespread:
-            around = np.maximum(-surrounding_weights(members, usable), 0.0)
-        weights = area_m2 * (filled - around)
-        volume_m3 = float(np.sum(weights[known] * change_m[known]))
-        variance = float(np.sum(weights[known] ** 2 * random_m2[known]))
+        parts = event_volumes.volume_parts(track, change, newest.rock > 0.5, others, surface)
+        if parts is None:
+            return [0.0, 0.0]
         difference = _difference(newest.cells, self._shared(before[-1]))
-        variance += _systematic_errors(newest).of_sum(weights, difference)
-        variance += event_errors.sampling_variance(newest.count, self._queries.cells, weights, change_m)
-        variance += area_m2**2 * void_variance(
-            members, distance, np.where(known, change_m, np.nan), random_m2
+        variance_m2 = (
+            parts.variance_m2
+            + _systematic_errors(newest).of_sum(parts.weights, difference)
+            + event_errors.sampling_variance(newest.count, self._queries.cells, parts.weights, change_m)
+            + (RETAINED_SIGMA * parts.sum_m) ** 2
         )
-        variance += (RETAINED_SIGMA * volume_m3) ** 2
-        if around.any():
-            variance += area_m2**2 * event_errors.like_regions_variance(members, usable, change_m, random_m2)
-        return [round(volume_m3, 4), round(float(np.sqrt(variance)), 4)]
-
-
-def _mean_level(first: BlockLevels, second: BlockLevels) -> BlockLevels:
-    """Return the mean level of two scans (by, bx), that of one where the other lacks it."""
-    levels_m = np.stack([first.change_m, second.change_m])
-    observed = np.isfinite(levels_m)
-    count = observed.sum(axis=0)
-    with np.errstate(invalid="ignore", divide="ignore"):
-        mean_m = np.where(observed, levels_m, 0.0).sum(axis=0) / count
-        random_m2 = np.where(observed, [first.random_m2, second.random_m2], 0.0).sum(axis=0) / count**2
-    return BlockLevels(mean_m, random_m2)
-
-
-def _members(
-    track: Track, core: Bools, known: Bools, usable: Bools, change_m: Floats, random_m2: Floats
-) -> Bools:
-    """Return the observed blocks (by, bx) of an event, with those at its edge, which it covers in part.
-
-    Blocks at the edge that changed the other way belong to another event.
-    """
-    if track.widespread:
-        return core.copy()
-    around = np.maximum(-surrounding_weights(core, usable), 0.0)
-    level_m = float(np.sum(around[around > 0] * change_m[around > 0]))
-    opposite_m = -track.sign * (change_m - level_m)
-    edge = ndimage.binary_dilation(core, NEIGHBOURS, EDGE_BLOCKS) & known
-    return np.asarray(core | (edge & (opposite_m < EDGE_SIGMAS * np.sqrt(random_m2))))
+        block_m2 = self.grid.cell_m**2
+        return [round(block_m2 * parts.sum_m, 4), round(block_m2 * float(np.sqrt(variance_m2)), 4)]
 
 
 def _systematic_errors(blocks: Blocks) -> event_errors.SystematicErrors:
