@@ -13,14 +13,22 @@ from support.shared_parameters import SCANNER, random_shared
 
 import station
 from station.archive import epochs
+from station.archive.derived.computed_rasters import CHANGE, RANDOM
 from station.archive.derived.fingerprints import is_intact, write_fingerprints
 from station.archive.netcdf_layout import Series
 from station.archive.reference_files import write_reference
+from station.archive.schema import FILL
 from station.archive.series.index import SeriesIndex, list_epochs
 from station.archive.series.virtual import build_series
 from station.quantities import Grid, Quality, Reference
 from station.queries import block_sums
-from station.queries.block_sums import FOLDER, EpochSummer, keep_epoch_sums
+from station.queries.block_sums import (
+    FOLDER,
+    EpochSummer,
+    block_levels,
+    keep_epoch_sums,
+    precise_levels,
+)
 from station.queries.blocks import BlockQueries, update_boxes
 
 GRID = Grid(
@@ -296,6 +304,31 @@ def test_sums_kept_while_an_epoch_is_written_have_the_bits_of_the_stored_rasters
         kept.write_bytes(damaged)
         for name, values in BlockQueries(stored).boxes(ref).items():
             assert values.tobytes() == expected[name].tobytes()
+
+
+def test_precise_means_of_blocks_have_the_least_variance():
+    """σ of cells differs tenfold: the weights of least squares, 1/σ², and how such means scatter."""
+    rng = np.random.default_rng(3)
+    sigma_m = np.where(rng.uniform(size=GRID.shape) < 0.4, 0.3, 0.03).astype(np.float32)
+    reference = {"known": np.full((18, 26), 25.0), "random_m2": np.full((18, 26), 0.0)}
+    levels, plain = [], []
+    for _ in range(200):
+        change_m = np.where(rng.uniform(size=GRID.shape) < 0.8, sigma_m * rng.normal(size=GRID.shape), FILL)
+        summer = EpochSummer(GRID)
+        summer.add(
+            slice(0, GRID.ny), {CHANGE: change_m, RANDOM: sigma_m, "quality": np.zeros(GRID.shape, int)}
+        )
+        levels.append(precise_levels(summer.sums(), reference))
+        plain.append(block_levels(summer.sums(), reference))
+    seen = change_m[:5, :5] < FILL
+    weights = seen / sigma_m[:5, :5] ** 2.0
+    assert levels[-1].change_m[0, 0] == pytest.approx(np.sum(weights * change_m[:5, :5]) / weights.sum())
+    assert levels[-1].random_m2[0, 0] == pytest.approx(1 / weights.sum())
+    assert plain[-1].change_m[0, 0] == pytest.approx(change_m[:5, :5][seen].mean())
+    for means, most in ((levels, 0.2), (plain, 1.0)):
+        z = np.array([level.change_m / np.sqrt(level.random_m2) for level in means])
+        assert np.std(z) == pytest.approx(1.0, abs=0.02)
+        assert np.median(means[-1].random_m2) < most * np.median(plain[-1].random_m2) * 1.01
 
 
 def test_kept_sums_of_another_file_of_that_name_are_not_used(stored):

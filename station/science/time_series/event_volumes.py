@@ -50,21 +50,20 @@ def volume_parts(
     usable = known & ground & ~others
     members = core.copy() if track.widespread else _with_edge(track, core, known, usable, change, surface)
     filled, distance = area_weights(members, known)
-    blocks = int(np.count_nonzero(members))
-    weights, around = blocks * filled, np.zeros_like(filled)
-    variance_m2 = blocks**2 * void_variance(members, distance, change.change_m, change.random_m2)
+    around = np.zeros_like(filled)
     if not track.widespread:
         around = np.maximum(-surrounding_weights(members, usable), 0.0)
-        level_m = float(np.sum((around * change.change_m)[around > 0]))
-        edge_m2 = (EDGE_SHARE * (float(change.change_m[core].mean()) - level_m)) ** 2
-        edge = members & known & ~core
-        left_out = np.where(edge, change.random_m2 / np.maximum(edge_m2 + change.random_m2, TINY_M2), 0.0)
-        variance_m2 += edge_m2 * float(np.sum((weights * left_out) ** 2))
-        weights = weights * (1 - left_out)
+    level_m = float(np.sum((around * change.change_m)[around > 0]))
+    edge_m2 = (EDGE_SHARE * (float(change.change_m[core].mean()) - level_m)) ** 2
+    edge = members & known & ~core
+    left_out = np.where(edge, change.random_m2 / np.maximum(edge_m2 + change.random_m2, TINY_M2), 0.0)
+    blocks = int(np.count_nonzero(members))
+    weights = blocks * filled * (1 - left_out)
+    variance_m2 = edge_m2 * float(np.sum((blocks * filled * left_out) ** 2))
+    variance_m2 += blocks**2 * void_variance(members, distance, change.change_m, change.random_m2)
     if around.any():
-        variance_m2 += weights.sum() ** 2 * like_regions_variance(
-            members, usable, change.change_m, change.random_m2
-        )
+        patches_m2 = like_regions_variance(members, usable, change.change_m, change.random_m2)
+        variance_m2 += weights.sum() ** 2 * patches_m2
     weights = weights - weights.sum() * around
     variance_m2 += float(np.sum((weights**2 * change.random_m2)[known]))
     return VolumeParts(weights, float(np.sum((weights * change.change_m)[known])), variance_m2)
