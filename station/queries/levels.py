@@ -44,7 +44,7 @@ from station.queries.level_filter import DAY_S, LevelFilter
 if TYPE_CHECKING:
     import xarray as xr
 
-FORMAT = 3  # of the filter: another one computes all files again
+FORMAT = 4  # of the filter: another one computes all files again
 RECENT_DAYS = 3  # whose states are kept, besides those of the last days of months
 Progress = Callable[[], None]
 

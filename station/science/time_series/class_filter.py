@@ -34,6 +34,7 @@ MOVING_RATE_NOISES_M2_D3 = (1e-6, 1e-5, 1e-4, 1e-3, 1e-2, 1e-1)  # relative to t
 SAMPLE_CELLS = 300  # per class
 MEDIAN_CHI2 = 0.4549  # of the square of a standard normal variable
 MOVED_EXCESS = 2.0  # times the expected median of 100 squares of innovations: four sigma
+PATCH_SHARE = 0.25  # of what a class does, that a patch does more or less; one sigma, before it is known
 TINY_M2_D2 = 1e-12  # against division by zero
 SYSTEMATIC_SIGMAS = 3.0  # what the error that a scan's cells share may be, before the ground has moved
 
@@ -114,7 +115,7 @@ class ClassFilter:
             return 0.0
         shares = self.shares
         counted = shares.total - shares.process if self.is_stable else shares.total
-        (filtered, covariance), (_, difference) = shares.rate_variances(counted)
+        (filtered, covariance), (_, difference) = shares.rate_variances(counted + shares.patches)
         filtered += self.missing_rate[1]
         disagreement = max(filtered + difference - 2 * covariance, TINY_M2_D2)
         return float(np.clip((filtered - covariance) / disagreement, 0.0, 1.0))
@@ -136,9 +137,14 @@ class ClassFilter:
         noise, before_m = self._noise(days), self._states.level_m[self._candidates.best]
         observed = np.isfinite(change_m) & np.isfinite(random_m2 + systematic_m2)
         motion = self._motion(days, observed, change_m, random_m2, systematic_m2)
+        further, patch_m2 = self._further_in_a_patch(motion), 0.0
+        if self.shares is not None and days > 0:
+            patch_m2 = self.shares.patch_growth(days, further)
+            noise = replace(noise, level_m2_d=noise.level_m2_d + patch_m2 / days)
         change_m, variance_m2 = change_m - motion.common_error_m, random_m2 + systematic_m2
         noises = ProcessNoise(*(noise[:, None] for noise in vars(self._candidates.all).values()))
         states = shifted(predict(self._states, days, noises), motion)
+        states = replace(states, level_m2=states.level_m2 + patch_m2)
         known = observed & np.isfinite(states.level_m[0])
         innovation_m = (change_m - states.level_m)[:, known]
         expected_m2 = (states.level_m2 + variance_m2)[:, known]
@@ -157,7 +163,8 @@ class ClassFilter:
         self._update(states, observed, np.where(observed, change_m, 0.0), variance_m2)
         moved_m = self._states.level_m[self._candidates.best] - before_m
         self.course.follow(moved_m[np.isfinite(moved_m)])
-        self._move_shares(days, noise, random_m2[observed], systematic_m2[observed])
+        shares = None if self.shares is None else self.shares.moved(days, noise, further)
+        self._update_shares(shares, random_m2[observed], systematic_m2[observed])
         return noise, motion
 
     def _noise(self, days: float) -> ProcessNoise:
@@ -174,6 +181,19 @@ class ClassFilter:
             noise.level_m2_d + max(more_m2, 0.0) / days, noise.rate_m2_d3 + max(more_m2_d2, 0.0) / days
         )
 
+    def _further_in_a_patch(self, motion: Motion) -> Floats:
+        """Return what a patch of cells did more than the class (2,), one sigma: level [m] and rate [m/d].
+
+        It is a share of what cells did as their class because their own share is not known: snow falls in
+        patches. Source: equations.md, 6.12.
+        """
+        if self.is_stable or self.shares is None:
+            return np.zeros(2)
+        uncertain = self.shares.total[RATE, RATE] + float(motion.lag_m_d) ** 2
+        typical_m_d = float(motion.mean_rate_m_d) - float(motion.lag_m_d)
+        share = PATCH_SHARE * np.sqrt(uncertain / (typical_m_d**2 + uncertain))
+        return np.asarray(share * np.array([motion.anomaly_m + motion.surge_m, motion.faster_m_d]))
+
     def _motion(
         self, days: float, observed: Bools, change_m: Floats, random_m2: Floats, systematic_m2: Floats
     ) -> Motion:
@@ -188,10 +208,7 @@ class ClassFilter:
         motion = self.course.advance(days, moved_m, *variances_m2)
         return replace(motion, lag_m_d=self._lag_m_d(float(motion.mean_rate_m_d)))
 
-    def _move_shares(
-        self, days: float, noise: ProcessNoise, random_m2: Floats, systematic_m2: Floats
-    ) -> None:
-        shares = None if self.shares is None else self.shares.moved(days, noise)
+    def _update_shares(self, shares: ErrorShares | None, random_m2: Floats, systematic_m2: Floats) -> None:
         if len(random_m2):
             variances_m2 = float(np.median(random_m2)), float(np.median(systematic_m2))
             shares = ErrorShares.first(*variances_m2) if shares is None else shares.updated(*variances_m2)

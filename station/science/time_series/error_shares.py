@@ -20,7 +20,8 @@ class ErrorShares:
 
     The rows are level [m], rate [m/d], the level at the begin of the day [m], and how much further than its
     rate tells the surface moved since [m]. `systematic` and `cross` (4,), its covariance with the present
-    error, are for a systematic error of 1 m. `elapsed_d` is the time since the begin of the day.
+    error, are for a systematic error of 1 m. `patch` (4,) are the errors of cells in a patch that does one
+    sigma more than its class; the process contains them. `elapsed_d` is the time since the begin of the day.
     """
 
     total: Floats
@@ -28,6 +29,7 @@ class ErrorShares:
     process: Floats
     systematic: Floats
     cross: Floats
+    patch: Floats
     elapsed_d: float
 
     @classmethod
@@ -37,7 +39,7 @@ class ErrorShares:
         unit, rate = np.zeros((2, 4, 4))
         unit[LEVEL, LEVEL], rate[RATE, RATE] = 1.0, first.rate_m2_d2[0]
         total = first.level_m2[0] * unit + rate
-        return cls(total, random_m2 * unit, rate, unit, unit[LEVEL], 0.0).begun()
+        return cls(total, random_m2 * unit, rate, unit, unit[LEVEL], np.zeros(4), 0.0).begun()
 
     @staticmethod
     def to_array(shares: ErrorShares | None) -> Floats:
@@ -51,7 +53,8 @@ class ErrorShares:
         if not len(values):
             return None
         total, random, process, systematic = values[:64].reshape(4, 4, 4)
-        return cls(total, random, process, systematic, values[64:68], float(values[68]))
+        cross, patch = values[64:72].reshape(2, 4)
+        return cls(total, random, process, systematic, cross, patch, float(values[72]))
 
     def begun(self) -> ErrorShares:
         """Return the matrices at the begin of a day."""
@@ -60,10 +63,18 @@ class ErrorShares:
         total, random, process, systematic = (
             begin @ matrix @ begin.T for matrix in (self.total, self.random, self.process, self.systematic)
         )
-        return ErrorShares(total, random, process, systematic, begin @ self.cross, 0.0)
+        return ErrorShares(total, random, process, systematic, begin @ self.cross, begin @ self.patch, 0.0)
 
-    def moved(self, days: float, noise: ProcessNoise) -> ErrorShares:
-        """Return the matrices some days later, without an observation."""
+    def patch_growth(self, days: float, further: Floats) -> float:
+        """Return what the variance of the level gains in some days in which a patch went further [m²].
+
+        That is `further` (2,), one sigma of level [m] and rate [m/d].
+        """
+        level_m = self.patch[LEVEL] + days * self.patch[RATE]
+        return float(max((level_m - further[0]) ** 2 - level_m**2, 0.0))
+
+    def moved(self, days: float, noise: ProcessNoise, further: Floats | None = None) -> ErrorShares:
+        """Return the matrices some days later, without an observation; a patch went `further`, if given."""
         elapsed_d = self.elapsed_d + days
         step = np.eye(4)
         step[LEVEL, RATE] = days
@@ -72,12 +83,14 @@ class ErrorShares:
         wander[1, 0] = wander[0, 1]
         effect = np.array([[-1.0, 0.0], [0.0, -1.0], [0.0, 0.0], [1.0, -elapsed_d]])
         wander = effect @ wander @ effect.T
+        patch = step @ self.patch
         return ErrorShares(
             step @ self.total @ step.T + wander,
             step @ self.random @ step.T,
             step @ self.process @ step.T + wander,
             step @ self.systematic @ step.T,
             step @ self.cross * np.exp(-days / CORRELATION_D),
+            patch if further is None else patch + effect @ further,
             elapsed_d,
         )
 
@@ -106,8 +119,14 @@ class ErrorShares:
             kept @ self.process @ kept.T,
             kept @ self.systematic @ kept.T + shared + shared.T + squared,
             kept @ self.cross + gain[:, 0],
+            kept @ self.patch,
             self.elapsed_d,
         )
+
+    @property
+    def patches(self) -> Floats:
+        """Covariance of the errors that the cells of a patch have in common."""
+        return np.outer(self.patch, self.patch)
 
     def rate_variances(self, matrix: Floats) -> Floats:
         """Return the covariance (2, 2) of the errors of two estimates of the mean rate of the day [m²/d²].

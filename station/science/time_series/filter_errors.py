@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -13,7 +13,7 @@ from station.science.time_series.class_filter import ClassFilter
 from station.science.time_series.error_shares import LEVEL, RATE
 
 TINY_M2 = 1e-12  # against division by zero
-OWN_PROCESS = 0.5  # share of what a cell does besides its class that the cells around it do not do
+OWN_PROCESS = 0.5  # share of what a cell does besides class and patch that cells around do not do
 
 
 @dataclass(frozen=True)
@@ -23,7 +23,7 @@ class FilterErrors:
     Random errors are independent between cells. Systematic ones are taken as the same in all of them: errors
     that a scan's cells share, and what the surface did since that the scans do not show. Errors that last are
     learned as process noise too, and are in the course as in the cells: the largest of the three counts. What
-    stable ground seems to do is such an error.
+    stable ground seems to do is such an error. What patches do besides their class is not.
     """
 
     level_random_m2: Floats
@@ -34,10 +34,11 @@ class FilterErrors:
 
 @dataclass(frozen=True)
 class _Parts:
-    """Variances of the errors of cells (n,): random ones, the process, and a systematic error of 1 m."""
+    """Variances of the errors of cells (n,): random, process, patches in it, a systematic error of 1 m."""
 
     random: Floats
     process: Floats
+    patches: Floats
     systematic: Floats
 
 
@@ -78,23 +79,26 @@ def filter_errors(
         return FilterErrors(unknown, unknown, unknown, unknown)
     weight, is_seen = _weights(moved_m, ground), unseen_d == 0
     single = random_m2 / np.maximum(random_m2 + systematic_m2, TINY_M2)
-    kinds = shares.total, shares.random, shares.process, shares.systematic
+    kinds = shares.total, shares.random, shares.process, shares.patches, shares.systematic
 
     level_m2, *levels = (np.full_like(single, matrix[LEVEL, LEVEL]) for matrix in kinds)
-    first = _Parts(single, np.zeros_like(single), np.ones_like(single))
+    none = np.zeros_like(single)
+    first = _Parts(single, none, none, np.ones_like(single))
     seen = _seen(state.level_m2, level_m2, _Parts(*levels), first, ground)
-    later = _unseen(state.level_m2, _moved(shares.random, unseen_d), _moved(shares.systematic, unseen_d))
+    later = _unseen(
+        state.level_m2, _moved(shares.random, unseen_d), levels[2], _moved(shares.systematic, unseen_d)
+    )
     level = _chosen(is_seen, seen, later)
 
     rate_m2_d2, *rates = (_combined(shares.rate_variances(matrix), weight) for matrix in kinds)
     settled_m2_d2 = shares.total[RATE, RATE]
     uncertainty = weight * state.level_m2 / level_m2 + (1 - weight) * state.rate_m2_d2 / settled_m2_d2
     variance_m2_d2 = rate_m2_d2 * uncertainty
-    first = _Parts(weight * single, 1 - weight, weight)
+    first = _Parts(weight * single, 1 - weight, none, weight)
     seen = _seen(variance_m2_d2, rate_m2_d2, _Parts(*rates), first, ground)
-    rate = _chosen(is_seen, seen, _unseen(variance_m2_d2, rates[0], rates[2]))
+    rate = _chosen(is_seen, seen, _unseen(variance_m2_d2, rates[0], rates[2], rates[3]))
     missing_m2_d2 = (1 - weight) ** 2 * ground.missing_rate[1]
-    rate = _Parts(rate.random, rate.process + missing_m2_d2, rate.systematic)
+    rate = replace(rate, process=rate.process + missing_m2_d2)
     return FilterErrors(
         *_random_and_systematic(level, course.level_errors(systematic_m2), systematic_m2, ground),
         *_random_and_systematic(rate, course.rate_errors(systematic_m2), systematic_m2, ground),
@@ -120,14 +124,15 @@ def _seen(variance: Floats, total: Floats, of_class: _Parts, first: _Parts, grou
     return _Parts(
         (settled * of_class.random / total + (1 - settled) * first.random) * variance,
         (settled * process / total + (1 - settled) * first.process) * variance,
+        settled * of_class.patches + (1 - settled) * first.patches,
         settled * of_class.systematic + (1 - settled) * first.systematic,
     )
 
 
-def _unseen(variance: Floats, random: Floats, systematic: Floats) -> _Parts:
+def _unseen(variance: Floats, random: Floats, patches: Floats, systematic: Floats) -> _Parts:
     """Return the parts of a variance (n,) in cells that the last scan did not see."""
     random = np.minimum(random, variance)
-    return _Parts(random, variance - random, systematic)
+    return _Parts(random, variance - random, patches, systematic)
 
 
 def _chosen(is_seen: Bools, seen: _Parts, unseen: _Parts) -> _Parts:
@@ -139,12 +144,14 @@ def _random_and_systematic(
     parts: _Parts, course: CourseErrors, systematic_m2: Floats, ground: ClassFilter
 ) -> tuple[Floats, Floats]:
     """Return the variances of random and of systematic errors of cells (n,)."""
+    process = np.maximum(parts.process - parts.patches, 0)
     shared = (
-        (1 - OWN_PROCESS) * parts.process + (0.0 if ground.is_stable else course.process),
+        (1 - OWN_PROCESS) * process + (0.0 if ground.is_stable else course.process),
         parts.systematic * systematic_m2,
         course.systematic,
     )
-    return parts.random + OWN_PROCESS * parts.process, np.maximum.reduce(shared) + course.random
+    systematic = np.maximum.reduce(shared) + parts.patches + course.random
+    return parts.random + OWN_PROCESS * process, systematic
 
 
 def _moved(matrix: Floats, days: Floats) -> Floats:

@@ -179,3 +179,30 @@ def test_live_equals_reprocessed_and_a_longer_series_changes_nothing_before():
     live = [level_m for level_m, _, _ in filtered(change_m[:60], 0.03, 0.003)]
     again = [level_m for level_m, _, _ in filtered(change_m, 0.03, 0.003)]
     assert np.array_equal(live, again[:60], equal_nan=True)
+
+
+def test_errors_of_a_patch_are_those_of_cells_that_move_further_than_their_class():
+    further = np.array([[0.003, 0.0], [0.004, 0.02], [-0.001, 0.05], [0.0, -0.06], [0.002, 0.0], [0.0, 0.0]])
+    noise, variance_m2 = ProcessNoise(1e-4, 1e-3), 4e-4
+    shares = ErrorShares.first(variance_m2, 0.0)
+    true_m = true_m_d = level_m = rate_m_d = 0.0  # besides the class
+    for hour in range(1, 43):
+        if hour == 19:
+            begin_m, true_begin_m, shares = level_m, true_m, shares.begun()
+        more_m, more_m_d = more = further[hour % 6]
+        level_m, true_m = level_m + HOUR_D * rate_m_d, true_m + HOUR_D * true_m_d + more_m
+        true_m_d += more_m_d
+        errors_m = level_m - true_m + more_m, level_m - true_m
+        growth_m2 = shares.patch_growth(HOUR_D, more)
+        assert growth_m2 == pytest.approx(max(errors_m[1] ** 2 - errors_m[0] ** 2, 0.0), abs=1e-12)
+        moved = shares.moved(HOUR_D, noise, more)
+        gain, rate_gain_d = moved.total[:2, 0] / (moved.total[0, 0] + variance_m2)
+        innovation_m = true_m - level_m
+        level_m, rate_m_d = level_m + gain * innovation_m, rate_m_d + rate_gain_d * innovation_m
+        shares = moved.updated(variance_m2, 0.0)
+    assert shares.patch[:2] == pytest.approx([level_m - true_m, rate_m_d - true_m_d])
+    mean_m_d = true_m - true_begin_m  # of one day
+    errors_m_d = np.array([rate_m_d, level_m - begin_m]) - mean_m_d
+    assert shares.elapsed_d == pytest.approx(1.0)
+    assert shares.rate_variances(shares.patches) == pytest.approx(np.outer(errors_m_d, errors_m_d))
+    assert np.abs(errors_m_d).min() > 0.001

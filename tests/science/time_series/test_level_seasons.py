@@ -163,6 +163,11 @@ def test_sigma_of_levels_and_rates_holds_from_cell_to_area_on_each_kind_of_groun
     assert np.all((by_kind > 0.45**2) & (by_kind < 1.35**2)), by_kind**0.5  # of few independent errors each
 
 
+def test_sigma_holds_in_patches_of_snow():
+    z = np.sqrt(squares("snow", 16))
+    assert np.all((z > 0.8) & (z < 1.2)), z
+
+
 def test_rates_of_a_day_of_snowfall_are_better_than_a_single_difference():
     ratios = []
     for seed in range(3):
