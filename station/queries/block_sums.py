@@ -30,6 +30,7 @@ FOLDER = ".block_sums"  # in the data folder
 MOST_SMALL_BLOCKS = 50_000  # of less than 10 m: they cost as much as those of a valley
 FORMAT = 3  # of the kept sums
 MIN_RANDOM_M = 0.001  # one sigma of a cell, for its weight
+MAX_REFERENCE_SHARE = 0.5  # of the random variance of a block
 QUALITY = "quality"
 ROCK = int(Quality.STABLE_GROUND | Quality.BARE_GROUND)
 
@@ -172,14 +173,16 @@ def precise_levels(epoch: Sums, reference: Sums) -> BlockLevels:
 
 
 def _levels(change_m: Floats, random_m2: Floats, epoch: Sums, reference: Sums) -> BlockLevels:
-    """Return levels without the variance of the reference, which is the same share of it in all cells."""
+    """Return levels without the variance of the reference, which is the same share of it in all cells.
+
+    It is at most half: that of a single scan. The mean over the known cells may be more, where only the best
+    were observed.
+    """
     observed = (epoch["count"] > 0) & (reference["known"] > 0)
     reference_m2 = epoch["count"] * reference["random_m2"] / np.maximum(reference["known"], 1)
     with np.errstate(invalid="ignore", divide="ignore"):
-        share = np.where(observed, 1 - reference_m2 / epoch["random_m2"], 0.0)
-    return BlockLevels(
-        np.where(observed, change_m, np.nan), np.where(observed, np.maximum(share, 0.0) * random_m2, 0.0)
-    )
+        own_share = 1 - np.minimum(reference_m2 / epoch["random_m2"], MAX_REFERENCE_SHARE)
+    return BlockLevels(np.where(observed, change_m, np.nan), np.where(observed, own_share * random_m2, 0.0))
 
 
 def drop_epoch_sums(series: Series, needed: Collection[str]) -> None:
