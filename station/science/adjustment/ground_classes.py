@@ -30,6 +30,8 @@ ICE_RATIO = 1.5  # of the brightness of ice or snow to that of rock, and of dark
 ICE_RANGE_M = 500.0  # rings within which brightness is compared: it may fall with the distance
 MIN_COS = 0.05  # of the incidence; rough ground is not seen at less
 MIN_ICE_SHARE = 0.2  # of moving ground; if less of it looks like ice, brightness does not tell ice from rock
+UNCLEAR_RATIO = 1.2  # of a brightness that tells nothing, to the limit of rock
+MAX_UNCLEAR_SHARE = 0.2  # of moving ground at a range at which no stable ground is known
 NOISE_CLASS_RANGE_M = 500.0
 NOISE_CLASS_SLOPE = 0.25
 
@@ -113,7 +115,7 @@ def snow_test(
 
 @dataclass(frozen=True)
 class RockBrightness:
-    """Median brightness of stable ground by ring of range (k,); NaN in rings with too few cells.
+    """Median brightness of stable ground by ring of range (k,); NaN where it does not tell rock from ice.
 
     With `lambertian` it is that of perpendicular incidence, and brightness falls with the cosine.
     """
@@ -143,8 +145,9 @@ def rock_brightness(
     """Return the brightness of rock, from cells (n,) of stable ground.
 
     Their own brightness tells whether it falls with the cosine of the incidence, by Lambert's law, or is
-    corrected for it. That of rock is unknown where too little of the moving ground looks otherwise: then it
-    may all be ice under debris. Source: equations.md, 6.9.
+    corrected for it. Rings with few of them have that of the nearest one with more. That of rock is unknown
+    where too little of the moving ground looks otherwise: then it may all be ice under debris, or be brighter
+    or darker because of its distance. Source: equations.md, 6.9.
     """
     ring = (range_m / ICE_RANGE_M).astype(np.int64)
     known = stable & (intensity > 0)
@@ -156,14 +159,28 @@ def rock_brightness(
     )
     lambertian = bool(log_cos @ log_intensity > 0.5 * (log_cos @ log_cos))
     normal = intensity / np.maximum(cos_incidence, MIN_COS) if lambertian else intensity
-    by_ring = np.full(int(ring.max(initial=0)) + 1, np.nan)
-    for index in np.flatnonzero(np.bincount(ring[known]) >= MIN_GAIN_CELLS):
-        by_ring[index] = float(np.median(normal[known & (ring == index)]))
-    rock = RockBrightness(by_ring, lambertian, wavelength_um >= DARK_SNOW_UM)
-    compared = moving & np.isfinite(intensity * by_ring[ring])
-    like_rock = rock.resembles(*(values[compared] for values in (intensity, range_m, cos_incidence)))
-    is_distinct = compared.any() and 1 - like_rock.mean() >= MIN_ICE_SHARE
-    return rock if is_distinct else replace(rock, by_ring=np.full_like(by_ring, np.nan))
+    rings = int(ring.max(initial=0)) + 1
+    measured = np.flatnonzero(np.bincount(ring[known], minlength=rings) >= MIN_GAIN_CELLS)
+    if not len(measured):
+        return RockBrightness(np.full(rings, np.nan), lambertian, wavelength_um >= DARK_SNOW_UM)
+    medians = np.array([np.median(normal[known & (ring == index)]) for index in measured])
+    nearest = np.abs(np.subtract.outer(np.arange(rings), measured)).argmin(axis=1)
+    rock = RockBrightness(medians[nearest], lambertian, wavelength_um >= DARK_SNOW_UM)
+    compared = moving & (intensity > 0)
+    is_other = compared & ~rock.resembles(intensity, range_m, cos_incidence)
+    if np.count_nonzero(is_other) < MIN_ICE_SHARE * np.count_nonzero(compared):
+        return replace(rock, by_ring=np.full(rings, np.nan))
+    darker, brighter = (
+        rock.resembles(intensity * factor, range_m, cos_incidence)
+        for factor in (1 / UNCLEAR_RATIO, UNCLEAR_RATIO)
+    )
+    count, others, unclear = (
+        np.bincount(ring[cells], minlength=rings)
+        for cells in (compared, is_other, compared & (darker != brighter))
+    )
+    is_distinct = (others >= MIN_ICE_SHARE * np.maximum(count, 1)) & (unclear <= MAX_UNCLEAR_SHARE * count)
+    is_distinct[measured] = True
+    return replace(rock, by_ring=np.where(is_distinct, rock.by_ring, np.nan))
 
 
 def _ratio(intensity: Floats32, reference: Floats32) -> Floats32:
