@@ -195,7 +195,7 @@ def test_level_and_rate_are_those_of_the_stored_day(tab, address, series):
         value, half = value_under_the_pointer(tab, east_m, north_m)
         assert value == pytest.approx(unit * level_at(column), abs=unit * sigma_m / 8 + 0.0006)
         assert half == pytest.approx(1.96 * unit * sigma_m, rel=0.06, abs=0.0006)
-        assert "2025-11-21 01:23 UTC" in tab.run("document.getElementById('map-key').textContent")
+        tab.await_("document.getElementById('map-key').textContent.includes('2025-11-21 01:23 UTC')")
         assert ("m/d" in tab.run("document.getElementById('map-hover').textContent")) == (layer == "rate")
     # the curves of the place say the same
     half_m = 1.96 * np.hypot(*LEVEL_SIGMA_M)
@@ -232,7 +232,7 @@ def test_the_map_is_named_for_screen_readers_and_speaks_german(tab, addresses):
     assert {"Höhenlinien", "Wischen"} <= set(named["checkbox"])
     assert all(name.strip() for role in ("button", "slider", "checkbox", "combobox") for name in named[role])
     assert tab.run("document.documentElement.lang") == "de"
-    assert "nicht beobachtet" in tab.run("document.getElementById('map-key').textContent")
+    tab.await_("document.getElementById('map-key').textContent.includes('nicht beobachtet')")
     spoken = tab.run("document.getElementById('since').getAttribute('aria-valuetext')")
     assert spoken == "2025-11-21 01:00 UTC"  # not the number of the scan
     assert tab.errors() == []
@@ -243,7 +243,7 @@ def test_layers_contours_and_play(tab, address):
         "const every = setInterval; window.setInterval = (f, ms) => every(f, Math.min(ms, 50));"
     )
     tab.open(f"{address}#layer=sigma")  # a picture from a folder could not be read back from the canvas
-    assert "levation change" in tab.run("document.getElementById('map-key').textContent")
+    tab.await_("document.getElementById('map-key').textContent.includes('levation change')")
     colours = """(() => { const c = document.getElementById('map-canvas');
         const copy = new OffscreenCanvas(c.width, c.height).getContext('2d', { willReadFrequently: true });
         copy.drawImage(c, 0, 0);
