@@ -325,10 +325,21 @@ def test_precise_means_of_blocks_have_the_least_variance():
     assert levels[-1].change_m[0, 0] == pytest.approx(np.sum(weights * change_m[:5, :5]) / weights.sum())
     assert levels[-1].random_m2[0, 0] == pytest.approx(1 / weights.sum())
     assert plain[-1].change_m[0, 0] == pytest.approx(change_m[:5, :5][seen].mean())
-    for means, most in ((levels, 0.2), (plain, 1.0)):
+    for means in (levels, plain):
         z = np.array([level.change_m / np.sqrt(level.random_m2) for level in means])
         assert np.std(z) == pytest.approx(1.0, abs=0.02)
-        assert np.median(means[-1].random_m2) < most * np.median(plain[-1].random_m2) * 1.01
+    assert np.median(levels[-1].random_m2) < 0.2 * np.median(plain[-1].random_m2)
+
+
+@pytest.mark.parametrize("levels_of", [block_levels, precise_levels])
+def test_a_block_of_which_only_the_best_cells_are_seen_has_a_random_variance(levels_of):
+    """Two cells of 1 cm, of the scan and its reference alike, are seen, two of 1 m are not."""
+    ones = np.ones((1, 1))
+    cell_m2 = 2 * 0.01**2
+    epoch = {"count": 2 * ones, "change_m": 0 * ones, "random_m2": 2 * cell_m2 * ones}
+    epoch |= {"weight": 2 / cell_m2 * ones, "weighted_change_m": 0 * ones}
+    reference = {"known": 4 * ones, "random_m2": (2 * 0.01**2 + 2 * 1.0**2) * ones}
+    assert levels_of(epoch, reference).random_m2[0, 0] == pytest.approx(0.01**2 / 2)  # of the scan alone
 
 
 def test_kept_sums_of_another_file_of_that_name_are_not_used(stored):

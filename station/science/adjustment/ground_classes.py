@@ -30,7 +30,7 @@ ICE_RATIO = 1.5  # of the brightness of ice or snow to that of rock, and of dark
 ICE_RANGE_M = 500.0  # rings within which brightness is compared: it may fall with the distance
 MIN_COS = 0.05  # of the incidence; rough ground is not seen at less
 MIN_ICE_SHARE = 0.2  # of moving ground; if less of it looks like ice, brightness does not tell ice from rock
-UNCLEAR_RATIO = 1.2  # of a brightness that tells nothing, to the limit of rock
+UNCLEAR_RATIO = 1.2  # of a brightness to the limit of rock, within which it may be rock or not
 MAX_UNCLEAR_SHARE = 0.2  # of moving ground at a range at which no stable ground is known
 NOISE_CLASS_RANGE_M = 500.0
 NOISE_CLASS_SLOPE = 0.25
@@ -168,8 +168,6 @@ def rock_brightness(
     rock = RockBrightness(medians[nearest], lambertian, wavelength_um >= DARK_SNOW_UM)
     compared = moving & (intensity > 0)
     is_other = compared & ~rock.resembles(intensity, range_m, cos_incidence)
-    if np.count_nonzero(is_other) < MIN_ICE_SHARE * np.count_nonzero(compared):
-        return replace(rock, by_ring=np.full(rings, np.nan))
     darker, brighter = (
         rock.resembles(intensity * factor, range_m, cos_incidence)
         for factor in (1 / UNCLEAR_RATIO, UNCLEAR_RATIO)
@@ -180,6 +178,8 @@ def rock_brightness(
     )
     is_distinct = (others >= MIN_ICE_SHARE * np.maximum(count, 1)) & (unclear <= MAX_UNCLEAR_SHARE * count)
     is_distinct[measured] = True
+    if others[measured].sum() < MIN_ICE_SHARE * max(count[measured].sum(), 1):
+        is_distinct[:] = False
     return replace(rock, by_ring=np.where(is_distinct, rock.by_ring, np.nan))
 
 

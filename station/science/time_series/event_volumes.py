@@ -50,10 +50,9 @@ def volume_parts(
     usable = known & ground & ~others
     members = core.copy() if track.widespread else _with_edge(track, core, known, usable, change, surface)
     filled, distance = area_weights(members, known)
-    around = np.zeros_like(filled)
+    around, level_m = np.zeros_like(filled), 0.0
     if not track.widespread:
-        around = np.maximum(-surrounding_weights(members, usable), 0.0)
-    level_m = float(np.sum((around * change.change_m)[around > 0]))
+        around, level_m = _surrounding_level(members, usable, change.change_m)
     edge_m2 = (EDGE_SHARE * (float(change.change_m[core].mean()) - level_m)) ** 2
     edge = members & known & ~core
     left_out = np.where(edge, change.random_m2 / np.maximum(edge_m2 + change.random_m2, TINY_M2), 0.0)
@@ -80,6 +79,12 @@ def mean_level(first: BlockLevels, second: BlockLevels) -> BlockLevels:
     return BlockLevels(mean_m, random_m2)
 
 
+def _surrounding_level(blocks: Bools, usable: Bools, change_m: Floats) -> tuple[Floats, float]:
+    """Return the weights (by, bx) of the usable blocks around some, and their mean change [m]."""
+    around = np.maximum(-surrounding_weights(blocks, usable), 0.0)
+    return around, float(np.sum((around * change_m)[around > 0]))
+
+
 def _with_edge(
     track: Track, core: Bools, known: Bools, usable: Bools, change: BlockLevels, surface: Bools
 ) -> Bools:
@@ -87,8 +92,7 @@ def _with_edge(
 
     Blocks at the edge that changed the other way belong to another event.
     """
-    around = np.maximum(-surrounding_weights(core, usable), 0.0)
-    level_m = float(np.sum((around * change.change_m)[around > 0]))
+    _, level_m = _surrounding_level(core, usable, change.change_m)
     opposite_m = -track.sign * (change.change_m - level_m)
     edge = ndimage.binary_dilation(core, NEIGHBOURS, EDGE_BLOCKS) & known
     inside = ndimage.binary_closing(core, NEIGHBOURS, EDGE_BLOCKS) & ~known & surface

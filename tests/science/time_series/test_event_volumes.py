@@ -44,14 +44,13 @@ def test_a_volume_on_smooth_ground_is_that_of_all_blocks_it_touches():
 
 
 def test_the_edge_adds_no_more_noise_than_an_event_can_have_there():
-    """Blocks of 0.3 m around the event: as much as it is deep, so its plain sum has √36 · 0.3 m and more."""
+    """Every other block has σ of 0.3 m, as much as the event is deep; 36 blocks and more are around it."""
     sigma_m = np.where((ROW + COLUMN) % 2 == 0, 0.3, 0.03)
     volume, sigma, true = draws(sigma_m)
     z = (volume - true) / sigma
     assert 0.8 < np.sqrt(np.mean(z**2)) < 1.25
     assert np.abs(np.mean(volume) / np.mean(true) - 1) < 0.1
-    edge_blocks = 18
-    assert np.mean(sigma) < 0.5 * np.sqrt(edge_blocks) * 0.3
+    assert np.mean(sigma) < 0.5 * np.sqrt(36 / 2) * 0.3  # half of a plain sum over these
 
 
 def test_what_surrounds_an_event_is_no_part_of_it():
