@@ -31,7 +31,9 @@ CHANGE_STEPS_M = tuple(float(step) for step in np.geomspace(0.5 / 2**11, 0.5, 12
 TREND_SIZES_M = tuple(float(size) for size in np.geomspace(0.0003, 1.0, 8))
 MEAN_RATIO = 1 / 0.6  # of the mean's size to that of a trend: melt from zero to twice the mean
 EVEN_SIGMA_M = 0.5  # of the mean of even change, which may exceed the trends by far
+EVEN_SLOPE_M = 0.01  # of its slopes by distance and by height, if it has any, at least
 TRENDS = 6
+SLOPES = [3, 5]  # the trends by distance and by height: ice that settles or melts
 KINDS = 2  # of moving ground: ice and snow, bare ground
 STABLE = KINDS  # kind of all other ground
 KIND_SPACING = 10_000  # of the azimuth knots of two kinds, so that they are not correlated
@@ -41,9 +43,12 @@ CORRELATED_CHANGE_RATIOS = (0.0, 3.0, 10.0)
 # Log prior odds against each. Smooth errors of the air look like correlated change too, but raise its log
 # likelihood by tens at most; a smooth snowfall raises it by hundreds.
 CORRELATION_LOG_PRIORS = (0.0, 12.0, 24.0)
-# For even change, whose mean may be any of half a metre: as likely as one of 25 mm.
-EVEN_LOG_PRIOR = 3.0
-RISING_ICE_LOG_PRIOR = 12.0  # against ice that rises while bare ground beside it does not: snow falls on both
+# For a mean that is as large as the trends, for even change, whose mean may be any of half a metre (as likely
+# as one of 25 mm), and for even change with slopes (as likely as one of 25 mm with slopes of 5 mm).
+EVEN_LOG_PRIORS = (0.0, 3.0, 4.5)
+# Against ice that rises while bare ground beside it does not, and bare ground that changes while the surface
+# does not rise: snow falls on both, and rock does not melt.
+BARE_LOG_PRIOR = 12.0
 SMALL_TREND_LOG_PRIOR = 2.0  # against each factor e by which trends are smaller than the change between knots
 CORRELATION_AZIMUTH_KNOTS, CORRELATION_RANGE_KNOTS = 4.0, 2.5  # correlation lengths, in knots
 # Where moving ground rises, stable ground may be under snow too thin to change its intensity.
@@ -62,8 +67,8 @@ MIN_HEAVE_M = 1e-5
 class ChangeModel(NamedTuple):
     """Indices into `CORRELATED_CHANGE_RATIOS`, `CHANGE_STEPS_M` and `TREND_SIZES_M`.
 
-    `bare` is 1 if bare ground has trends of the same size as ice and snow, 0 if it has none. `even` is 1 if
-    the mean is free, 0 if it is as large as the trends.
+    `bare` is 1 if bare ground has trends of the same size as ice and snow, 0 if it has none. `even` is 0 if
+    the mean is as large as the trends, 1 if it is free, 2 if there are slopes besides.
     """
 
     ratio: int
@@ -87,7 +92,7 @@ class ChangeModel(NamedTuple):
         """Logarithm of the prior odds: correlation and small trends need evidence."""
         below = max(float(np.log(self.step_m / TREND_SIZES_M[self.trend])), 0.0)
         evidence = CORRELATION_LOG_PRIORS[self.ratio] + SMALL_TREND_LOG_PRIOR * below
-        return EVEN_LOG_PRIOR * self.even - evidence
+        return EVEN_LOG_PRIORS[self.even] - evidence
 
     def with_ratio(self, ratio: int) -> ChangeModel:
         """Return the model of another correlation with about the same change between knots."""
@@ -96,7 +101,7 @@ class ChangeModel(NamedTuple):
 
     def neighbours(self, *, bare: bool, ratios: bool = False) -> list[ChangeModel]:
         """Return the models that differ by one index: step, trend, with `bare` and `ratios` also these."""
-        sizes = {"step": len(CHANGE_STEPS_M), "trend": len(TREND_SIZES_M), "even": 2}
+        sizes = {"step": len(CHANGE_STEPS_M), "trend": len(TREND_SIZES_M), "even": len(EVEN_LOG_PRIORS)}
         if bare:
             sizes["bare"] = 2
         if ratios:
@@ -138,24 +143,36 @@ class GroundChange:
 
     def log_prior(self, model: ChangeModel) -> float:
         """Return the logarithm of the prior odds of a model."""
-        is_ice_alone = self.bare_columns > 0 and not model.bare and self.mean_m > THIN_SNOW_M
-        return model.log_prior - RISING_ICE_LOG_PRIOR * is_ice_alone
+        has_snowed = self.mean_m > THIN_SNOW_M
+        is_unlikely = self.bare_columns > 0 and bool(model.bare) != has_snowed
+        return model.log_prior - BARE_LOG_PRIOR * is_unlikely
 
     def size_m(self, model: ChangeModel) -> float:
         """Return one sigma of the change of moving ground, with its mean [m]."""
         return float(np.hypot(model.size_m, self.mean_m))
 
-    def precision_at(self, model: ChangeModel) -> tuple[Floats, float]:
-        """Return the precision (k, k) of a model, and log |precision⁻¹|."""
+    @property
+    def knots(self) -> slice:
+        """Columns of the change between knots."""
+        last = self.design.shape[1] - self.snow_columns - self.heave_columns
+        return slice(self.trend_columns, last)
+
+    @property
+    def independent(self) -> Ints:
+        """Columns of the other unknowns, which are independent of each other."""
+        return np.delete(np.arange(self.design.shape[1]), self.knots)
+
+    def sigma_m(self, model: ChangeModel) -> Floats:
+        """Return sigma of the independent unknowns of a model [m]: trends, depths of snow, heave."""
         snow_m = min(self.size_m(model), THIN_SNOW_M) if self.mean_m > 0 else NO_CHANGE_M
         trend_m = np.full(TRENDS, TREND_SIZES_M[model.trend])
-        trend_m[0] = EVEN_SIGMA_M if model.even else MEAN_RATIO * trend_m[0]
+        trend_m[0] *= MEAN_RATIO
+        if model.even:
+            trend_m[0] = EVEN_SIGMA_M
+        if model.even > 1:
+            trend_m[SLOPES] = np.maximum(trend_m[SLOPES], EVEN_SLOPE_M)
         bare_m = trend_m if model.bare else np.full(TRENDS, NO_CHANGE_M)
-        knots, step_m = len(self.knot_precisions[model.ratio]), CHANGE_STEPS_M[model.step]
-        first, last = self.trend_columns, self.trend_columns + knots
-        precision = np.zeros((self.design.shape[1],) * 2)
-        precision[first:last, first:last] = self.knot_precisions[model.ratio] / step_m**2
-        sigma_m = np.concatenate(
+        return np.concatenate(
             [
                 trend_m[: self.trend_columns - self.bare_columns],
                 bare_m[: self.bare_columns],
@@ -163,10 +180,19 @@ class GroundChange:
                 np.full(self.heave_columns, self.heave_m),
             ]
         )
-        independent = np.r_[0:first, last : len(precision)]
-        precision[independent, independent] = 1 / sigma_m**2
-        log_determinant = self.knot_log_determinants[model.ratio] + 2 * knots * np.log(step_m)
-        return precision, float(log_determinant + 2 * np.log(sigma_m).sum())
+
+    def knot_precision(self, ratio: int, step: int) -> tuple[Floats, float]:
+        """Return the precision (knots, knots) of the change between knots, and log |precision⁻¹|."""
+        precision, step_m = self.knot_precisions[ratio], CHANGE_STEPS_M[step]
+        log_determinant = self.knot_log_determinants[ratio] + 2 * len(precision) * np.log(step_m)
+        return precision / step_m**2, float(log_determinant)
+
+    def precision_at(self, model: ChangeModel) -> Floats:
+        """Return the precision (k, k) of a model."""
+        precision, independent = np.zeros((self.design.shape[1],) * 2), self.independent
+        precision[self.knots, self.knots], _ = self.knot_precision(model.ratio, model.step)
+        precision[independent, independent] = 1 / self.sigma_m(model) ** 2
+        return precision
 
     def updated(self, estimate_m: Floats, heave_variance_m2: Floats) -> GroundChange:
         """Return this change with the size of heave that an estimate (k,) shows, and the mean change.

@@ -43,6 +43,15 @@ class Mixture:
     size_m: float
 
 
+@dataclass(frozen=True)
+class WithoutKnots:
+    """Normal equations of the change (s, s) and (s,) without its knots, and the log odds that these add."""
+
+    normal: Floats
+    rhs: Floats
+    log_odds: float
+
+
 class Solution:
     """Solution with the most likely model of the change, whose unknowns are the last."""
 
@@ -54,6 +63,7 @@ class Solution:
         self._normal = normal[state_size:, state_size:] - half.T @ half  # of the change, state eliminated
         self._rhs = rhs[state_size:] - half.T @ self._state_factor.half_solve(rhs[:state_size, None])[:, 0]
         self._log_odds: dict[ChangeModel, float] = {}
+        self._without_knots: dict[tuple[int, int], WithoutKnots] = {}
         self.model = START_MODEL
 
     def log_odds(self, model: ChangeModel) -> float:
@@ -61,12 +71,33 @@ class Solution:
         if model not in self._log_odds:
             if not len(self._rhs):
                 return self._change.log_prior(model)
-            cholesky, determinant = self._factor(model)
-            change_m = linalg.cho_solve((cholesky, True), self._rhs, check_finite=False)
-            half_log_determinant = (log_determinant(cholesky) + determinant) / 2
-            self._log_odds[model] = float(self._rhs @ change_m / 2 - half_log_determinant)
+            rest = self._eliminate_knots(model.ratio, model.step)
+            sigma_m = self._change.sigma_m(model)
+            cholesky = cholesky_inplace(rest.normal + np.diag(1 / sigma_m**2))
+            half = linalg.solve_triangular(cholesky, rest.rhs, lower=True, check_finite=False)
+            half_log_determinant = log_determinant(cholesky) / 2 + np.log(sigma_m).sum()
+            self._log_odds[model] = rest.log_odds + float(half @ half / 2 - half_log_determinant)
             self._log_odds[model] += self._change.log_prior(model)
         return self._log_odds[model]
+
+    def _eliminate_knots(self, ratio: int, step: int) -> WithoutKnots:
+        """Return the normal equations of the change without knots, for a correlation and step of theirs.
+
+        Models that differ in the sizes of trends have these in common.
+        """
+        if (ratio, step) not in self._without_knots:
+            knots, rest = self._change.knots, self._change.independent
+            precision, determinant = self._change.knot_precision(ratio, step)
+            cholesky = cholesky_inplace(self._normal[knots, knots] + precision)
+            columns = np.column_stack([self._normal[knots, rest], self._rhs[knots]])
+            half = linalg.solve_triangular(cholesky, columns, lower=True, check_finite=False)
+            coupling, rhs = half[:, :-1], half[:, -1]
+            self._without_knots[ratio, step] = WithoutKnots(
+                self._normal[np.ix_(rest, rest)] - coupling.T @ coupling,
+                self._rhs[rest] - coupling.T @ rhs,
+                float(rhs @ rhs - log_determinant(cholesky) - determinant) / 2,
+            )
+        return self._without_knots[ratio, step]
 
     def select(self, previous: ChangeModel | None) -> None:
         """Select the most likely model; with a previous one only neighbouring correlations are tried."""
@@ -84,21 +115,19 @@ class Solution:
             model = best
         return model
 
-    def _factor(self, model: ChangeModel) -> tuple[Floats, float]:
-        """Return the Cholesky factor of the change's normal matrix, and log |P⁻¹| of its prior."""
-        precision, determinant = self._change.precision_at(model)
-        return cholesky_inplace(self._normal + precision), determinant
+    def _factor(self) -> Floats:
+        """Return the Cholesky factor (k, k) of the change's normal matrix with the most likely model."""
+        return cholesky_inplace(self._normal + self._change.precision_at(self.model))
 
     @property
     def change_m(self) -> Floats:
         """Estimated change (k,) [m]."""
-        cholesky, _ = self._factor(self.model)
-        return np.asarray(linalg.cho_solve((cholesky, True), self._rhs, check_finite=False))
+        return np.asarray(linalg.cho_solve((self._factor(), True), self._rhs, check_finite=False))
 
     @property
     def heave_variance_m2(self) -> Floats:
         """Posterior variance of the heaves (heave_columns,) [m²]."""
-        cholesky, _ = self._factor(self.model)
+        cholesky = self._factor()
         columns = np.eye(len(cholesky))[:, len(cholesky) - self._change.heave_columns :]
         half = linalg.solve_triangular(cholesky, columns, lower=True, check_finite=False)
         return np.asarray(np.sum(half**2, axis=0))
@@ -122,7 +151,7 @@ class Solution:
         size = len(self._rhs)
         mean_m, covariance, bias = np.zeros(size), np.zeros((size, size)), np.zeros((size, size))
         for model, share in zip(models, weight, strict=True):
-            precision, _ = self._change.precision_at(model)
+            precision = self._change.precision_at(model)
             model_covariance = ScaledCholesky(self._normal + precision).inverse()
             change_m = model_covariance @ self._rhs
             mean_m += share * change_m

@@ -1,6 +1,7 @@
 """Mixture over models of the ground's change, compared with dense algebra and with direct integration."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -43,13 +44,21 @@ def make_patches(seed, change_m, bare_share=0.0):
     return Patches(jacobian, range_bin, height_m, ground_class, residual_m, variance_m2, cells)
 
 
-def solve(seed, change_m, bare_share=0.0, temperature_c=None):
+def solve(seed, change_m, bare_share=0.0, temperature_c=None, bare_change_m=None):
     patches = make_patches(seed, change_m, bare_share)
+    if bare_change_m is not None:
+        bare = (patches.ground_class == GroundClass.MOVING) & ~on_ice(patches)
+        patches = replace(patches, residual_m=patches.residual_m + bare * bare_change_m)
     moving = patches.ground_class == GroundClass.MOVING
     change = ground_change.ground_change(patches, moving, temperature_c)
     equations = NormalEquations(patches.jacobian, change.design, patches.residual_m, PRIOR, None)
     reduced = equations.reduce(1 / patches.variance_m2)
     return patches, change, equations.size, solution.solve(reduced, equations.size, change, None)
+
+
+def on_ice(patches):
+    """Return whether patches are ice, over which refraction is its own."""
+    return patches.jacobian.pose[PARAMS.names.index("refraction_ice")] != 0
 
 
 def sigma_of(mixture, count):
@@ -90,10 +99,10 @@ def test_odds_of_models_are_those_of_the_marginal_likelihood(moderate):
     design = change.design.toarray()
 
     def log_likelihood(model):
-        covariance = rest + design @ np.linalg.inv(change.precision_at(model)[0]) @ design.T
+        covariance = rest + design @ np.linalg.inv(change.precision_at(model)) @ design.T
         return multivariate_normal(cov=covariance).logpdf(patches.residual_m) + model.log_prior
 
-    first, second = ChangeModel(0, 3, 2), ChangeModel(1, 6, 5)
+    first, second = ChangeModel(0, 3, 2), ChangeModel(1, 6, 3, even=2)
     expected = log_likelihood(first) - log_likelihood(second)
     assert solved.log_odds(first) - solved.log_odds(second) == pytest.approx(expected, abs=1e-5)
 
@@ -104,14 +113,14 @@ def test_mixture_has_the_moments_of_all_models(moderate):
     reduced, moments = solved._reduced, []
     sizes = len(ground_change.CHANGE_STEPS_M), len(ground_change.TREND_SIZES_M)
     models = [
-        ChangeModel(ratio, step, trend, even=even) for ratio, step, trend, even in np.ndindex(3, *sizes, 2)
+        ChangeModel(ratio, step, trend, even=even) for ratio, step, trend, even in np.ndindex(3, *sizes, 3)
     ]
     odds = np.array([solved.log_odds(model) for model in models])
     weight = np.exp(odds - odds.max())
     weight /= weight.sum()
     for model in models:
         normal = reduced.normal.copy()
-        normal[size:, size:] += change.precision_at(model)[0]
+        normal[size:, size:] += change.precision_at(model)
         covariance = np.linalg.inv(normal)
         moments.append((covariance @ reduced.rhs, covariance))
     mean = sum(share * estimate for share, (estimate, _) in zip(weight, moments, strict=True))
@@ -165,3 +174,33 @@ def test_melt_that_ends_at_the_edge_of_the_ice_is_no_refraction(change_m):
         mixture = solve(seed, change_m, bare_share=0.4)[3].mixture()
         standardised.append(mixture.estimate[moving] / sigma_of(mixture, moving + 1)[moving])
     assert np.abs(standardised).max() < 3
+
+
+@pytest.mark.parametrize("settling_m", [0.03, 0.06])
+def test_ice_that_settles_with_the_distance_does_not_move_the_scanner(settling_m):
+    """At 2,400 m; rock beside it is at rest. Most of the change is kept, and sigma covers the rest."""
+    error, sigma, change = [], [], []
+    for seed in range(12):
+        patches = make_patches(seed, 0.0, bare_share=0.4)
+        lowering_m = -settling_m * (patches.range_bin + 0.5) / 30
+        mixture = solve(seed, lowering_m, bare_share=0.4)[3].mixture()
+        ice = on_ice(patches)
+        effect = np.zeros((len(mixture.estimate), 1))
+        effect[: len(PARAMS.names), 0] = patches.jacobian.aggregate(ice / ice.sum())
+        error.append(float(effect[:, 0] @ mixture.estimate))
+        sigma.append(np.linalg.norm(mixture.factor.half_solve(effect)))
+        change.append(lowering_m[ice].mean())
+    assert np.sqrt(np.mean(np.square(error))) < 0.2 * abs(np.mean(change))
+    assert abs(np.mean(error)) < 0.12 * abs(np.mean(change))
+    assert np.sqrt(np.mean(np.square(np.divide(error, sigma)))) < 1.25
+
+
+@pytest.mark.parametrize(("ice_m", "bare_m", "expected"), [(-0.02, 0.004, 0), (0.0, 0.004, 0), (0.1, 0.1, 1)])
+def test_bare_ground_changes_with_snow_only(ice_m, bare_m, expected):
+    """Millimetres that rough rock shows when the beams move are no trends of its own."""
+    for seed in range(12):
+        wave = 1 + np.cos(make_patches(seed, 0.0).range_bin / 6)
+        _, change, _, solved = solve(seed, ice_m * wave, bare_share=0.4, bare_change_m=bare_m * wave)
+        updated = change.updated(solved.change_m, solved.heave_variance_m2)
+        again = solution.solve(solved._reduced, solved._state_size, updated, solved.model)
+        assert again.model.bare == expected
