@@ -275,11 +275,7 @@ def test_avalanche_deposit_keeps_its_height(tmp_path):
     [
         ("log", "inclination log missing"),
         ("weather", "weather"),
-        pytest.param(
-            "ground",
-            "no stable ground",
-            marks=pytest.mark.xfail(strict=True, reason="sigma is too large: z is 0.73"),
-        ),
+        ("ground", "no stable ground"),
     ],
 )
 def test_missing_input_is_reported_and_included_in_sigma(calm_folder, damage, reason):
