@@ -5,8 +5,8 @@ smoothly between knots. Bare ground that is not known to be stable has trends an
 at the edge of the ice, as the refraction of cold air does, and snow does not. Stable ground is not quite at
 rest: it heaves, as a whole and by blocks, and where moving ground rises it may be under thin snow. The sizes
 of trends and of the change between knots are not known. A model is one choice of them, of whether the mean is
-as large as the trends or free, and of whether bare ground has trends; an adjustment weighs all models by
-their likelihood.
+as large as the trends or free, with slopes of its own or without, and of whether bare ground has trends; an
+adjustment weighs all models by their likelihood.
 Source: equations.md, 6.3; adjustment.md, 5.
 """
 
