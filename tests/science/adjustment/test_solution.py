@@ -178,7 +178,10 @@ def test_melt_that_ends_at_the_edge_of_the_ice_is_no_refraction(change_m):
 
 @pytest.mark.parametrize("settling_m", [0.03, 0.06])
 def test_ice_that_settles_with_the_distance_does_not_move_the_scanner(settling_m):
-    """At 2,400 m; rock beside it is at rest. Most of the change is kept, and sigma covers the rest."""
+    """By as much at 2,400 m; rock beside it is at rest. Most of the change is kept, sigma covers the rest.
+
+    The scanner is at rest in all draws, so that z has no lower bound.
+    """
     error, sigma, change = [], [], []
     for seed in range(12):
         patches = make_patches(seed, 0.0, bare_share=0.4)
