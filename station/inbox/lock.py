@@ -186,7 +186,7 @@ def _write_holder(lock_fd: int, pause: str) -> None:
 def _read_holder(lock_fd: int) -> tuple[str, str]:
     """Return process id and reason of a pause from the lock file, as far as they are there."""
     try:
-        text = os.pread(lock_fd, HOLDER_BYTES, 0).decode("utf-8", "replace")
+        text = os.pread(lock_fd, HOLDER_BYTES, 0).decode("utf-8", "ignore")  # it may end within a character
     except OSError:
         text = ""
     pid, _, rest = text.partition("\n")
