@@ -9,9 +9,11 @@ from datetime import UTC, datetime
 from functools import lru_cache
 from typing import Any
 
+import h5py
 import numpy as np
 import shapely
 
+from station.archive.derived.computed_rasters import CHANGE, RANDOM
 from station.archive.derived.event_table import (
     KEY_LENGTH,
     Event,
@@ -27,12 +29,13 @@ from station.archive.epochs import EpochRef
 from station.archive.netcdf_layout import Series
 from station.archive.series.index import SeriesIndex, references_and_usable
 from station.errors import StoreError
-from station.quantities import Bools, Grid, Ints, SharedParameters
+from station.quantities import Bools, Floats, Grid, Ints, SharedParameters
 from station.queries.block_sums import Sums, block_levels, epoch_sums, precise_levels
 from station.queries.blocks import BlockQueries, Blocks
 from station.queries.common_errors import common_error_covariance
-from station.queries.epoch_cells import EpochCells, EpochReader
+from station.queries.epoch_cells import EpochCells, EpochReader, read_window
 from station.science.time_series import event_errors, event_volumes
+from station.science.time_series.event_cells import agreement_sigmas
 from station.science.time_series.event_tracks import Track, pair_tracks, track_events
 from station.science.time_series.events import (
     BEFORE,
@@ -48,6 +51,7 @@ LEAST_HISTORY = 8
 YEAR_S = 365.25 * 86_400
 CACHED_EPOCHS = 5  # whose shared parameters are in memory
 RETAINED_SIGMA = 0.02  # of the share of a change that cells with few points retain (accuracy.md)
+LEAST_AGREEMENT = 2.5  # sigma by which the cells of a place must have changed together
 SEARCHES_KEPT = 200  # at once: a long search of a whole series can be interrupted
 
 
@@ -228,7 +232,24 @@ class EventQueries:
                 region.lag,
             ]
             for region in regions
+            if self._changed_together(region, window)
         ]
+
+    def _changed_together(self, region: Region, scans: range) -> bool:
+        """Return True if the cells of a local region changed together, in the two newest of the scans."""
+        if region.window is None:
+            return True
+        cells = self._queries.cells
+        rows, columns = (slice(axis.start * cells, axis.stop * cells) for axis in region.window)
+
+        def read(scan: int, name: str) -> Floats:
+            epoch = self._epoch(scan)
+            with h5py.File(epoch.path, "r") as file:
+                return read_window(file, name, epoch.index, (rows, columns)).ravel()
+
+        change_m = np.stack([read(scan, CHANGE) for scan in scans[-2 - BEFORE :]])
+        sigmas = agreement_sigmas(change_m[:-2], change_m[-2:], read(scans[-1], RANDOM), region.around_m)
+        return region.sign * sigmas > LEAST_AGREEMENT
 
     def _events(self, tracks: list[Track]) -> Iterator[tuple[Event, shapely.Geometry]]:
         volumes = []

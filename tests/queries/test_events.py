@@ -23,7 +23,7 @@ from station.archive.reference_files import write_reference
 from station.archive.series.index import list_epochs
 from station.archive.series.virtual import build_series
 from station.quantities import Grid, Quality, Reference
-from station.queries import block_sums
+from station.queries import block_sums, events
 from station.queries.blocks import BlockQueries
 from station.queries.events import LEAST_HISTORY, EventQueries
 
@@ -39,6 +39,13 @@ SURFACE_M = 0.8 * DEPOSIT - 1.0 * SCAR
 
 def deposit_and_scar(hour):
     return SURFACE_M if hour >= EVENT_HOUR else np.zeros(GRID.shape)
+
+
+def edge(hour):
+    """Three cells that beams hit otherwise: the mean of a block changes by many of its sigma."""
+    jump_m = np.zeros(GRID.shape)
+    jump_m[25, 30:33] = 1.0 * (hour >= EVENT_HOUR)
+    return jump_m
 
 
 def slow_snowfall(hour):
@@ -123,6 +130,17 @@ def test_scar_and_deposit_are_a_pair_with_the_true_volumes(base):
     assert deposit.balance_m3 == pytest.approx(scar.volume_m3 + deposit.volume_m3, abs=0.02)
     assert (deposit.east_m, deposit.north_m) == pytest.approx((632_180, 5_185_840), abs=6)
     assert deposit.confirmed[11:13] == f"{(int(deposit.begin[11:13]) + 1):02}"
+
+
+def test_an_edge_that_is_hit_otherwise_is_no_event(tmp_path, monkeypatch):
+    series = empty_store(tmp_path / "store")
+    write(series, range(HOURS), edge)
+    update(series)
+    assert read_events(series.folder) == []
+    (series.folder / FOUND_NAME).unlink()
+    monkeypatch.setattr(events, "agreement_sigmas", lambda *_: events.LEAST_AGREEMENT + 1)
+    update(series)
+    assert len(read_events(series.folder)) == 1  # the means of blocks alone would say so
 
 
 @pytest.mark.integration

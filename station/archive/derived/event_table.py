@@ -27,7 +27,7 @@ from station.errors import StoreError
 from station.quantities import Bools, Grid
 
 FILE_NAME, FOUND_NAME = "events.geojson", ".event_regions.json"
-FORMAT = 8  # of the kept regions
+FORMAT = 9  # of the kept regions
 KEY_LENGTH = 32
 CLASSES = ("loss", "gain", "paired", "melt_front", "snowfall")
 

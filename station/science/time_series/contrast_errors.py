@@ -46,16 +46,19 @@ class ContrastErrors:
         weights = np.where(seen, 1 / np.maximum(random_m2[self.observed], TINY), 0.0)
         line_m2 = self.line_effect**2 * self.line_rad2[self.line]
         beside_lines = weights / (1 + weights * line_m2)
-        error_m, left_m2 = np.zeros(len(excess_m)), line_m2
+        error_m = np.zeros(len(excess_m))
         for _ in range(ITERATIONS):
             fits = (excess_m - error_m) ** 2 * beside_lines < OUTLIER_SIGMAS**2
-            shared_m, shared_m2 = self._shared_errors(excess_m, np.where(fits, beside_lines, 0.0))
+            shared_m, covariance = self._shared_errors(excess_m, np.where(fits, beside_lines, 0.0))
             tilt_m, tilt_m2 = self._line_errors(excess_m - shared_m, np.where(fits, weights, 0.0))
-            error_m, left_m2 = shared_m + tilt_m, shared_m2 + tilt_m2
-        return self._placed(error_m), self._placed(left_m2)
+            error_m = shared_m + tilt_m
+        return self._placed(error_m), self._placed(self._variance(covariance) + tilt_m2)
 
     def _shared_errors(self, excess_m: Floats, weights: Floats) -> tuple[Floats, Floats]:
-        """Return the errors (n,) [m] by the parameters, from least squares with the prior, and variances."""
+        """Return the errors (n,) [m] by the parameters, from least squares with the prior.
+
+        With the covariance (p, p) of the parameters that are left.
+        """
         groups = sparse.csr_array(
             (weights, (self.group, np.arange(len(self.group)))), shape=(len(self.around), len(self.group))
         )
@@ -69,18 +72,30 @@ class ContrastErrors:
         posterior = (posterior + posterior.T) / 2
         estimate = posterior @ right
         error_m = self.design @ estimate - (self.around @ estimate)[self.group]
-        return error_m, self._variance(posterior)
+        return error_m, posterior
 
     def _variance(self, covariance: Floats) -> Floats:
-        """Return (j - g) C (j - g)ᵀ (n,) [m²]."""
+        """Return (j - g) C (j - g)ᵀ (n,) [m²], entry by entry of j: few of them are not zero."""
         weighted = self.around @ covariance
-        entries = self.design.tocoo()
-        common_m2 = np.bincount(
-            entries.row, entries.data * weighted[self.group[entries.row], entries.col], len(self.group)
-        )
-        own_m2 = np.asarray(self.design.multiply(self.design @ covariance).sum(axis=1)).ravel()
-        around_m2 = np.sum(weighted * self.around, axis=1)[self.group]
-        return np.asarray(np.maximum(own_m2 - 2 * common_m2 + around_m2, 0.0))
+        variance_m2 = np.sum(weighted * self.around, axis=1)[self.group]
+        columns, values = self._entries
+        for i, (column, value) in enumerate(zip(columns, values, strict=True)):
+            effect = value * covariance[column, column] - 2 * weighted[self.group, column]
+            for other, other_value in zip(columns[:i], values[:i], strict=True):
+                effect += 2 * other_value * covariance[column, other]
+            variance_m2 += value * effect
+        return np.asarray(np.maximum(variance_m2, 0.0))
+
+    @property
+    def _entries(self) -> tuple[Ints, Floats]:
+        """Columns and values (k, n) of the entries of each row of the design; zeros where it has fewer."""
+        start, count = self.design.indptr[:-1], np.diff(self.design.indptr)
+        row = np.repeat(np.arange(len(count)), count)
+        place = np.arange(self.design.nnz) - np.repeat(start, count), row
+        columns = np.zeros((int(count.max(initial=0)), len(count)), np.int64)
+        values = np.zeros(columns.shape)
+        columns[place], values[place] = self.design.indices, self.design.data
+        return columns, values
 
     def _line_errors(self, excess_m: Floats, weights: Floats) -> tuple[Floats, Floats]:
         """Return the errors (n,) [m] by the line tilts, from least squares with the prior, and variances."""

@@ -66,7 +66,11 @@ class BlockErrors:
 
 @dataclass(frozen=True)
 class Region:
-    """Blocks (by, bx) that changed together, up or down; everywhere, or against their surroundings."""
+    """Blocks (by, bx) that changed together, up or down; everywhere, or against their surroundings.
+
+    Of a local region that was just found, `window` is the most significant one, and `around_m` the change of
+    its surroundings, which is taken off.
+    """
 
     blocks: Bools
     sign: int
@@ -74,6 +78,8 @@ class Region:
     mean_m: float  # of the change of the blocks, as detected
     sigmas: float  # of the most significant window
     lag: int = 0  # scans between those compared with and the first of the two
+    window: tuple[slice, slice] | None = None
+    around_m: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -136,8 +142,11 @@ def detect_regions(
         regions += _slow_rise(history, scans, rock, thresholds.widespread)
     history_m = np.stack([levels.change_m for levels in history])
     change_m = smaller_of_both(*(change.change_m for change in absolute))
+    around_m = np.mean(
+        [whole.change_m - excess.change_m for whole, excess in zip(absolute, relative, strict=True)], axis=0
+    )
     regions += [
-        region
+        replace(region, around_m=float(np.nanmean(around_m[region.window])))
         for region in _local_regions(relative, history_m, rock, thresholds.local)
         if region.sign * np.mean(change_m[region.blocks]) > abs(region.mean_m) / 2
     ]  # where it did not change, its surroundings did
@@ -205,8 +214,9 @@ def _local_regions(
             is_most = inside_m > sign * np.sum(excess_m[window]) / 2  # else it is beside another change
             if np.count_nonzero(blocks) >= MIN_BLOCKS and is_most:
                 mean_change_m = float(excess_m[blocks].mean())
+                sigmas_most = float(abs(score.flat[most]))
                 yield Region(
-                    blocks, sign, widespread=False, mean_m=mean_change_m, sigmas=float(abs(score.flat[most]))
+                    blocks, sign, widespread=False, mean_m=mean_change_m, sigmas=sigmas_most, window=window
                 )
 
 
