@@ -30,8 +30,8 @@ CHANGE_RANGE_BINS = 3  # range bins between two knots of the change
 CHANGE_STEPS_M = tuple(float(step) for step in np.geomspace(0.5 / 2**11, 0.5, 12))
 TREND_SIZES_M = tuple(float(size) for size in np.geomspace(0.0003, 1.0, 8))
 MEAN_RATIO = 1 / 0.6  # of the mean's size to that of a trend: melt from zero to twice the mean
-EVEN_SIGMA_M = 0.5  # of the mean of even change, which may exceed the trends by far
-EVEN_SLOPE_M = 0.01  # of its slopes by distance and by height, if it has any, at least
+FREE_MEAN_SIGMA_M = 0.5  # of a mean that may exceed the trends by far
+FREE_SLOPE_SIGMA_M = 0.01  # of the slopes by distance and by height beside such a mean, at least
 TRENDS = 6
 SLOPES = [3, 5]  # the trends by distance and by height: ice that settles or melts
 KINDS = 2  # of moving ground: ice and snow, bare ground
@@ -43,9 +43,9 @@ CORRELATED_CHANGE_RATIOS = (0.0, 3.0, 10.0)
 # Log prior odds against each. Smooth errors of the air look like correlated change too, but raise its log
 # likelihood by tens at most; a smooth snowfall raises it by hundreds.
 CORRELATION_LOG_PRIORS = (0.0, 12.0, 24.0)
-# For a mean that is as large as the trends, for even change, whose mean may be any of half a metre (as likely
-# as one of 25 mm), and for even change with slopes (as likely as one of 25 mm with slopes of 5 mm).
-EVEN_LOG_PRIORS = (0.0, 3.0, 4.5)
+# For a mean that is as large as the trends, for one that may be any of half a metre (as likely as one of
+# 25 mm), and for such a mean with slopes (as likely as one of 25 mm with slopes of 5 mm).
+MEAN_LOG_PRIORS = (0.0, 3.0, 4.5)
 # Against ice that rises while bare ground beside it does not, and bare ground that changes while the surface
 # does not rise: snow falls on both, and rock does not melt.
 BARE_LOG_PRIOR = 12.0
@@ -67,15 +67,15 @@ MIN_HEAVE_M = 1e-5
 class ChangeModel(NamedTuple):
     """Indices into `CORRELATED_CHANGE_RATIOS`, `CHANGE_STEPS_M` and `TREND_SIZES_M`.
 
-    `bare` is 1 if bare ground has trends of the same size as ice and snow, 0 if it has none. `even` is 0 if
-    the mean is as large as the trends, 1 if it is free, 2 if there are slopes besides.
+    `bare` is 1 if bare ground has trends of the same size as ice and snow, 0 if it has none. `mean` is 0 if
+    the mean is as large as the trends, 1 if it is free, 2 if slopes are free as well.
     """
 
     ratio: int
     step: int
     trend: int
     bare: int = 0
-    even: int = 0
+    mean: int = 0
 
     @property
     def step_m(self) -> float:
@@ -92,7 +92,7 @@ class ChangeModel(NamedTuple):
         """Logarithm of the prior odds: correlation and small trends need evidence."""
         below = max(float(np.log(self.step_m / TREND_SIZES_M[self.trend])), 0.0)
         evidence = CORRELATION_LOG_PRIORS[self.ratio] + SMALL_TREND_LOG_PRIOR * below
-        return EVEN_LOG_PRIORS[self.even] - evidence
+        return MEAN_LOG_PRIORS[self.mean] - evidence
 
     def with_ratio(self, ratio: int) -> ChangeModel:
         """Return the model of another correlation with about the same change between knots."""
@@ -101,7 +101,7 @@ class ChangeModel(NamedTuple):
 
     def neighbours(self, *, bare: bool, ratios: bool = False) -> list[ChangeModel]:
         """Return the models that differ by one index: step, trend, with `bare` and `ratios` also these."""
-        sizes = {"step": len(CHANGE_STEPS_M), "trend": len(TREND_SIZES_M), "even": len(EVEN_LOG_PRIORS)}
+        sizes = {"step": len(CHANGE_STEPS_M), "trend": len(TREND_SIZES_M), "mean": len(MEAN_LOG_PRIORS)}
         if bare:
             sizes["bare"] = 2
         if ratios:
@@ -167,10 +167,10 @@ class GroundChange:
         snow_m = min(self.size_m(model), THIN_SNOW_M) if self.mean_m > 0 else NO_CHANGE_M
         trend_m = np.full(TRENDS, TREND_SIZES_M[model.trend])
         trend_m[0] *= MEAN_RATIO
-        if model.even:
-            trend_m[0] = EVEN_SIGMA_M
-        if model.even > 1:
-            trend_m[SLOPES] = np.maximum(trend_m[SLOPES], EVEN_SLOPE_M)
+        if model.mean:
+            trend_m[0] = FREE_MEAN_SIGMA_M
+        if model.mean > 1:
+            trend_m[SLOPES] = np.maximum(trend_m[SLOPES], FREE_SLOPE_SIGMA_M)
         bare_m = trend_m if model.bare else np.full(TRENDS, NO_CHANGE_M)
         return np.concatenate(
             [

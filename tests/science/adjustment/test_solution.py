@@ -102,7 +102,7 @@ def test_odds_of_models_are_those_of_the_marginal_likelihood(moderate):
         covariance = rest + design @ np.linalg.inv(change.precision_at(model)) @ design.T
         return multivariate_normal(cov=covariance).logpdf(patches.residual_m) + model.log_prior
 
-    first, second = ChangeModel(0, 3, 2), ChangeModel(1, 6, 3, even=2)
+    first, second = ChangeModel(0, 3, 2), ChangeModel(1, 6, 3, mean=2)
     expected = log_likelihood(first) - log_likelihood(second)
     assert solved.log_odds(first) - solved.log_odds(second) == pytest.approx(expected, abs=1e-5)
 
@@ -113,7 +113,7 @@ def test_mixture_has_the_moments_of_all_models(moderate):
     reduced, moments = solved._reduced, []
     sizes = len(ground_change.CHANGE_STEPS_M), len(ground_change.TREND_SIZES_M)
     models = [
-        ChangeModel(ratio, step, trend, even=even) for ratio, step, trend, even in np.ndindex(3, *sizes, 3)
+        ChangeModel(ratio, step, trend, mean=mean) for ratio, step, trend, mean in np.ndindex(3, *sizes, 3)
     ]
     odds = np.array([solved.log_odds(model) for model in models])
     weight = np.exp(odds - odds.max())
