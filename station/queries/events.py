@@ -51,7 +51,7 @@ LEAST_HISTORY = 8
 YEAR_S = 365.25 * 86_400
 CACHED_EPOCHS = 5  # whose shared parameters are in memory
 RETAINED_SIGMA = 0.02  # of the share of a change that cells with few points retain (accuracy.md)
-LEAST_AGREEMENT = 2.5  # sigma by which the cells of a place must have changed together
+LEAST_AGREEMENT = 3.0  # sigma by which the cells of a place must have changed together
 SEARCHES_KEPT = 200  # at once: a long search of a whole series can be interrupted
 
 
