@@ -35,7 +35,6 @@ from station.queries.blocks import BlockQueries, Blocks
 from station.queries.common_errors import common_error_covariance
 from station.queries.epoch_cells import EpochCells, EpochReader, read_window
 from station.science.time_series import event_errors, event_volumes
-from station.science.time_series.event_cells import agreement_sigmas
 from station.science.time_series.event_tracks import Track, pair_tracks, track_events
 from station.science.time_series.events import (
     BEFORE,
@@ -45,6 +44,7 @@ from station.science.time_series.events import (
     detect_regions,
     event_thresholds,
 )
+from station.science.time_series.window_scores import agreement_sigmas
 
 HISTORY = 24  # scans before the two newest, which show how a block scatters
 LEAST_HISTORY = 8

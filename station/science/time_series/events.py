@@ -19,6 +19,7 @@ from station.science.geometry.robust_statistics import MEDIAN_ABSOLUTE_NORMAL
 from station.science.time_series.contrast_errors import ContrastErrors
 from station.science.time_series.surroundings import NEIGHBOURS, TILE, nanmedian, surroundings, tiles_of
 from station.science.time_series.window_scores import (
+    LEAST_BEFORE,
     BlockChange,
     block_weights,
     may_exceed,
@@ -28,7 +29,6 @@ from station.science.time_series.window_scores import (
 )
 
 BEFORE = 6  # newest of the earlier scans, with whose median a scan is compared
-LEAST_BEFORE = 3  # of them must have seen a block
 WINDOWS = (2, 3, 5, 8, 13)  # edge of the windows [blocks]
 MIN_DEPTH_M = 0.05  # less is no event, however significant
 MIN_WIDESPREAD_M = 0.01

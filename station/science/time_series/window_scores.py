@@ -1,4 +1,7 @@
-"""Change summed over windows of blocks, and its z. Source: equations.md, 6.11."""
+"""Change summed over windows of blocks, its z, and whether the cells of a window changed together.
+
+Source: equations.md, 6.11.
+"""
 
 from __future__ import annotations
 
@@ -6,18 +9,22 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy import ndimage
+from scipy import ndimage, stats
 
 from station.quantities import Bools, Floats
 from station.science.geometry.robust_statistics import MEDIAN_ABSOLUTE_NORMAL
-from station.science.time_series.surroundings import SURROUNDING_TILES, TILE, surroundings
+from station.science.time_series.surroundings import SURROUNDING_TILES, TILE, nanmedian, surroundings
 
 MIN_OBSERVED = 0.5  # share of the blocks of a window
 TAIL_QUANTILE, TAIL_SIGMAS = 0.99, 2.576  # two-sided, of a normal distribution
 OUTLIER_SIGMAS = 6.0  # beyond, a window has changed, and is no sample of the errors
 SCATTER_VARIANCE = 1.3  # of a scan less the median of six, over that of a scan
 SCATTER_QUANTILE, SCATTER_SIGMAS = 0.9, 1.645  # of absolute values, two-sided
-MIN_VARIANCE = 0.25  # of a block, for its weight, over the usual variance around it
+MIN_VARIANCE = 0.25  # of a block or cell, for its weight, over the usual variance around it
+LEAST_BEFORE = 3  # of the scans before must have seen a block or cell
+MIN_CELLS = 3
+MIN_VARIANCE_M2 = 1e-12
+MIN_LOG_TAIL = -700.0  # of what numbers can represent
 TINY = 1e-9
 
 
@@ -106,6 +113,28 @@ def window_scores(
         means.append(mean_m)
         scores.append(z)
     return smaller_of_both(*means), smaller_of_both(*scores)
+
+
+def agreement_sigmas(before_m: Floats, after_m: Floats, random_m: Floats, around_m: float) -> float:
+    """Return how many sigma the mean change of cells (n,) is from that of their surroundings [m].
+
+    `before_m` (k, n) and `after_m` (2, n) are the changes of the cells against the reference [m], NaN where a
+    scan did not observe them; `random_m` (n,) is sigma of their random errors. The error of the mean is that
+    by which the cells differ: where beams hit an edge otherwise, a cell jumps by many of its sigma, and those
+    beside it stay. The statistic is Student's t, given as the value of a normal variable that is exceeded as
+    rarely. Zero for fewer than three cells.
+    """
+    known = (np.isfinite(before_m).sum(axis=0) >= LEAST_BEFORE) & np.isfinite(after_m).all(axis=0)
+    if np.count_nonzero(known) < MIN_CELLS:
+        return 0.0
+    change_m = after_m[:, known].mean(axis=0) - nanmedian(before_m[:, known], 0) - around_m
+    variance_m2 = random_m[known] ** 2
+    weights = 1 / np.maximum(variance_m2, MIN_VARIANCE * np.median(variance_m2))
+    weights /= weights.sum()
+    mean_m, freedom = weights @ change_m, 1 / (weights @ weights) - 1
+    mean_m2 = weights**2 @ (change_m - mean_m) ** 2 * (freedom + 1) / freedom
+    log_tail = stats.t.logsf(abs(mean_m) / np.sqrt(max(mean_m2, MIN_VARIANCE_M2)), freedom)
+    return float(np.sign(mean_m) * stats.norm.isf(np.exp(max(log_tail, MIN_LOG_TAIL))))
 
 
 class _Windows:
