@@ -79,11 +79,11 @@ def test_forbidden_words(word):
     pattern = re.compile(rf"(?<![A-Za-z]){word}(?![A-Za-z])", re.IGNORECASE)
     camel = re.compile(rf"(?<![A-Z]){word.capitalize()}(?=[A-Z]|\b)")
     found = [
-        f"{path.relative_to(ROOT)}:{text.count(chr(10), 0, match.start()) + 1}"
+        f"{path.relative_to(ROOT)}:{number}"
         for path, text in TEXTS.items()
-        if word in text.lower()  # ten times as fast as a pattern
-        for match in (pattern.search(text), camel.search(text))
-        if match
+        if word in text.lower()  # much faster than the patterns
+        for number, line in enumerate(text.splitlines(), 1)
+        if pattern.search(line) or camel.search(line)
     ]
     assert not found
 
