@@ -28,7 +28,8 @@ BLOCK_M = 100.0
 MIN_BLOCK_CELLS = 5
 CORRELATED_BLOCKS = 9.0  # blocks that share their systematic error: it varies over some 300 m
 PRIOR_BLOCKS = 3.0  # weight of the model, in independent blocks
-FACTOR_BOUNDS = (0.1, 100.0)  # random
+PRIOR_PAIRS = 10.0  # weight of independent cells against pairs of neighbouring blocks
+FACTOR_BOUNDS = (0.01, 100.0)  # random
 # Upper bound of the variance of means of cells on ground that may have changed, over what points within cells
 # show: on unchanged ground it is 1.3 at most (equations.md, 6.7); more is change, as by drifts of snow.
 MAX_SCATTER_RATIO = 3.0
@@ -110,7 +111,10 @@ def estimate_variance_factors(residuals: Residuals) -> VarianceFactors:
 
 
 def _random_factors(residuals: Residuals) -> Floats32:
-    """Return the factor of the random variance by noise class, from deviations from the mean of the group."""
+    """Return the factor of the random variance by noise class (512,), from deviations from means of groups.
+
+    Classes of the same roughness at all ranges are drawn to their common factor, and that to the model.
+    """
     weight = 1 / (residuals.scan_m2 + residuals.reference_m2).astype(np.float64)
     groups = int(residuals.group.max(initial=0)) + 1
     count = np.bincount(residuals.group, minlength=groups)
@@ -122,10 +126,29 @@ def _random_factors(residuals: Residuals) -> Floats32:
         weight / np.maximum(1 - own_share, 1 / MIN_GROUP_CELLS)
     )
     usable = count[residuals.group] >= MIN_GROUP_CELLS
-    factors, upper_bounds = np.ones(NOISE_CLASSES, np.float32), _moving_upper_bounds(residuals)
-    order = np.argsort(residuals.noise_class, kind="stable")
+    roughness = _roughness_class(np.arange(NOISE_CLASSES))
+    common = np.ones(int(roughness.max()) + 1, np.float32)
+    common = _factors_by_class(residuals, ratio, usable, roughness[residuals.noise_class], common)
+    return _factors_by_class(residuals, ratio, usable, residuals.noise_class, common[roughness])
+
+
+def _roughness_class(noise_class: Ints) -> Ints:
+    """Return the class (n,) by roughness and scatter alone of noise classes in a scan, 0 to 511."""
+    ratio_classes = len(RATIO_EDGES) + 1
+    return np.asarray(noise_class // (NOISE_CLASSES // 2) * ratio_classes + noise_class // 2 % ratio_classes)
+
+
+def _factors_by_class(
+    residuals: Residuals, ratio: Floats, usable: Bools, classes: NDArray[np.integer[Any]], prior: Floats32
+) -> Floats32:
+    """Return the factors (k,) of classes of cells (n,), drawn to a prior (k,) where there are few.
+
+    `ratio` is a deviation over its modelled sigma; only usable ones count.
+    """
+    factors, upper_bounds = prior.copy(), _moving_upper_bounds(residuals, classes, len(prior))
+    order = np.argsort(classes, kind="stable")
     order = order[usable[order]]
-    edges = np.searchsorted(residuals.noise_class[order], np.arange(NOISE_CLASSES + 1))
+    edges = np.searchsorted(classes[order], np.arange(len(prior) + 1))
     for index in np.flatnonzero(np.diff(edges) >= MIN_CLASS_CELLS):
         members = order[edges[index] : edges[index + 1]]
         stable = members[residuals.stable[members]]
@@ -137,25 +160,27 @@ def _random_factors(residuals: Residuals) -> Floats32:
         reference_share = float(residuals.reference_m2[members].sum() / residuals.scan_m2[members].sum())
         variance = robust_scale(ratio[members]) ** 2
         variance += (variance - 1) * reference_share
-        factor = (len(members) * variance + PRIOR_CELLS) / (len(members) + PRIOR_CELLS)
+        factor = (len(members) * variance + PRIOR_CELLS * prior[index]) / (len(members) + PRIOR_CELLS)
         factors[index] = np.clip(factor, FACTOR_BOUNDS[0], upper_bound)
     return factors
 
 
-def _moving_upper_bounds(residuals: Residuals) -> Floats:
-    """Return the upper bound of the factor of moving ground by noise class (512,).
+def _moving_upper_bounds(
+    residuals: Residuals, all_classes: NDArray[np.integer[Any]], class_count: int
+) -> Floats:
+    """Return the upper bound of the factor of moving ground by class (k,).
 
     It comes from the scatter of points within cells; for classes with little of it, from that of all moving
     ground.
     """
     moving = ~residuals.stable & (residuals.freedom > 0)
-    freedom, classes = residuals.freedom[moving].astype(np.float64), residuals.noise_class[moving]
+    freedom, classes = residuals.freedom[moving].astype(np.float64), all_classes[moving]
     ratio = residuals.scatter_m2[moving] / (residuals.scan_m2[moving] * (freedom + 1))
     scatter = np.minimum(ratio, MAX_POINT_SCATTER) * freedom
     total = freedom.sum()
     if total < MIN_CLASS_CELLS:
-        return np.full(NOISE_CLASSES, FACTOR_BOUNDS[1])
-    of_class, weight = (np.bincount(classes, values, NOISE_CLASSES) for values in (scatter, freedom))
+        return np.full(class_count, FACTOR_BOUNDS[1])
+    of_class, weight = (np.bincount(classes, values, class_count) for values in (scatter, freedom))
     of_all = scatter.sum() / total
     return np.asarray(MAX_SCATTER_RATIO * (of_class + MIN_CLASS_CELLS * of_all) / (weight + MIN_CLASS_CELLS))
 
@@ -172,8 +197,9 @@ def _systematic_factor(residuals: Residuals, random: Floats32) -> float:
     )
     if not len(column):
         return 1.0
-    key = (row - row.min()) * (np.ptp(column) + 1) + column - column.min()
-    _, block, count = np.unique(key, return_inverse=True, return_counts=True)
+    columns = int(np.ptp(column)) + 2  # so that the last block of a row has no neighbour in the next
+    key = (row - row.min()) * columns + column - column.min()
+    blocks_found, block, count = np.unique(key, return_inverse=True, return_counts=True)
     random_m2 = (residuals.scan_m2 * random[residuals.noise_class] + residuals.reference_m2)[stable]
     weight = 1 / random_m2.astype(np.float64)
     weight_sum = np.bincount(block, weight)
@@ -185,6 +211,7 @@ def _systematic_factor(residuals: Residuals, random: Floats32) -> float:
     mean_m2, blocks = 1 / weight_sum[enough], np.count_nonzero(enough)
     if blocks < CORRELATED_BLOCKS:
         return 1.0
+    mean_m2 *= _block_factor(blocks_found[enough], columns, mean_m, mean_m2)
     low, high = 0.0, float(np.log(MAX_SYSTEMATIC_FACTOR))
     for _ in range(BISECTIONS):
         middle = (low + high) / 2
@@ -194,3 +221,22 @@ def _systematic_factor(residuals: Residuals, random: Floats32) -> float:
             high = middle
     independent = blocks / CORRELATED_BLOCKS
     return float(np.exp(low * independent / (independent + PRIOR_BLOCKS)))
+
+
+def _block_factor(block: Ints, columns: int, mean_m: Floats, mean_m2: Floats) -> float:
+    """Return by what factor cells of a block that err alike enlarge the variance (n,) of its mean.
+
+    Neighbouring blocks have nearly the same systematic error, so that their differences do not contain it.
+    The factor is at least 1. `block` is ascending, by rows.
+    """
+    ratios = []
+    for step in (1, columns):
+        other = np.minimum(np.searchsorted(block, block + step), len(block) - 1)
+        first = np.flatnonzero(block[other] == block + step)
+        second = other[first]
+        ratios.append((mean_m[first] - mean_m[second]) / np.sqrt(mean_m2[first] + mean_m2[second]))
+    ratio = np.concatenate(ratios)
+    if not len(ratio):
+        return 1.0
+    factor = (len(ratio) * robust_scale(ratio) ** 2 + PRIOR_PAIRS) / (len(ratio) + PRIOR_PAIRS)
+    return max(factor, 1.0)
