@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from station.quantities import Bools, Floats, Floats32, Ints, Reals
-from station.science.geometry.robust_statistics import robust_scale
+from station.science.geometry.robust_statistics import MEDIAN_ABSOLUTE_NORMAL, robust_scale
 
 NOISE_CLASSES = 512  # twice those of the reference's cells: points may scatter as modelled, or more
 RANGE_CLASS_M = 500.0
@@ -238,5 +238,5 @@ def _block_factor(block: Ints, columns: int, mean_m: Floats, mean_m2: Floats) ->
     ratio = np.concatenate(ratios)
     if not len(ratio):
         return 1.0
-    factor = (len(ratio) * robust_scale(ratio) ** 2 + PRIOR_PAIRS) / (len(ratio) + PRIOR_PAIRS)
-    return max(factor, 1.0)
+    shown = float(np.median(ratio**2)) / MEDIAN_ABSOLUTE_NORMAL**2
+    return max((len(ratio) * shown + PRIOR_PAIRS) / (len(ratio) + PRIOR_PAIRS), 1.0)
