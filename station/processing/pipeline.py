@@ -45,7 +45,7 @@ from station.science.gridding.viewpoints import PositionErrors
 from station.science.uncertainty import propagation
 from station.science.uncertainty.jacobian import HeightJacobian
 from station.science.uncertainty.parameters import ParameterLayout
-from station.science.uncertainty.variance_factors import UNIT_FACTORS, VarianceFactors, mean_sampling_ratio
+from station.science.uncertainty.variance_factors import UNIT_FACTORS, VarianceFactors, sampling_ratio
 
 MIN_STABLE_CELLS = 20  # fewer cells give no meaningful statistics
 MIN_BRIGHTNESS_SHARE = 0.5  # of the stable cells; less counts as no brightness
@@ -171,7 +171,7 @@ def adjust_to_reference(
             log = log.relative_to(inputs.params, state_prior.reference_covariance(reference_state))
         temperature_c = None if inputs.air is None else inputs.air.temperature_c
         state_prior = state_prior.relative_to(reference_state)
-        return adjust_scan(patches, inputs.assumed_rad, state_prior, log, temperature_c)
+        return adjust_scan(patches, inputs.assumed_rad, state_prior, log, temperature_c, reference_state)
 
     adjustment = adjusted(components)
     widened = variance_components.as_wide_as(components, adjustment.estimate)
@@ -246,6 +246,7 @@ def _cells(gridder: Gridder, viewing: ViewingGeometry, test: SnowTest) -> Iterat
             ),
             sums.mean_residual() - sector.mean_residual_m,
             sector.point_variance_m2 / sums.count + sector.reference_variance_m2,
+            sampling_ratio(sector.noise_class),
             viewing.sampling_step,
         )
 
@@ -290,12 +291,6 @@ def height_correction(adjustment: tuple[AdjustmentInputs, Adjustment], jacobian:
     """Return the correction to subtract from heights (n,) [m]: effect of estimated minus assumed state."""
     inputs, estimated = adjustment
     return np.asarray(estimated.effect(jacobian) - tilt_effect(jacobian, inputs.assumed_rad))
-
-
-def stable_sampling_ratio(viewing: ViewingGeometry) -> float:
-    """Return the mean sampling ratio of the stable cells that an adjustment uses."""
-    cell_index = viewing.select(CellClass.STABLE, CellClass.EVEN)
-    return mean_sampling_ratio(viewing.cells["noise_class"][:].take(cell_index))
 
 
 def measure(

@@ -443,6 +443,7 @@ def adjusted(scene):
         rng.normal(0, 0.003, count),
         np.full(count, 9e-6),
         np.ones(count),
+        np.zeros(count),
     )
     return adjust_scan(patches, np.zeros((3, SECTOR.line_groups)), state_prior, None)
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from station.processing.pipeline import AdjustmentInputs, stable_sampling_ratio
+from station.processing.pipeline import AdjustmentInputs
 from station.processing.scans.scan_inputs import ScanInputs
 from station.processing.scans.scan_residuals import variance_factors, with_motion_seen
 from station.processing.workers.worker_process import trim_heap
@@ -47,7 +47,7 @@ def scan_errors(
     """Return the errors of a gridded scan, adjusted or not; `components` are its usual motion."""
     if adjustment is None or viewing is None:
         return ScanErrors(inputs.log_only_shared(components))
-    shared = adjustment[1].to_shared_parameters(stable_sampling_ratio(viewing), viewing.reference.shared)
+    shared = adjustment[1].to_shared_parameters()
     if inputs.geometry.published_budget:
         return ScanErrors(shared)
     variance = _motion_variance(viewing.reference, components)

@@ -26,8 +26,8 @@ from station.science.adjustment.normal_equations import (
 from station.science.adjustment.patches import CHI2_MEDIAN, GroundClass, Patches
 from station.science.adjustment.solution import Solution, solve
 from station.science.uncertainty.jacobian import HeightJacobian, sight_tilt_of
-from station.science.uncertainty.parameters import GLOBAL, ParameterLayout
-from station.science.uncertainty.propagation import expand_rows
+from station.science.uncertainty.parameters import GLOBAL, ParameterLayout, interpolate_to_lines
+from station.science.uncertainty.propagation import condense_rows, expand_rows
 
 MAX_ITERATIONS = 8
 CONVERGED_M = 0.0003  # stop when an iteration changes the residuals by less (root mean square)
@@ -38,10 +38,8 @@ MIN_WEIGHT = 0.1  # a patch of smaller weight counts as rejected
 TUKEY = 4.685  # 95 % efficient for normal errors
 EXCESS_BOUNDS_M = (0.002, 0.02)  # of the excess sigma of stable patches over the random errors of cells
 MAX_MOVING_EXCESS_M = 1.0  # upper bound for moving patches
-# Of the response of ground to a motion of the beams, over its sampling ratio: on fractal relief the median
-# response of cells is 5 % too small where their ratio is a third, the mean 2 % too large. Larger ratios do
-# not make the response of many cells together more uncertain than the bound.
-RESPONSE_ERROR, MAX_RESPONSE_ERROR = 0.15, 0.04
+# Of the response of patches to a motion of the beams, over their sampling ratio (equations.md, 6.8).
+RESPONSE_ERROR, MAX_RESPONSE_ERROR = 0.2, 0.05
 MAX_RESPONSE_TILT_RAD = math.radians(0.01)  # beyond, shots are taken to jump as often as they slide
 MAX_GROUP_SIZE = 40.0  # patches that share one error
 HEADING_CLOCKWISE = np.array([1.0, 1.0, -1.0])  # against a rotation about up
@@ -59,7 +57,8 @@ class Adjustment:
     prior's, 1 if the observations alone determine it. `log` is the inclination log that was used, and
     `predicted_log_rad` (lines,) is what the adjustment predicts for it, without the errors of the sensor.
     `unapplied_rad` (3,) is the estimated rotation about east, north and up that the points lack, as a mean
-    over the lines.
+    over the lines. `response_shifts` (2, u) is how far the estimate is off where moving ground, and where
+    stable ground, responds to the motion of the beams by one sigma less than modelled.
     """
 
     params: ParameterLayout
@@ -74,6 +73,7 @@ class Adjustment:
     log: LineInclination | None
     predicted_log_rad: Floats
     unapplied_rad: Floats
+    response_shifts: Floats
 
     def effect(self, jacobian: HeightJacobian) -> Reals:
         """Return the effect of the estimated state on heights (n,) [m], to be subtracted from them."""
@@ -98,23 +98,11 @@ class Adjustment:
         """Posterior covariance (u, u) of the estimate."""
         return self.posterior.line_covariance()
 
-    def to_shared_parameters(
-        self, sampling_ratio: float = 0.0, reference: SharedParameters | None = None
-    ) -> SharedParameters:
-        """Return the estimate and its covariance on knots, for the store.
-
-        `sampling_ratio` is the mean of that of stable cells (`reference_cells.sampling_ratio`): rough ground
-        responds to a motion of the beams against those of the `reference` by a little more or less than
-        modelled. Source: equations.md, 6.8.
-        """
+    def to_shared_parameters(self) -> SharedParameters:
+        """Return the estimate and its covariance on knots, for the store."""
         shared = self.posterior.to_shared_parameters(self.estimate)
-        response_error = min(RESPONSE_ERROR * sampling_ratio, MAX_RESPONSE_ERROR)
-        motion = shared.estimate.copy()
-        if reference is not None and reference.names == shared.names:
-            motion -= reference.estimate
-        motion[:2] *= min(1.0, MAX_RESPONSE_TILT_RAD / max(float(np.hypot(*motion[:2])), 1e-12))
-        beam = np.where(self.params.moves_beam, response_error * motion, 0.0)
-        return replace(shared, covariance=shared.covariance + np.outer(beam, beam))
+        shifts = condense_rows(self.params, self.response_shifts.T)
+        return replace(shared, covariance=shared.covariance + shifts @ shifts.T)
 
 
 def tilt_effect(jacobian: HeightJacobian, applied_rad: Floats) -> Reals:
@@ -129,12 +117,14 @@ def adjust_scan(
     prior: StatePrior,
     log: LineInclination | None,
     temperature_c: float | None = None,
+    reference: SharedParameters | None = None,
 ) -> Adjustment:
     """Return the scanner's state estimated from patches, inclination log and prior.
 
     `applied_rad` (3, lines) is the tilt already applied to the points, as a rotation about east, north and
-    up. `temperature_c` is that of the air at the scanner, None if it was not measured. Hold-out patches are
-    not used. Source: adjustment.md, 5.
+    up. `temperature_c` is that of the air at the scanner, None if it was not measured. Rough ground responds
+    to a motion of the beams against those of the `reference` by a little more or less than modelled. Hold-out
+    patches are not used. Source: adjustment.md, 5; equations.md, 6.8.
     """
     params = patches.jacobian.params
     patches = patches.take(patches.ground_class <= GroundClass.STABLE)
@@ -180,6 +170,8 @@ def adjust_scan(
     )
     leverage_m2 = fit_leverage(patches, weight, equations, posterior)
     state, predicted_log_rad = _state_and_log(params, mixture.estimate, reduced, log)
+    error_m = _response_error(patches, equations.state_effect(_motion(params, mixture.estimate, reference)))
+    of_errors = [equations.of_errors(reduced, weight, error_m * (moving == kind)) for kind in (True, False)]
     sigma = np.sqrt(np.diag(posterior.to_shared_parameters(state).covariance))
     return Adjustment(
         params,
@@ -194,7 +186,27 @@ def adjust_scan(
         log,
         predicted_log_rad,
         state[:3] * HEADING_CLOCKWISE - applied_rad.mean(axis=1),
+        np.array([_state(params, mixture.factor.solve(errors.rhs), errors) for errors in of_errors]),
     )
+
+
+def _motion(params: ParameterLayout, estimate: Floats, reference: SharedParameters | None) -> Floats:
+    """Return by how much the beams moved against those of the reference, as a state by knots (p,)."""
+    motion = np.where(params.moves_beam, estimate[: len(params.names)], 0.0)
+    if reference is not None and reference.names == params.names:
+        motion -= np.where(params.moves_beam, reference.estimate, 0.0)
+    knots = slice(len(GLOBAL), len(GLOBAL) + params.sight_tilt_knots)
+    sight_tilt_rad = sight_tilt_of(params.line_azimuth_rad) @ motion[:2]
+    sight_tilt_rad += interpolate_to_lines(params, motion[knots, None])[:, 0]
+    excess = max(1.0, float(np.abs(sight_tilt_rad).max()) / MAX_RESPONSE_TILT_RAD)
+    motion[:2] /= excess
+    motion[knots] /= excess
+    return motion
+
+
+def _response_error(patches: Patches, motion_m: Floats) -> Floats:
+    """Return one sigma of the response of patches (n,) to what the motion of the beams does to them [m]."""
+    return np.asarray(np.minimum(RESPONSE_ERROR * patches.sampling_ratio, MAX_RESPONSE_ERROR) * motion_m)
 
 
 def _mean_sigma(patches: Patches, moving: Bools, posterior: Posterior) -> float:
@@ -207,17 +219,23 @@ def _mean_sigma(patches: Patches, moving: Bools, posterior: Posterior) -> float:
     return float(np.sqrt(max(variance_m2, 0.0)))
 
 
+def _state(params: ParameterLayout, estimate: Floats, reduced: ReducedNormals) -> Floats:
+    """Return the state by line group (u,) from the unknowns (m,)."""
+    state = expand_rows(params, estimate[: len(params.names), None])[:, 0]
+    state[len(GLOBAL) : len(GLOBAL) + params.line_groups] += reduced.back_substitute(estimate)
+    return np.asarray(state)
+
+
 def _state_and_log(
     params: ParameterLayout, estimate: Floats, reduced: ReducedNormals, log: LineInclination | None
 ) -> tuple[Floats, Floats]:
     """Return the state by line group (u,), and the predicted log (lines,) [rad], free of errors."""
-    state = expand_rows(params, estimate[: len(params.names), None])[:, 0]
+    state = _state(params, estimate, reduced)
     lines = slice(len(GLOBAL), len(GLOBAL) + params.line_groups)
-    state[lines] += reduced.back_substitute(estimate)
     predicted_rad = sight_tilt_of(params.line_azimuth_rad) @ state[:2] + state[lines]
     if log is not None and log.reference_tilt is not None:
         predicted_rad += log.reference_tilt.sight_tilt_rad @ estimate[log.reference_columns(params)]
-    return np.asarray(state), np.asarray(predicted_rad)
+    return state, np.asarray(predicted_rad)
 
 
 def _residual_variance(patches: Patches, residual_m: Floats, kind: Ints) -> Floats:

@@ -206,22 +206,34 @@ class NormalEquations:
             np.asarray(self._line_design_transposed @ (weight * self._line_effect))
         )
         coupling: sparse.csr_array = self._line_design_transposed @ weighted_design
-        line_rhs = np.asarray(self._line_design_transposed @ (weight * self._misclosure))
         normal = (
             self._precision
             + (self._design_transposed @ weighted_design).toarray()
             - line_tilt.quadratic_form(coupling)
         )
-        rhs = (
-            self._design_transposed @ (weight * self._misclosure)
-            - coupling.T @ line_tilt.apply(line_rhs[:, None])[:, 0]
+        return self._with_right_hand_side(
+            ReducedNormals(normal, np.empty(0), line_tilt, coupling, np.empty(0)), weight * self._misclosure
         )
-        return ReducedNormals(normal, rhs, line_tilt, coupling, line_rhs)
+
+    def of_errors(self, reduced: ReducedNormals, weight: Floats, error_m: Floats) -> ReducedNormals:
+        """Return the equations whose solution is the shift that errors of patches (n,) cause [m]."""
+        weighted = np.concatenate([weight * error_m, np.zeros(len(self._log_weight))])
+        return self._with_right_hand_side(reduced, weighted)
+
+    def _with_right_hand_side(self, reduced: ReducedNormals, weighted: Floats) -> ReducedNormals:
+        """Return the equations with the right-hand sides of weighted misclosures (n + lines,)."""
+        line_rhs = np.asarray(self._line_design_transposed @ weighted)
+        eliminated = reduced.coupling.T @ reduced.line_tilt.apply(line_rhs[:, None])[:, 0]
+        return replace(reduced, rhs=self._design_transposed @ weighted - eliminated, line_rhs=line_rhs)
 
     def mean_jtj(self, state_size: int) -> Floats:
         """Return the mean of JᵀJ over the patches (state_size, state_size), for the first unknowns."""
         state_design = self._design[: self._patch_count, :state_size]
         return np.asarray((state_design.T @ state_design).toarray() / max(self._patch_count, 1))
+
+    def state_effect(self, state: Floats) -> Floats:
+        """Return the effect of a state by knots (p,) on the patches (n,) [m]."""
+        return np.asarray(self._design[: self._patch_count, : len(state)] @ state)
 
     def effect(self, estimate: Floats, line_tilt_rad: Floats) -> Floats:
         """Return the effect of the unknowns (m,) and of the line tilts (lines,) on the patches (n,) [m]."""

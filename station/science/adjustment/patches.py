@@ -38,6 +38,7 @@ class CellObservations:
     ground_class: Ints
     residual_m: Floats
     variance_m2: Floats
+    sampling_ratio: Reals  # roughness of the ground against the grazing angle (`variance_factors`)
     sampling_step: tuple[int, int] = (1, 1)  # every n-th cell is used: n of moving, of stable cells
 
 
@@ -52,6 +53,7 @@ class Patches:
     residual_m: Floats  # (m,) above the reference surface
     variance_m2: Floats  # (m,) random variance of the residual
     cell_count: Floats  # (m,)
+    sampling_ratio: Floats  # (m,) mean of the cells
     sampling_step: tuple[int, int] = (1, 1)  # that of the cells
     bin_m: float = RANGE_BIN_M  # extent of a range bin
 
@@ -69,6 +71,7 @@ class Patches:
             self.residual_m[selection],
             self.variance_m2[selection],
             self.cell_count[selection],
+            self.sampling_ratio[selection],
             self.sampling_step,
             self.bin_m,
         )
@@ -106,7 +109,7 @@ def aggregate_patches(
     range_bins = int(max_range_m / bin_m) + 1
     class_size = params.line_groups * range_bins
     size = class_size * GroundClass.UNUSED
-    sums = np.zeros((len(GLOBAL) + 5, GroundClass.UNUSED, params.line_groups, range_bins))
+    sums = np.zeros((len(GLOBAL) + 6, GroundClass.UNUSED, params.line_groups, range_bins))
     collected: list[tuple[Ints32, Floats32, Floats32]] = []
     sampling_step = (1, 1)
     for cells in blocks:
@@ -121,7 +124,7 @@ def aggregate_patches(
         local_key = (ground_class * lines + line - first) * range_bins + range_bin
         total = sums[:, :, first : first + lines]
         effects = *jacobian.pose, jacobian.sight_tilt, jacobian.refraction, jacobian.cross_tilt
-        for row, effect in enumerate([*effects, cells.height_m, None]):
+        for row, effect in enumerate([*effects, cells.height_m, cells.sampling_ratio, None]):
             weighted = precision if effect is None else precision * effect[used]
             total[row] += np.bincount(local_key, weighted, total[row].size).reshape(total[row].shape)
         key = ground_class * class_size + line * range_bins + range_bin
@@ -138,7 +141,7 @@ def aggregate_patches(
     means = patch_sums[:-1, occupied] / patch_sums[-1, occupied]
     patch_index = occupied % class_size
     knot_position = (patch_index // range_bins + 0.5) / LINE_GROUPS_PER_KNOT
-    sight_tilt, refraction, cross_tilt, height_m = means[len(GLOBAL) :]
+    sight_tilt, refraction, cross_tilt, height_m, sampling_ratio = means[len(GLOBAL) :]
     jacobian = HeightJacobian(params, means[: len(GLOBAL)], sight_tilt, refraction, cross_tilt, knot_position)
     return Patches(
         jacobian,
@@ -148,6 +151,7 @@ def aggregate_patches(
         mean_m,
         variance_m2,
         count,
+        sampling_ratio,
         sampling_step,
         bin_m,
     )

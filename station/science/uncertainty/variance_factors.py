@@ -92,11 +92,11 @@ def noise_class(range_m: Reals, sampling_ratio: Reals, dense: Bools) -> Ints:
     return np.asarray((range_class * (len(RATIO_EDGES) + 1) + ratio_class) * 2 + dense)
 
 
-def mean_sampling_ratio(noise_class: NDArray[np.uint8]) -> float:
-    """Return the mean sampling ratio of cells (n,) from their classes; zero without cells."""
-    edges = np.array([RATIO_EDGES[0] / 2, *RATIO_EDGES, 2 * RATIO_EDGES[-1]])
+def sampling_ratio(noise_class: NDArray[np.uint8]) -> Floats32:
+    """Return the sampling ratio of cells (n,), as that of the middle of their classes."""
+    edges = np.array([RATIO_EDGES[0] / 2, *RATIO_EDGES, 2 * RATIO_EDGES[-1]], np.float32)
     middle = np.sqrt(edges[1:] * edges[:-1])
-    return float(middle[noise_class // 2 % len(middle)].mean()) if len(noise_class) else 0.0
+    return np.asarray(middle.take(noise_class // 2 % len(middle)))
 
 
 def class_with_excess(noise_class: NDArray[np.uint8], excess: Bools) -> Ints:

@@ -85,7 +85,9 @@ class Sites:
         stable = np.full(len(self.line), self.stable)
         return height_jacobian(params, self.offset_m, self.east, self.north, rock=stable)
 
-    def patches(self, residual_m, sigma_m=0.01, ground_class=GroundClass.STABLE, params=PARAMS):
+    def patches(
+        self, residual_m, sigma_m=0.01, ground_class=GroundClass.STABLE, params=PARAMS, sampling_ratio=0.0
+    ):
         count = len(self.line)
         return Patches(
             self.jacobian(params),
@@ -95,6 +97,7 @@ class Sites:
             np.asarray(residual_m, dtype=float),
             np.full(count, sigma_m**2),
             np.full(count, 20.0),
+            np.full(count, sampling_ratio),
         )
 
 
@@ -125,7 +128,15 @@ def concatenate(*patches):
         ),
         *(
             np.concatenate([getattr(part, name) for part in patches])
-            for name in ("range_bin", "height_m", "ground_class", "residual_m", "variance_m2", "cell_count")
+            for name in (
+                "range_bin",
+                "height_m",
+                "ground_class",
+                "residual_m",
+                "variance_m2",
+                "cell_count",
+                "sampling_ratio",
+            )
         ),
     )
 
@@ -361,36 +372,60 @@ def test_log_without_ground_gives_its_tilt_with_the_uncertainty_of_the_sensor():
     assert adjustment_warnings(adjustment, COMPONENTS) == ["no stable ground observed"]
 
 
+AHEAD_RAD = math.radians(START_DEG + WIDTH_DEG / 2)
+
+
+def tilt_ahead(tilt_deg):
+    """State (p,) that tilts the beams ahead."""
+    direction = [-math.cos(AHEAD_RAD), math.sin(AHEAD_RAD)]
+    return np.concatenate([np.radians(tilt_deg) * np.array(direction), np.zeros(len(PARAMS.names) - 2)])
+
+
+def adjusted_tilt(tilt_deg, reference_deg, response_error, ratio, ground_class=GroundClass.STABLE):
+    """Adjustment of level ground whose patches respond to a tilt by so much less than modelled."""
+    ground = random_sites(3, 600, steep=0.05)
+    motion, reference = tilt_ahead(tilt_deg), replace(reference_of(1e-9), estimate=tilt_ahead(reference_deg))
+    residual_m = ground.jacobian().to_sparse() @ (motion - response_error * (motion - reference.estimate))
+    patches = ground.patches(residual_m, 0.002, ground_class, sampling_ratio=ratio)
+    return adjust_scan(patches, NO_TILT, knot_prior(PARAMS), None, None, reference)
+
+
 @pytest.mark.parametrize(
     ("tilt_deg", "reference_deg", "ratio", "expected_m"),
     [
-        (0.004, 0.0, 0.5, 0.04 * 1500 * 0.004 / 57.29578),
+        (0.004, 0.0, 0.5, 0.05 * 1500 * 0.004 / 57.29578),
         (0.004, 0.004, 0.5, 0.0),  # the beams are where those of the reference were
-        (0.004, -0.004, 0.1, 0.15 * 0.1 * 1500 * 0.008 / 57.29578),
-        (
-            0.060,
-            0.0,
-            0.5,
-            0.04 * 1500 * 0.010 / 57.29578,
-        ),  # beyond 0.01 degree shots jump as often as they slide
+        (0.004, -0.004, 0.1, 0.2 * 0.1 * 1500 * 0.008 / 57.29578),
+        # Beyond 0.01 degree shots jump as often as they slide.
+        (0.060, 0.0, 0.5, 0.05 * 1500 * 0.010 / 57.29578),
     ],
 )
 def test_rough_ground_adds_its_response_to_a_tilt_against_the_reference(
     tilt_deg, reference_deg, ratio, expected_m
 ):
-    ahead = tuple(np.array([value]) for value in (0.0, 1500.0, -200.0))
-    cells = Sites(np.zeros(1, int), np.zeros(1, int), ahead, np.zeros(1), np.zeros(1))
-    adjustment = adjust_scan(no_patches(), NO_TILT, knot_prior(PARAMS), None)
-    state = np.zeros_like(adjustment.estimate)
-    state[0] = math.radians(tilt_deg)
-    adjustment = replace(adjustment, estimate=state)
-    plain = adjustment.to_shared_parameters()
-    reference = replace(
-        plain, estimate=np.where(np.arange(len(PARAMS.names)) == 0, np.radians(reference_deg), 0)
+    ahead = tuple(np.array([1500 * value]) for value in (math.sin(AHEAD_RAD), math.cos(AHEAD_RAD), 0.0))
+    cells = Sites(np.zeros(1, int), np.zeros(1, int), ahead, np.zeros(1), np.zeros(1)).jacobian()
+    rough, smooth = (
+        cells.variance(adjusted_tilt(tilt_deg, reference_deg, 0.0, value).to_shared_parameters())
+        for value in (ratio, 0.0)
     )
-    rough = adjustment.to_shared_parameters(ratio, reference)
-    added_m2 = cells.jacobian().variance(rough) - cells.jacobian().variance(plain)
-    assert np.sqrt(added_m2) == pytest.approx(expected_m, rel=0.02, abs=1e-6)
+    assert np.sqrt(rough - smooth) == pytest.approx(expected_m, rel=0.1, abs=2e-4)
+
+
+@pytest.mark.parametrize(("stable_share", "row"), [(1.0, 1), (0.0, 0)])
+def test_shift_by_the_response_is_the_error_that_such_ground_causes(stable_share, row):
+    """Ground that responds by one sigma less, against ground that responds as modelled."""
+    ground_class = np.where(np.arange(600) < 600 * stable_share, GroundClass.STABLE, GroundClass.MOVING)
+    modelled, less = (
+        adjusted_tilt(0.008, 0.0, response_error, 0.1, ground_class) for response_error in (0.0, 0.02)
+    )
+    cells = random_sites(4, 100, steep=0.05).jacobian()
+    caused_m = less.effect(cells) - modelled.effect(cells)
+    stated_m = replace(modelled, estimate=modelled.response_shifts[row]).effect(cells)
+    other_m = replace(modelled, estimate=modelled.response_shifts[1 - row]).effect(cells)
+    assert np.abs(caused_m).max() > 0.005
+    assert -stated_m == pytest.approx(caused_m, abs=0.05 * np.abs(caused_m).max())
+    assert np.abs(other_m).max() < 1e-9
 
 
 def reference_of(sigma_rad):

@@ -62,7 +62,10 @@ def make_patches(residual_m, ground_class, sampling_step=(1, 1)):
         np.full(PATCH_COUNT, SIGMA_M**2 / CELLS_PER_PATCH),
         np.full(PATCH_COUNT, CELLS_PER_PATCH),
     )
-    return Patches(jacobian, range_bin, height_m, ground_class, residual_m, variance_m2, cells, sampling_step)
+    smooth = np.zeros(PATCH_COUNT)
+    return Patches(
+        jacobian, range_bin, height_m, ground_class, residual_m, variance_m2, cells, smooth, sampling_step
+    )
 
 
 def ground_classes(stable):
@@ -164,7 +167,7 @@ def test_leverage_depends_on_ground_class_and_noise():
     )
 
 
-def test_patcheskeep_the_sampling_step_of_their_cells():
+def test_patches_keep_the_sampling_step_of_their_cells():
     cells = CellObservations(
         random_sites(1)[0],
         np.full(PATCH_COUNT, 1000.0),
@@ -172,6 +175,7 @@ def test_patcheskeep_the_sampling_step_of_their_cells():
         ground_classes(300),
         np.zeros(PATCH_COUNT),
         np.full(PATCH_COUNT, 1e-4),
+        np.zeros(PATCH_COUNT),
         (6, 2),
     )
     patches = aggregate_patches(PARAMS, [cells], 4000.0)

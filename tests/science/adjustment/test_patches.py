@@ -12,7 +12,7 @@ from station.science.uncertainty.parameters import ParameterLayout
 
 PARAMS = ParameterLayout(np.radians(10.0), 20, full_circle=False)
 MAX_RANGE_M = 3000.0
-FIELDS = ("range_bin", "ground_class", "residual_m", "variance_m2", "cell_count")
+FIELDS = ("range_bin", "ground_class", "residual_m", "variance_m2", "cell_count", "sampling_ratio")
 
 
 def random_cells(seed=0, count=4000):
@@ -22,8 +22,9 @@ def random_cells(seed=0, count=4000):
     jacobian = height_jacobian(PARAMS, offset_m, *rng.uniform(-0.5, 0.5, (2, count)))
     sigma_m = rng.uniform(0.02, 0.1, count)
     ground_class = rng.integers(0, 4, count)
+    ratio = rng.uniform(0, 1, count)
     return CellObservations(
-        jacobian, range_m, offset_m[2], ground_class, rng.normal(0, sigma_m), sigma_m**2
+        jacobian, range_m, offset_m[2], ground_class, rng.normal(0, sigma_m), sigma_m**2, ratio
     ), azimuth
 
 
@@ -35,6 +36,7 @@ def subset(cells, chosen):
         cells.ground_class[chosen],
         cells.residual_m[chosen],
         cells.variance_m2[chosen],
+        cells.sampling_ratio[chosen],
     )
 
 
@@ -51,7 +53,7 @@ def cells_by_patch(per_patch, count=400, seed=1):
     )
     sigma_m = rng.uniform(0.02, 0.1, len(line))
     return CellObservations(
-        jacobian, range_m, level, np.ones(len(line), np.int64), rng.normal(0, sigma_m), sigma_m**2
+        jacobian, range_m, level, np.ones(len(line), np.int64), rng.normal(0, sigma_m), sigma_m**2, level
     )
 
 
@@ -77,6 +79,7 @@ def test_patches_match_a_plain_loop():
             (patches.jacobian.sight_tilt[i], cells.jacobian.sight_tilt),
             (patches.jacobian.refraction[i], cells.jacobian.refraction),
             (patches.height_m[i], cells.height_m),
+            (patches.sampling_ratio[i], cells.sampling_ratio),
         ):
             assert abs(actual - share @ effect[members]) < 1e-9 * np.abs(effect[members]).max()
         min_sigma_m = weight.sum() ** -0.5

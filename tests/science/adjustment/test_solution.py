@@ -41,7 +41,8 @@ def make_patches(seed, change_m, bare_share=0.0):
     residual_m = rng.normal(0, SIGMA_M, COUNT) + np.where(rock, 0.0, change_m)
     ground_class = np.where(stable, GroundClass.STABLE, GroundClass.MOVING).astype(np.int64)
     variance_m2, cells = np.full(COUNT, SIGMA_M**2), np.full(COUNT, 20.0)
-    return Patches(jacobian, range_bin, height_m, ground_class, residual_m, variance_m2, cells)
+    smooth = np.zeros(COUNT)
+    return Patches(jacobian, range_bin, height_m, ground_class, residual_m, variance_m2, cells, smooth)
 
 
 def solve(seed, change_m, bare_share=0.0, temperature_c=None, bare_change_m=None):

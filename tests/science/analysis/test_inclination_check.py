@@ -107,6 +107,7 @@ def make_adjustment(estimate, covariance, log):
         log,
         predicted_rad,
         np.zeros(3),
+        np.zeros((2, len(estimate))),
     )
 
 
