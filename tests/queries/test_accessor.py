@@ -20,6 +20,7 @@ from station.archive.series.index import series_in
 from station.archive.series.virtual import build_series
 from station.errors import StationError, StoreError
 from station.quantities import Reference
+from station.queries import accessor  # noqa: F401 - registers ds.station, as station.open does
 from station.queries.aggregates import Aggregates
 from station.queries.grid_arrays import to_mask
 
