@@ -24,6 +24,7 @@ from station.processing.scans.epoch_inputs import load_scan_inputs
 from station.processing.scans.scan_air import pressure_fault
 from station.processing.scans.scan_files import scan_file
 from station.quantities import Air, Quality
+from station.science.adjustment import joint
 from station.science.uncertainty.parameters import LINE_GROUPS_PER_KNOT
 from station.simulation.instrument.motion import sensor_faults
 from station.simulation.station import simulate, small
@@ -131,8 +132,15 @@ def test_missing_log_increases_the_tilt_sigma(folder):
 
 
 @pytest.mark.integration
-def test_response_of_rough_ground_counts_from_the_state_in_the_scans_of_the_reference(folder):
-    """Its variance is a parabola of that state with the estimate as its vertex (equations.md, 6.8)."""
+def test_response_of_rough_ground_counts_from_the_state_in_the_scans_of_the_reference(folder, monkeypatch):
+    """Its variance is a parabola of that state with the estimate as its vertex (equations.md, 6.8).
+
+    Ground is taken to respond very unlike the model, so that the response is most of the variance. That of
+    the other tilts is small against the steps.
+    """
+    monkeypatch.setattr(joint, "RESPONSE_ERROR", 20.0)
+    monkeypatch.setattr(joint, "MAX_RESPONSE_ERROR", 1.0)
+    monkeypatch.setattr(joint, "MAX_RESPONSE_TILT_RAD", 1.0)
     site = edited_site(folder)
     scans = [scan_file(site, path) for path in sorted(site.scans.inbox.glob("*.laz"))]
     reference_tasks.build_reference_version(site, scans, "1", lambda: None)
@@ -151,13 +159,14 @@ def test_response_of_rough_ground_counts_from_the_state_in_the_scans_of_the_refe
         epoch.unlink()  # else it is that of an identical scan, which is not stored again
         return sigma[0] ** 2, estimate_rad
 
-    step_rad = math.radians(0.004)
+    step_rad = math.radians(0.02)
     offsets_rad = (-step_rad, 0.0, step_rad)
     (below, _), (here, estimate_rad), (above, _) = (tilt_variance(stored[0] + each) for each in offsets_rad)
     curvature = (above - 2 * here + below) / step_rad**2
     vertex_rad = stored[0] - (above - below) / (2 * step_rad) / curvature
-    assert 1e-5 < curvature / 2 <= 0.04**2
-    assert vertex_rad == pytest.approx(estimate_rad, abs=0.02 * step_rad)
+    # Moving and stable ground that err by all of a motion shift the state by x₁ + x₂ = 1 of it.
+    assert 0.4 < curvature / 2 < 1.1
+    assert vertex_rad == pytest.approx(estimate_rad, abs=0.15 * step_rad)
 
 
 def change_log(folder, change):
