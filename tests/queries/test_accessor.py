@@ -20,7 +20,6 @@ from station.archive.series.index import series_in
 from station.archive.series.virtual import build_series
 from station.errors import StationError, StoreError
 from station.quantities import Reference
-from station.queries import accessor  # noqa: F401 - registers ds.station, as station.open does
 from station.queries.aggregates import Aggregates
 from station.queries.grid_arrays import to_mask
 
@@ -63,6 +62,7 @@ def test_the_series_has_the_results_and_the_accessor_how_they_were_computed(ds):
     assert (processing.time == ds.time[[3, 1]]).all()
 
 
+@pytest.mark.usefixtures("ds")  # station.open registers the accessor
 @pytest.mark.parametrize("variables", [None, "all"])
 def test_an_export_says_where_its_variances_are(folder, tmp_path, variables):
     from station.products.area_tables import Span

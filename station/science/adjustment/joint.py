@@ -57,8 +57,8 @@ class Adjustment:
     prior's, 1 if the observations alone determine it. `log` is the inclination log that was used, and
     `predicted_log_rad` (lines,) is what the adjustment predicts for it, without the errors of the sensor.
     `unapplied_rad` (3,) is the estimated rotation about east, north and up that the points lack, as a mean
-    over the lines. `response_shifts` (2, u) is how far the estimate is off where moving ground, and where
-    stable ground, responds to the motion of the beams by one sigma less than modelled.
+    over the lines. `response_shifts` (2, u) is how far the estimate moves if moving ground, and if stable
+    ground, responds to the motion of the beams by one sigma more than modelled.
     """
 
     params: ParameterLayout

@@ -211,20 +211,22 @@ class NormalEquations:
             + (self._design_transposed @ weighted_design).toarray()
             - line_tilt.quadratic_form(coupling)
         )
-        return self._with_right_hand_side(
-            ReducedNormals(normal, np.empty(0), line_tilt, coupling, np.empty(0)), weight * self._misclosure
-        )
+        rhs, line_rhs = self._right_hand_sides(weight * self._misclosure, line_tilt, coupling)
+        return ReducedNormals(normal, rhs, line_tilt, coupling, line_rhs)
 
     def of_errors(self, reduced: ReducedNormals, weight: Floats, error_m: Floats) -> ReducedNormals:
         """Return the equations whose solution is the shift that errors of patches (n,) cause [m]."""
         weighted = np.concatenate([weight * error_m, np.zeros(len(self._log_weight))])
-        return self._with_right_hand_side(reduced, weighted)
+        rhs, line_rhs = self._right_hand_sides(weighted, reduced.line_tilt, reduced.coupling)
+        return replace(reduced, rhs=rhs, line_rhs=line_rhs)
 
-    def _with_right_hand_side(self, reduced: ReducedNormals, weighted: Floats) -> ReducedNormals:
-        """Return the equations with the right-hand sides of weighted misclosures (n + lines,)."""
+    def _right_hand_sides(
+        self, weighted: Floats, line_tilt: LineTiltPosterior, coupling: sparse.csr_array
+    ) -> tuple[Floats, Floats]:
+        """Return the right-hand sides (m,) and (lines,) of weighted misclosures of patches and log."""
         line_rhs = np.asarray(self._line_design_transposed @ weighted)
-        eliminated = reduced.coupling.T @ reduced.line_tilt.apply(line_rhs[:, None])[:, 0]
-        return replace(reduced, rhs=self._design_transposed @ weighted - eliminated, line_rhs=line_rhs)
+        eliminated = coupling.T @ line_tilt.apply(line_rhs[:, None])[:, 0]
+        return self._design_transposed @ weighted - eliminated, line_rhs
 
     def mean_jtj(self, state_size: int) -> Floats:
         """Return the mean of JᵀJ over the patches (state_size, state_size), for the first unknowns."""

@@ -96,7 +96,12 @@ def sampling_ratio(noise_class: NDArray[np.uint8]) -> Floats32:
     """Return the sampling ratio of cells (n,), as that of the middle of their classes."""
     edges = np.array([RATIO_EDGES[0] / 2, *RATIO_EDGES, 2 * RATIO_EDGES[-1]], np.float32)
     middle = np.sqrt(edges[1:] * edges[:-1])
-    return np.asarray(middle.take(noise_class // 2 % len(middle)))
+    return np.asarray(middle.take(_ratio_class(noise_class)))
+
+
+def _ratio_class(noise_class: NDArray[np.integer[Any]]) -> Ints:
+    """Return the class (n,) of the sampling ratio alone, 0 to 6, of noise classes 0 to 255."""
+    return np.asarray(noise_class // 2 % (len(RATIO_EDGES) + 1))
 
 
 def class_with_excess(noise_class: NDArray[np.uint8], excess: Bools) -> Ints:
@@ -113,7 +118,8 @@ def estimate_variance_factors(residuals: Residuals) -> VarianceFactors:
 def _random_factors(residuals: Residuals) -> Floats32:
     """Return the factor of the random variance by noise class (512,), from deviations from means of groups.
 
-    Classes of the same roughness at all ranges are drawn to their common factor, and that to the model.
+    Classes of the same roughness and scatter, at all ranges, are drawn to their common factor, and that to
+    the model.
     """
     weight = 1 / (residuals.scan_m2 + residuals.reference_m2).astype(np.float64)
     groups = int(residuals.group.max(initial=0)) + 1
@@ -126,16 +132,11 @@ def _random_factors(residuals: Residuals) -> Floats32:
         weight / np.maximum(1 - own_share, 1 / MIN_GROUP_CELLS)
     )
     usable = count[residuals.group] >= MIN_GROUP_CELLS
-    roughness = _roughness_class(np.arange(NOISE_CLASSES))
+    has_excess, of_cells = np.divmod(np.arange(NOISE_CLASSES), NOISE_CLASSES // 2)
+    roughness = _ratio_class(of_cells) + has_excess * (len(RATIO_EDGES) + 1)
     common = np.ones(int(roughness.max()) + 1, np.float32)
     common = _factors_by_class(residuals, ratio, usable, roughness[residuals.noise_class], common)
     return _factors_by_class(residuals, ratio, usable, residuals.noise_class, common[roughness])
-
-
-def _roughness_class(noise_class: Ints) -> Ints:
-    """Return the class (n,) by roughness and scatter alone of noise classes in a scan, 0 to 511."""
-    ratio_classes = len(RATIO_EDGES) + 1
-    return np.asarray(noise_class // (NOISE_CLASSES // 2) * ratio_classes + noise_class // 2 % ratio_classes)
 
 
 def _factors_by_class(
@@ -238,5 +239,5 @@ def _block_factor(block: Ints, columns: int, mean_m: Floats, mean_m2: Floats) ->
     ratio = np.concatenate(ratios)
     if not len(ratio):
         return 1.0
-    shown = float(np.median(ratio**2)) / MEDIAN_ABSOLUTE_NORMAL**2
-    return max((len(ratio) * shown + PRIOR_PAIRS) / (len(ratio) + PRIOR_PAIRS), 1.0)
+    observed = float(np.median(ratio**2)) / MEDIAN_ABSOLUTE_NORMAL**2
+    return max((len(ratio) * observed + PRIOR_PAIRS) / (len(ratio) + PRIOR_PAIRS), 1.0)

@@ -11,6 +11,7 @@ from station.science.uncertainty.variance_factors import (
     VarianceFactors,
     estimate_variance_factors,
     noise_class,
+    sampling_ratio,
 )
 
 SIDE_M, CELL_M, GROUP_M, POINTS = 3000.0, 5.0, 50.0, 3
@@ -38,7 +39,8 @@ def residuals(seed, true_factor, systematic_sigma_m=0.0, stable_share=1.0, refer
 @pytest.mark.parametrize("factors", [(1.0, 1.0), (4.0, 0.25), (0.5, 9.0), (1.0, 0.04)])
 def test_random_factors_are_found_by_class_in_both_directions(factors):
     found = estimate_variance_factors(residuals(1, factors)).random
-    assert found[:2] == pytest.approx(factors, rel=0.03, abs=0.003)
+    assert found[:2] == pytest.approx(factors, rel=0.03)
+    assert (found[2:14] == 1).all()  # rougher ground at the same range
     assert len(found) == NOISE_CLASSES
 
 
@@ -125,6 +127,14 @@ def test_noise_classes_fit_a_byte_and_part_range_roughness_and_sampling():
     assert of_one == noise_class(one[0] + 200, one[1] + 0.02, np.array([True]))
     for other in ((1600.0, 0.07, True), (1200.0, 0.12, True), (1200.0, 0.07, False)):
         assert noise_class(*(np.array([value]) for value in other)) != of_one
+
+
+@pytest.mark.parametrize(("ratio", "middle"), [(0.01, 0.0177), (0.07, 0.0707), (0.39, 0.283), (5.0, 1.131)])
+def test_the_sampling_ratio_of_a_class_is_the_geometric_mean_of_its_edges(ratio, middle):
+    """At any range, of cells as a reference stores them."""
+    range_m = np.array([100.0, 2200.0, 8900.0])
+    classes = noise_class(range_m, np.full(3, ratio), np.array([True, False, True])).astype(np.uint8)
+    assert sampling_ratio(classes) == pytest.approx(np.full(3, middle), rel=0.003)
 
 
 def test_median_of_random_factors_counts_cells():
