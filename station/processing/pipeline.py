@@ -27,7 +27,7 @@ from station.quantities import (
 from station.science.adjustment import ground_classes, prior, variance_components
 from station.science.adjustment.ground_classes import SnowTest
 from station.science.adjustment.joint import Adjustment, adjust_scan, tilt_effect
-from station.science.adjustment.normal_equations import LineInclination
+from station.science.adjustment.normal_equations import LineInclination, StatePrior
 from station.science.adjustment.patches import (
     CellObservations,
     aggregate_patches,
@@ -162,20 +162,23 @@ def adjust_to_reference(
     extent_m = line_length(scan_geometry.grid, scan_geometry.scanner.range_max_m)
     patches = aggregate_patches(inputs.params, cells, *extent_m)
 
-    def adjusted(components: VarianceComponents) -> Adjustment:
+    def prior_and_log(components: VarianceComponents) -> tuple[StatePrior, LineInclination | None]:
         state_prior = prior.state_prior(
             inputs.params, inputs.lines, components, weather_known=inputs.air is not None
         )
         log = inputs.log
         if log is not None and reference_state is not None:
             log = log.relative_to(inputs.params, state_prior.reference_covariance(reference_state))
-        temperature_c = None if inputs.air is None else inputs.air.temperature_c
-        state_prior = state_prior.relative_to(reference_state)
-        return adjust_scan(patches, inputs.assumed_rad, state_prior, log, temperature_c, reference_state)
+        return state_prior.relative_to(reference_state), log
 
-    adjustment = adjusted(components)
-    widened = variance_components.as_wide_as(components, adjustment.estimate)
-    return adjustment if widened == components else adjusted(widened)
+    def wider(estimate: Floats) -> tuple[StatePrior, LineInclination | None] | None:
+        widened = variance_components.as_wide_as(components, estimate)
+        return None if widened == components else prior_and_log(widened)
+
+    temperature_c = None if inputs.air is None else inputs.air.temperature_c
+    return adjust_scan(
+        patches, inputs.assumed_rad, *prior_and_log(components), temperature_c, reference_state, wider
+    )
 
 
 def usual_motion(reference: Reference, time_s: float) -> VarianceComponents:

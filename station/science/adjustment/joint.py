@@ -9,12 +9,13 @@ Source: equations.md, 6.3; adjustment.md, 5.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from station.quantities import Bools, Floats, Ints, Reals, SharedParameters
-from station.science.adjustment.ground_change import STABLE, ground_change
+from station.science.adjustment.ground_change import STABLE, GroundChange, ground_change
 from station.science.adjustment.leverage import fit_leverage
 from station.science.adjustment.normal_equations import (
     LineInclination,
@@ -118,19 +119,81 @@ def adjust_scan(
     log: LineInclination | None,
     temperature_c: float | None = None,
     reference: SharedParameters | None = None,
+    wider: Callable[[Floats], tuple[StatePrior, LineInclination | None] | None] = lambda _: None,
 ) -> Adjustment:
     """Return the scanner's state estimated from patches, inclination log and prior.
 
     `applied_rad` (3, lines) is the tilt already applied to the points, as a rotation about east, north and
     up. `temperature_c` is that of the air at the scanner, None if it was not measured. Rough ground responds
-    to a motion of the beams against those of the `reference` by a little more or less than modelled. Hold-out
-    patches are not used. Source: adjustment.md, 5; equations.md, 6.8.
+    to a motion of the beams against those of the `reference` by a little more or less than modelled.
+    `wider(estimate)` returns prior and log for a second estimate if the state (p,) is not one that the prior
+    expects, else None. Hold-out patches are not used. Source: adjustment.md, 5; equations.md, 6.8.
     """
     params = patches.jacobian.params
     patches = patches.take(patches.ground_class <= GroundClass.STABLE)
     moving = patches.ground_class == GroundClass.MOVING
     misclosure_m = patches.residual_m + tilt_effect(patches.jacobian, applied_rad)
     change = ground_change(patches, moving, temperature_c)
+    estimation = _estimate(patches, change, misclosure_m, prior, log)
+    second = wider(estimation.solution.estimate[: len(params.names)])
+    if second is not None:
+        prior, log = second
+        estimation = _estimate(patches, change, misclosure_m, prior, log)
+    equations, reduced = estimation.equations, estimation.reduced
+    mixture = estimation.solution.mixture()
+    posterior = Posterior(
+        params,
+        reduced.line_tilt,
+        reduced.coupling,
+        mixture.factor,
+        mixture.change_bias,
+        equations.mean_jtj(len(params.names)),
+        change.polar_mean(patches, mixture.estimate[equations.size :] / mixture.size_m),
+    )
+    leverage_m2 = fit_leverage(patches, estimation.weight, equations, posterior)
+    state, predicted_log_rad = _state_and_log(params, mixture.estimate, reduced, log)
+    error_m = _response_error(patches, equations.state_effect(_motion(params, mixture.estimate, reference)))
+    of_errors = [
+        equations.of_errors(reduced, estimation.weight, error_m * (moving == kind)) for kind in (True, False)
+    ]
+    sigma = np.sqrt(np.diag(posterior.to_shared_parameters(state).covariance))
+    return Adjustment(
+        params,
+        state,
+        posterior,
+        float(np.hypot(mixture.size_m, estimation.mean_change_m)),
+        estimation.robust_weight[~moving],
+        leverage_m2,
+        _mean_sigma(patches, moving, posterior),
+        sigma,
+        np.clip(1 - sigma**2 / np.diag(prior.knot_covariance), 0.0, 1.0),  # redundancy numbers of the prior
+        log,
+        predicted_log_rad,
+        state[:3] * HEADING_CLOCKWISE - applied_rad.mean(axis=1),
+        np.array([_state(params, mixture.factor.solve(errors.rhs), errors) for errors in of_errors]),
+    )
+
+
+@dataclass(frozen=True)
+class _Estimation:
+    """What the iterations end with: the last solution, its equations, and the weights (n,) of the patches."""
+
+    equations: NormalEquations
+    reduced: ReducedNormals
+    solution: Solution
+    weight: Floats  # [1 / m²]
+    robust_weight: Floats  # 0 to 1
+    mean_change_m: float
+
+
+def _estimate(
+    patches: Patches,
+    change: GroundChange,
+    misclosure_m: Floats,
+    prior: StatePrior,
+    log: LineInclination | None,
+) -> _Estimation:
+    """Return the estimate by iteration: residual variances, rejection and the size of change depend on it."""
     equations = NormalEquations(patches.jacobian, change.design, misclosure_m, prior, log)
     excess_m2 = np.full(len(patches), EXCESS_BOUNDS_M[0] ** 2)
     robust_weight = np.ones(len(patches))
@@ -158,36 +221,7 @@ def adjust_scan(
             if same_model and update_m <= CONVERGED_M * np.sqrt(len(residual_m)):
                 break
     assert solution is not None  # noqa: S101 - the loop runs at least once
-    mixture = solution.mixture()
-    posterior = Posterior(
-        params,
-        reduced.line_tilt,
-        reduced.coupling,
-        mixture.factor,
-        mixture.change_bias,
-        equations.mean_jtj(len(params.names)),
-        change.polar_mean(patches, mixture.estimate[equations.size :] / mixture.size_m),
-    )
-    leverage_m2 = fit_leverage(patches, weight, equations, posterior)
-    state, predicted_log_rad = _state_and_log(params, mixture.estimate, reduced, log)
-    error_m = _response_error(patches, equations.state_effect(_motion(params, mixture.estimate, reference)))
-    of_errors = [equations.of_errors(reduced, weight, error_m * (moving == kind)) for kind in (True, False)]
-    sigma = np.sqrt(np.diag(posterior.to_shared_parameters(state).covariance))
-    return Adjustment(
-        params,
-        state,
-        posterior,
-        float(np.hypot(mixture.size_m, change.mean_m)),
-        robust_weight[~moving],
-        leverage_m2,
-        _mean_sigma(patches, moving, posterior),
-        sigma,
-        np.clip(1 - sigma**2 / np.diag(prior.knot_covariance), 0.0, 1.0),  # redundancy numbers of the prior
-        log,
-        predicted_log_rad,
-        state[:3] * HEADING_CLOCKWISE - applied_rad.mean(axis=1),
-        np.array([_state(params, mixture.factor.solve(errors.rhs), errors) for errors in of_errors]),
-    )
+    return _Estimation(equations, reduced, solution, weight, robust_weight, change.mean_m)
 
 
 def _motion(params: ParameterLayout, estimate: Floats, reference: SharedParameters | None) -> Floats:

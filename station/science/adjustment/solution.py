@@ -8,6 +8,7 @@ holds their disagreement. Source: Hoeting et al. (1999), Eq. 1 to 4; equations.m
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from scipy import linalg
@@ -115,24 +116,25 @@ class Solution:
             model = best
         return model
 
+    @cached_property
     def _factor(self) -> Floats:
-        """Return the Cholesky factor (k, k) of the change's normal matrix with the most likely model."""
+        """Cholesky factor (k, k) of the change's normal matrix with the most likely model."""
         return cholesky_inplace(self._normal + self._change.precision_at(self.model))
 
-    @property
+    @cached_property
     def change_m(self) -> Floats:
         """Estimated change (k,) [m]."""
-        return np.asarray(linalg.cho_solve((self._factor(), True), self._rhs, check_finite=False))
+        return np.asarray(linalg.cho_solve((self._factor, True), self._rhs, check_finite=False))
 
     @property
     def heave_variance_m2(self) -> Floats:
         """Posterior variance of the heaves (heave_columns,) [m²]."""
-        cholesky = self._factor()
+        cholesky = self._factor
         columns = np.eye(len(cholesky))[:, len(cholesky) - self._change.heave_columns :]
         half = linalg.solve_triangular(cholesky, columns, lower=True, check_finite=False)
         return np.asarray(np.sum(half**2, axis=0))
 
-    @property
+    @cached_property
     def estimate(self) -> Floats:
         """Estimated unknowns (m,)."""
         return self._with_change(self.change_m)
