@@ -144,12 +144,12 @@ def test_there_is_no_crossing_without_both_sides():
 
 
 def test_a_crest_on_rough_ground_is_as_uncertain_as_repetitions_show():
-    """2,000 ridges with one summit, whose heights scatter by 0.3 m, by noise or not."""
+    """1,000 ridges with one summit, whose heights scatter by 0.3 m, by noise or not."""
     rng, distance_m = np.random.default_rng(1), np.arange(0.0, 400.0, 10.0)
     ridge_m = -2e-3 * (distance_m - 195.0) ** 2
     for noise_m in (0.0, 0.1, 0.3):
         noise_m2 = np.full(40, noise_m**2)
-        found = [crest(distance_m, ridge_m + rng.normal(0, 0.3, 40), noise_m2) for _ in range(2000)]
+        found = [crest(distance_m, ridge_m + rng.normal(0, 0.3, 40), noise_m2) for _ in range(1000)]
         error_m = np.array([place.distance_m for place in found]) - 195.0
         stated_m2 = [
             noise_m**2 * place.sensitivity @ place.sensitivity + place.relief_m2 * place.relief @ place.relief
@@ -162,14 +162,14 @@ def test_a_crest_on_rough_ground_is_as_uncertain_as_repetitions_show():
 @pytest.mark.parametrize("noise_m", [0.0, 0.05, 0.2, 0.6])
 @pytest.mark.parametrize("length_cells", [0.5, 2.0])
 def test_a_contour_is_where_rough_ground_crosses_the_height(noise_m, length_cells):
-    """2,000 slopes, each with relief of 0.3 m and this length of correlation, and noise of its own.
+    """1,000 slopes, each with relief of 0.3 m and this length of correlation, and noise of its own.
 
     The truth is between two true heights. Positions are as good as those of a line through four heights or
     between two measured ones, whichever is better on such ground.
     """
     rng, distance_m, noise_m2 = np.random.default_rng(4), np.arange(0.0, 400.0, 10.0), np.full(40, noise_m**2)
     z, errors_m = [], {"position": [], "line": [], "two": []}
-    reliefs_m = ndimage.gaussian_filter1d(rng.standard_normal((2000, 80)), length_cells, axis=1)[:, 20:60]
+    reliefs_m = ndimage.gaussian_filter1d(rng.standard_normal((1000, 80)), length_cells, axis=1)[:, 20:60]
     reliefs_m *= 0.3 / np.sqrt(np.sum(ndimage.gaussian_filter1d(np.eye(80)[40], length_cells) ** 2))
     for relief_m in reliefs_m:
         true_m = 100.0 - 0.5 * distance_m + relief_m
