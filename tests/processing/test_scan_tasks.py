@@ -276,7 +276,7 @@ def test_swapped_axes_of_the_log_are_named(folder):
     assert "roll and pitch are swapped" in finding["message"]
 
 
-def test_a_wrong_time_in_the_log_changes_nothing(folder):
+def test_a_wrong_time_in_the_log_is_named_and_changes_nothing_else(folder):
     good, _ = process(folder)
 
     def wrong_time(rows):
@@ -285,7 +285,8 @@ def test_a_wrong_time_in_the_log_changes_nothing(folder):
 
     change_log(folder, wrong_time)
     result, _ = process(folder)
-    assert (result.verdict, result.reason) == ("good", "")
+    assert (good.verdict, result.verdict) == ("good", "degraded")
+    assert result.reason == "inclination log has 1 row with a wrong time, left out"
     assert result.metrics["sigma_median_m"] == pytest.approx(good.metrics["sigma_median_m"], rel=0.01)
     assert result.metrics["roll_deg"] == pytest.approx(good.metrics["roll_deg"], abs=2e-4)
 

@@ -208,6 +208,8 @@ def _clean_log(
         return None
     if dropped > 0.1 * (dropped + rows):
         warnings.append(f"inclination log bad: {dropped} of {dropped + rows} rows rejected")
+    if wrong := inclination.wrong_times(raw):
+        warnings.append(f"inclination log has {wrong} row{'s' * (wrong > 1)} with a wrong time, left out")
     wrong_axes = inclination.axes_warnings(log, rotation)
     warnings += [f"{message}: it is not used" for message in wrong_axes]
     return None if wrong_axes else log

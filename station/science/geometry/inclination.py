@@ -75,6 +75,13 @@ def clean(log: InclinationLog, range_rad: float) -> tuple[InclinationLog, int]:
     return cleaned, len(log.time_s) - len(cleaned.time_s)
 
 
+def wrong_times(log: InclinationLog) -> int:
+    """Return the number of rows of an uncleaned log with a wrong time; one that is only repeated is none."""
+    time_s = log.time_s[np.isfinite(log.time_s)]
+    run = np.cumsum(np.diff(time_s, prepend=time_s[:1]) != 0)  # rows of the same time
+    return int(np.count_nonzero(~np.isin(run, run[_in_time_order(time_s)])))
+
+
 def _in_time_order(time_s: Floats) -> Ints:
     """Return the indices of the rows with a plausible time: as many as possible with times that increase.
 

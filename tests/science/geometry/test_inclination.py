@@ -38,8 +38,9 @@ def test_clean_removes_spikes_invalid_values_and_times_that_do_not_increase():
     time_s = np.arange(100.0)
     time_s[50] = 49.0  # a duplicate
     time_s[60] = 10.0  # back in time
-    cleaned, dropped = inclination.clean(inclination_log(roll, np.zeros(100), time_s), RANGE)
-    assert dropped == 5
+    log = inclination_log(roll, np.zeros(100), time_s)
+    cleaned, dropped = inclination.clean(log, RANGE)
+    assert (dropped, inclination.wrong_times(log)) == (5, 1)
     assert np.all(np.diff(cleaned.time_s) > 0)
     assert np.all(cleaned.roll_rad == 0.01)
 
@@ -59,8 +60,9 @@ def test_clean_removes_spikes_invalid_values_and_times_that_do_not_increase():
 def test_a_wrong_time_costs_its_own_row_only(rows, wrong_s):
     time_s = 1000.0 + np.arange(1800)
     time_s[rows] = wrong_s
-    cleaned, dropped = inclination.clean(inclination_log(*np.zeros((2, 1800)), time_s), RANGE)
-    assert dropped == len(rows)
+    log = inclination_log(*np.zeros((2, 1800)), time_s)
+    cleaned, dropped = inclination.clean(log, RANGE)
+    assert dropped == inclination.wrong_times(log) == len(rows)
     assert np.array_equal(cleaned.time_s, np.delete(1000.0 + np.arange(1800), rows))
 
 
