@@ -349,11 +349,11 @@ def test_sigma_is_calibrated_over_five_stations(z_of_stations, method, scale):
 @pytest.mark.parametrize(
     "name",
     [
-        pytest.param("drift", marks=pytest.mark.xfail(strict=False, reason="at the bound: 0.797")),
+        "drift",
         "wind",
         pytest.param("melt", marks=sigma_too_large(0.72)),
-        pytest.param("poor", marks=pytest.mark.xfail(strict=False, reason="at the bound: 1.257")),
-        pytest.param("fog", marks=pytest.mark.xfail(strict=False, reason="at the bound: 0.793")),
+        pytest.param("poor", marks=pytest.mark.xfail(strict=True, reason="sigma is too small: z is 1.33")),
+        pytest.param("fog", marks=pytest.mark.xfail(strict=False, reason="at the bound: 0.805")),
         "moved",
     ],
 )
