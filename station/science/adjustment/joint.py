@@ -25,7 +25,7 @@ from station.science.adjustment.normal_equations import (
     StatePrior,
 )
 from station.science.adjustment.patches import CHI2_MEDIAN, GroundClass, Patches
-from station.science.adjustment.solution import Solution, solve
+from station.science.adjustment.solution import Solution
 from station.science.uncertainty.jacobian import HeightJacobian, sight_tilt_of
 from station.science.uncertainty.parameters import GLOBAL, ParameterLayout, interpolate_to_lines
 from station.science.uncertainty.propagation import condense_rows, expand_rows
@@ -183,7 +183,7 @@ class _Estimation:
     solution: Solution
     weight: Floats  # [1 / m²]
     robust_weight: Floats  # 0 to 1
-    mean_change_m: float
+    mean_change_m: float  # of moving ground
 
 
 def _estimate(
@@ -203,7 +203,7 @@ def _estimate(
         previous, previous_m = solution, residual_m
         weight = robust_weight / (patches.variance_m2 + excess_m2)
         reduced = equations.reduce(weight)
-        solution = solve(reduced, equations.size, change, previous.model if previous else None)
+        solution = Solution(reduced, equations.size, change, previous.model if previous else None)
         change = change.updated(solution.change_m, solution.heave_variance_m2)
         residual_m = misclosure_m - equations.effect(
             solution.estimate, reduced.back_substitute(solution.estimate)

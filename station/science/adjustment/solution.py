@@ -54,9 +54,19 @@ class WithoutKnots:
 
 
 class Solution:
-    """Solution with the most likely model of the change, whose unknowns are the last."""
+    """Solution of the reduced normal equations with the most likely model of the change.
 
-    def __init__(self, reduced: ReducedNormals, state_size: int, change: GroundChange) -> None:
+    The first `state_size` unknowns are not change. With `previous`, the model of the last iteration, only
+    neighbouring correlations are tried.
+    """
+
+    def __init__(
+        self,
+        reduced: ReducedNormals,
+        state_size: int,
+        change: GroundChange,
+        previous: ChangeModel | None = None,
+    ) -> None:
         self._reduced, self._change, self._state_size = reduced, change, state_size
         normal, rhs = reduced.normal, reduced.rhs
         self._state_factor = ScaledCholesky(normal[:state_size, :state_size])
@@ -65,7 +75,7 @@ class Solution:
         self._rhs = rhs[state_size:] - half.T @ self._state_factor.half_solve(rhs[:state_size, None])[:, 0]
         self._log_odds: dict[ChangeModel, float] = {}
         self._without_knots: dict[tuple[int, int], WithoutKnots] = {}
-        self.model = START_MODEL
+        self.model = self._most_likely(previous)
 
     def log_odds(self, model: ChangeModel) -> float:
         """Return the logarithm of a model's posterior odds, up to a constant."""
@@ -100,14 +110,13 @@ class Solution:
             )
         return self._without_knots[ratio, step]
 
-    def select(self, previous: ChangeModel | None) -> None:
-        """Select the most likely model; with a previous one only neighbouring correlations are tried."""
+    def _most_likely(self, previous: ChangeModel | None) -> ChangeModel:
         best = start = previous or START_MODEL
         for ratio in range(len(CORRELATED_CHANGE_RATIOS)):
             if previous is None or abs(ratio - previous.ratio) <= 1:
                 start = self._hill_climb(start.with_ratio(ratio))
                 best = max(best, start, key=self.log_odds)
-        self.model = best
+        return best
 
     def _hill_climb(self, model: ChangeModel) -> ChangeModel:
         """Return a model whose neighbours of the same correlation are less likely."""
@@ -178,15 +187,3 @@ class Solution:
                 likely.add(model)
                 frontier += model.neighbours(bare=self._change.bare_columns > 0, ratios=True)
         return sorted(likely)
-
-
-def solve(
-    reduced: ReducedNormals, state_size: int, change: GroundChange, previous: ChangeModel | None
-) -> Solution:
-    """Return the solution of the reduced normal equations; the first `state_size` unknowns are not change.
-
-    `previous` is the model of the last iteration.
-    """
-    solution = Solution(reduced, state_size, change)
-    solution.select(previous)
-    return solution

@@ -54,7 +54,7 @@ def solve(seed, change_m, bare_share=0.0, temperature_c=None, bare_change_m=None
     change = ground_change.ground_change(patches, moving, temperature_c)
     equations = NormalEquations(patches.jacobian, change.design, patches.residual_m, PRIOR, None)
     reduced = equations.reduce(1 / patches.variance_m2)
-    return patches, change, equations.size, solution.solve(reduced, equations.size, change, None)
+    return patches, change, equations.size, solution.Solution(reduced, equations.size, change)
 
 
 def on_ice(patches):
@@ -206,5 +206,5 @@ def test_bare_ground_changes_with_snow_only(ice_m, bare_m, expected):
         wave = 1 + np.cos(make_patches(seed, 0.0).range_bin / 6)
         _, change, _, solved = solve(seed, ice_m * wave, bare_share=0.4, bare_change_m=bare_m * wave)
         updated = change.updated(solved.change_m, solved.heave_variance_m2)
-        again = solution.solve(solved._reduced, solved._state_size, updated, solved.model)
+        again = solution.Solution(solved._reduced, solved._state_size, updated, solved.model)
         assert again.model.bare == expected
