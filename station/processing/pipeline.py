@@ -25,6 +25,7 @@ from station.quantities import (
     VarianceComponents,
 )
 from station.science.adjustment import ground_classes, prior, variance_components
+from station.science.adjustment.ground_change import ThinSnow
 from station.science.adjustment.ground_classes import SnowTest
 from station.science.adjustment.joint import Adjustment, adjust_scan, tilt_effect
 from station.science.adjustment.normal_equations import LineInclination, StatePrior
@@ -175,9 +176,12 @@ def adjust_to_reference(
         widened = variance_components.as_wide_as(components, estimate)
         return None if widened == components else prior_and_log(widened)
 
-    temperature_c = None if inputs.air is None else inputs.air.temperature_c
+    thin_snow = ThinSnow(
+        None if inputs.air is None else inputs.air.temperature_c,
+        ground_classes.unseen_snow_m(scan_geometry.scanner.wavelength_um),
+    )
     return adjust_scan(
-        patches, inputs.assumed_rad, *prior_and_log(components), temperature_c, reference_state, wider
+        patches, inputs.assumed_rad, *prior_and_log(components), thin_snow, reference_state, wider
     )
 
 

@@ -3,10 +3,10 @@
 Moving ground changes by trends over all of it (mean, east, north, distance, squared distance, height) and
 smoothly between knots. Bare ground that is not known to be stable has trends and knots of its own: melt ends
 at the edge of the ice, as the refraction of cold air does, and snow does not. Stable ground is not quite at
-rest: it heaves, as a whole and by blocks, and where moving ground rises it may be under thin snow. The sizes
-of trends and of the change between knots are not known. A model is one choice of them, of whether the mean is
-as large as the trends or free, with slopes of its own or without, and of whether bare ground has trends; an
-adjustment weighs all models by their likelihood.
+rest: it heaves, as a whole and by blocks, and after snowfall it may be under thin snow. The sizes of trends
+and of the change between knots are not known. A model is one choice of them, of whether the mean is as large
+as the trends or free, with slopes of its own or without, and of whether snow has fallen; an adjustment weighs
+all models by their likelihood.
 Source: equations.md, 6.3; adjustment.md, 5.
 """
 
@@ -19,6 +19,7 @@ import numpy as np
 from scipy import sparse
 
 from station.quantities import Bools, Floats, Ints, Reals
+from station.science.adjustment.ground_classes import UNSEEN_SNOW_M
 from station.science.adjustment.normal_equations import ScaledCholesky
 from station.science.adjustment.patches import Patches
 from station.science.geometry.air import LAPSE_K_PER_M
@@ -46,18 +47,21 @@ CORRELATION_LOG_PRIORS = (0.0, 12.0, 24.0)
 # For a mean that is as large as the trends, for one that may be any of half a metre (as likely as one of
 # 25 mm), and for such a mean with slopes (as likely as one of 25 mm with slopes of 5 mm).
 MEAN_LOG_PRIORS = (0.0, 3.0, 4.5)
-# Against ice that rises while bare ground beside it does not, and bare ground that changes while the surface
-# does not rise: snow falls on both, and rock does not melt.
-BARE_LOG_PRIOR = 12.0
+# Against ice that rises while bare ground beside it does not, and both sinking: snow falls on both, and rock
+# does not melt. Snow has fallen in one scan of twenty.
+UNLIKELY_LOG_PRIOR = 12.0
+SNOW_LOG_PRIORS = (0.0, 3.0, UNLIKELY_LOG_PRIOR)
 SMALL_TREND_LOG_PRIOR = 2.0  # against each factor e by which trends are smaller than the change between knots
 CORRELATION_AZIMUTH_KNOTS, CORRELATION_RANGE_KNOTS = 4.0, 2.5  # correlation lengths, in knots
-# Where moving ground rises, stable ground may be under snow too thin to change its intensity.
-THIN_SNOW_M = 0.005  # upper bound of sigma; the change of moving ground bounds it too
+# Mean and sigma of thin snow, over its largest depth: any depth that does not show is as likely.
+UNIFORM = np.sqrt([1 / 4, 1 / 12])
 NO_CHANGE_M = 1e-6
 # Of the air over thin snow. At most of the warmest places half of what falls at 2.4 °C is snow (Jennings et
 # al., 2018), and a thermometer in the sun shows up to 5 K too much.
 MAX_SNOW_C = 8.0
-MAX_SNOW_SLOPES = tuple(np.tan(np.radians((40.0, 50.0))))  # upper bounds (tan): full snow, some snow
+SNOW_SLOPES = tuple(
+    np.tan(np.radians((40.0, 45.0, 50.0)))
+)  # upper bounds (tan): all, most, little of the snow
 HEAVE_M = 0.002  # start value of sigma: frost and heat move rock by millimetres
 HEAVE_BLOCK_M = 500.0
 PRIOR_HEAVE_BLOCKS = 4.0  # weight of the start value, in blocks
@@ -67,15 +71,21 @@ MIN_HEAVE_M = 1e-5
 class ChangeModel(NamedTuple):
     """Indices into `CORRELATED_CHANGE_RATIOS`, `CHANGE_STEPS_M` and `TREND_SIZES_M`.
 
-    `bare` is 1 if bare ground has trends of the same size as ice and snow, 0 if it has none. `mean` is 0 if
-    the mean is as large as the trends, 1 if it is free, 2 if slopes are free as well.
+    `snow` is 0 if bare ground does not change, 1 if snow has fallen: ice and bare ground rise, and stable
+    ground may be under thin snow; 2 if ice and bare ground change otherwise, as when snow melts. `mean` is 0
+    if the mean is as large as the trends, 1 if it is free, 2 if slopes are free as well.
     """
 
     ratio: int
     step: int
     trend: int
-    bare: int = 0
+    snow: int = 0
     mean: int = 0
+
+    @property
+    def mean_sign(self) -> int:
+        """Sign of the mean change: snow raises the surface, ice that changes alone melts; 0 if it is open."""
+        return (-1, 1, 0)[self.snow]
 
     @property
     def step_m(self) -> float:
@@ -89,21 +99,19 @@ class ChangeModel(NamedTuple):
 
     @property
     def log_prior(self) -> float:
-        """Logarithm of the prior odds: correlation and small trends need evidence."""
+        """Logarithm of the prior odds: correlation, small trends and snow need evidence."""
         below = max(float(np.log(self.step_m / TREND_SIZES_M[self.trend])), 0.0)
         evidence = CORRELATION_LOG_PRIORS[self.ratio] + SMALL_TREND_LOG_PRIOR * below
-        return MEAN_LOG_PRIORS[self.mean] - evidence
+        return MEAN_LOG_PRIORS[self.mean] - SNOW_LOG_PRIORS[self.snow] - evidence
 
     def with_ratio(self, ratio: int) -> ChangeModel:
         """Return the model of another correlation with about the same change between knots."""
         steps_m = np.hypot(1.0, CORRELATED_CHANGE_RATIOS[ratio]) * np.array(CHANGE_STEPS_M)
         return self._replace(ratio=ratio, step=int(np.argmin(np.abs(np.log(steps_m / self.step_m)))))
 
-    def neighbours(self, *, bare: bool, ratios: bool = False) -> list[ChangeModel]:
-        """Return the models that differ by one index: step, trend, with `bare` and `ratios` also these."""
+    def neighbours(self, *, ratios: bool = False) -> list[ChangeModel]:
+        """Return the models that differ by one index, in the ratio only with `ratios`."""
         sizes = {"step": len(CHANGE_STEPS_M), "trend": len(TREND_SIZES_M), "mean": len(MEAN_LOG_PRIORS)}
-        if bare:
-            sizes["bare"] = 2
         if ratios:
             sizes["ratio"] = len(CORRELATED_CHANGE_RATIOS)
         return [
@@ -111,18 +119,41 @@ class ChangeModel(NamedTuple):
             for name, size in sizes.items()
             for index in (getattr(self, name) - 1, getattr(self, name) + 1)
             if 0 <= index < size
-        ]
+        ] + [self._replace(snow=index) for index in range(len(SNOW_LOG_PRIORS)) if index != self.snow]
 
 
 START_MODEL = ChangeModel(0, len(CHANGE_STEPS_M) // 2, len(TREND_SIZES_M) // 2)
+
+
+class ThinSnow(NamedTuple):
+    """Snow that stable ground may be under without showing it.
+
+    `temperature_c` is that of the air at the scanner, None if it was not measured, `max_depth_m` the largest
+    depth that the brightness of a cell does not show.
+    """
+
+    temperature_c: float | None = None
+    max_depth_m: float = UNSEEN_SNOW_M
+
+    def is_possible(self, patches: Patches) -> Bools:
+        """Return True for patches (n,) where it is cold enough; everywhere if no temperature is known.
+
+        It falls with the height. Below the scanner it is taken to do so too: cold air collects in hollows.
+        """
+        if self.temperature_c is None:
+            return np.ones(len(patches), np.bool_)
+        return np.asarray(self.temperature_c - LAPSE_K_PER_M * np.abs(patches.height_m) < MAX_SNOW_C)
+
+
+THIN_SNOW = ThinSnow()
 
 
 @dataclass(frozen=True)
 class GroundChange:
     """Unknown change of patches (n,): trends, knots, depths of thin snow, heave, in this order.
 
-    `mean_m` is the estimated mean of moving ground; snow depths are free if it rises. A patch of moving
-    ground is of the kind that has most of it.
+    A patch of moving ground is of the kind that has most of it. `thin_snow_m` is the largest depth of
+    thin snow on stable ground.
     """
 
     design: sparse.csr_array  # (n, k)
@@ -133,23 +164,13 @@ class GroundChange:
     bare_columns: int  # the last of these, trends of bare ground beside ice and snow
     snow_columns: int
     heave_columns: int
+    thin_snow_m: float
     heave_m: float
-    mean_m: float = THIN_SNOW_M
 
     @property
     def moving(self) -> Bools:
         """Whether patches are moving ground (n,)."""
         return np.asarray(self.kind != STABLE)
-
-    def log_prior(self, model: ChangeModel) -> float:
-        """Return the logarithm of the prior odds of a model."""
-        has_snowed = self.mean_m > THIN_SNOW_M
-        is_unlikely = self.bare_columns > 0 and bool(model.bare) != has_snowed
-        return model.log_prior - BARE_LOG_PRIOR * is_unlikely
-
-    def size_m(self, model: ChangeModel) -> float:
-        """Return one sigma of the change of moving ground, with its mean [m]."""
-        return float(np.hypot(model.size_m, self.mean_m))
 
     @property
     def knots(self) -> slice:
@@ -162,24 +183,28 @@ class GroundChange:
         """Columns of the other unknowns, which are independent of each other."""
         return np.delete(np.arange(self.design.shape[1]), self.knots)
 
-    def sigma_m(self, model: ChangeModel) -> Floats:
-        """Return sigma of the independent unknowns of a model [m]: trends, depths of snow, heave."""
-        snow_m = min(self.size_m(model), THIN_SNOW_M) if self.mean_m > 0 else NO_CHANGE_M
-        trend_m = np.full(TRENDS, TREND_SIZES_M[model.trend])
-        trend_m[0] *= MEAN_RATIO
+    def prior_m(self, model: ChangeModel) -> tuple[Floats, Floats]:
+        """Return mean and sigma of the independent unknowns of a model [m]: trends, depths of snow, heave."""
+        unchanged = np.array([[0.0], [NO_CHANGE_M]])
+        trends = np.stack([np.zeros(TRENDS), np.full(TRENDS, TREND_SIZES_M[model.trend])])
+        trends[1, 0] *= MEAN_RATIO
+        depth_m = min(self.thin_snow_m, float(np.hypot(model.step_m, trends[1, 0])))
         if model.mean:
-            trend_m[0] = FREE_MEAN_SIGMA_M
+            depth_m, trends[1, 0] = self.thin_snow_m, FREE_MEAN_SIGMA_M
         if model.mean > 1:
-            trend_m[SLOPES] = np.maximum(trend_m[SLOPES], FREE_SLOPE_SIGMA_M)
-        bare_m = trend_m if model.bare else np.full(TRENDS, NO_CHANGE_M)
-        return np.concatenate(
+            trends[1, SLOPES] = np.maximum(trends[1, SLOPES], FREE_SLOPE_SIGMA_M)
+        bare = trends if model.snow else np.repeat(unchanged, TRENDS, axis=1)
+        thin_snow = depth_m * UNIFORM[:, None] if model.snow == 1 else unchanged
+        heave = np.array([[0.0], [self.heave_m]])
+        mean_m, sigma_m = np.hstack(
             [
-                trend_m[: self.trend_columns - self.bare_columns],
-                bare_m[: self.bare_columns],
-                np.full(self.snow_columns, snow_m),
-                np.full(self.heave_columns, self.heave_m),
+                trends[:, : self.trend_columns - self.bare_columns],
+                bare[:, : self.bare_columns],
+                np.repeat(thin_snow, self.snow_columns, axis=1),
+                np.repeat(heave, self.heave_columns, axis=1),
             ]
         )
+        return mean_m, sigma_m
 
     def knot_precision(self, ratio: int, step: int) -> tuple[Floats, float]:
         """Return the precision (knots, knots) of the change between knots, and log |precision⁻¹|."""
@@ -187,26 +212,32 @@ class GroundChange:
         log_determinant = self.knot_log_determinants[ratio] + 2 * len(precision) * np.log(step_m)
         return precision / step_m**2, float(log_determinant)
 
-    def precision_at(self, model: ChangeModel) -> Floats:
-        """Return the precision (k, k) of a model."""
+    def precision_at(self, model: ChangeModel) -> tuple[Floats, Floats]:
+        """Return the precision (k, k) of a model, and its product with the prior mean (k,)."""
         precision, independent = np.zeros((self.design.shape[1],) * 2), self.independent
         precision[self.knots, self.knots], _ = self.knot_precision(model.ratio, model.step)
-        precision[independent, independent] = 1 / self.sigma_m(model) ** 2
-        return precision
+        mean_m, sigma_m = self.prior_m(model)
+        precision[independent, independent] = 1 / sigma_m**2
+        information = np.zeros(len(precision))
+        information[independent] = mean_m / sigma_m**2
+        return precision, information
+
+    def mean_m(self, estimate_m: Floats) -> float:
+        """Return the mean change of moving ground that an estimate (k,) shows [m]; 0 without any."""
+        return float((self.design @ estimate_m)[self.moving].mean()) if self.moving.any() else 0.0
 
     def updated(self, estimate_m: Floats, heave_variance_m2: Floats) -> GroundChange:
-        """Return this change with the size of heave that an estimate (k,) shows, and the mean change.
+        """Return this change with the size of heave that an estimate (k,) shows.
 
         Its variance is the mean of estimate squared plus posterior variance (heave_columns,), shrunk towards
         the start value (expectation-maximisation).
         """
-        mean_m = float((self.design @ estimate_m)[self.moving].mean()) if self.moving.any() else 0.0
         heave_m = HEAVE_M
         if self.heave_columns:
             second_moment_m2 = float(np.sum(estimate_m[-self.heave_columns :] ** 2 + heave_variance_m2))
             second_moment_m2 += PRIOR_HEAVE_BLOCKS * HEAVE_M**2
             heave_m = max(np.sqrt(second_moment_m2 / (PRIOR_HEAVE_BLOCKS + self.heave_columns)), MIN_HEAVE_M)
-        return replace(self, heave_m=heave_m, mean_m=mean_m)
+        return replace(self, heave_m=heave_m)
 
     def polar_mean(self, patches: Patches, estimate_m: Floats) -> Floats:
         """Return the mean estimated change of moving ground by azimuth sector and range ring."""
@@ -216,18 +247,15 @@ class GroundChange:
         return common_mode.polar_mean(azimuth_rad, distance_m, (self.design @ estimate_m)[self.moving])
 
 
-def ground_change(patches: Patches, moving: Bools, temperature_c: float | None = None) -> GroundChange:
-    """Return the unknown change of patches, of which `moving` (n,) are moving ground.
-
-    `temperature_c` is that of the air at the scanner, None if it was not measured.
-    """
+def ground_change(patches: Patches, moving: Bools, thin_snow: ThinSnow = THIN_SNOW) -> GroundChange:
+    """Return the unknown change of patches, of which `moving` (n,) are moving ground."""
     shares = _shares(patches, moving)
     knot_design, precisions, log_determinants = _knots(patches, shares)
     trends = [_trends(patches, share) for share in shares]
     trend_design = sparse.hstack(trends, format="csr")
     snow_design = sparse.csr_array((len(moving), 0))
     if moving.any():
-        snow_design = _thin_snow(patches, ~moving & _may_hold_snow(patches, temperature_c))
+        snow_design = _thin_snow(patches, ~moving & thin_snow.is_possible(patches))
     heave_design = _heave(patches, ~moving)
     return GroundChange(
         sparse.hstack([trend_design, knot_design, snow_design, heave_design], format="csr"),
@@ -238,6 +266,7 @@ def ground_change(patches: Patches, moving: Bools, temperature_c: float | None =
         trends[1].shape[1] if trends[0].shape[1] else 0,
         snow_design.shape[1],
         heave_design.shape[1],
+        thin_snow.max_depth_m,
         HEAVE_M,
     )
 
@@ -310,20 +339,11 @@ def _trends(patches: Patches, share: Floats) -> sparse.csr_array:
     return sparse.csr_array(trends * share[:, None])
 
 
-def _may_hold_snow(patches: Patches, temperature_c: float | None) -> Bools:
-    """Return True for patches (n,) where it is cold enough for snow; everywhere if no temperature is known.
-
-    It falls with the height. Below the scanner it is taken to do so too: cold air collects in hollows.
-    """
-    if temperature_c is None:
-        return np.ones(len(patches), np.bool_)
-    return np.asarray(temperature_c - LAPSE_K_PER_M * np.abs(patches.height_m) < MAX_SNOW_C)
-
-
 def _thin_snow(patches: Patches, chosen: Bools) -> sparse.csr_array:
-    """Return the design matrix (n, 2) of thin snow: chosen patches that hold snow, and that hold some."""
-    snow_class = np.digitize(patches.jacobian.tan_slope, MAX_SNOW_SLOPES)
-    return sparse.csr_array(np.stack([(snow_class == index) & chosen for index in range(2)], axis=1) * 1.0)
+    """Return the design matrix (n, 3) of thin snow on chosen patches, by how much of it their slope holds."""
+    snow_class = np.digitize(patches.jacobian.tan_slope, SNOW_SLOPES)
+    classes = [(snow_class == index) & chosen for index in range(len(SNOW_SLOPES))]
+    return sparse.csr_array(np.stack(classes, axis=1) * 1.0)
 
 
 def _heave(patches: Patches, stable: Bools) -> sparse.csr_array:

@@ -22,6 +22,9 @@ DARK_SNOW_UM = 1.4  # wavelength from which snow is darker than rock: water and 
 # to 20 % and rock 20 to 50 %. Rock that is wet now, 0.6 times as bright at worst, stays within.
 BRIGHT_SNOW_RATIOS = (0.5, 1.25)
 DARK_SNOW_RATIOS = (0.55, 1 / 0.55)
+# Largest depth of patchy snow that stays within these limits: it covers rock at a few centimetres, and bright
+# snow shows when it covers a fifth of a cell, dark snow when it covers two thirds.
+UNSEEN_SNOW_M, UNSEEN_DARK_SNOW_M = 0.01, 0.02
 MAX_GAIN_CHANGE = 0.15  # of the receiver, usually 5 % from scan to scan; beyond, the ground has changed
 MIN_GAIN_CELLS = 50
 MAX_GROUND_INTENSITY = 0.5  # of the scale; snow of twice that would not be on it
@@ -111,6 +114,11 @@ def snow_test(
         return SnowTest(np.nan, ratios)
     gain = float(np.median(ratio[known])) if is_gain_known else 1.0
     return SnowTest(gain if abs(gain - 1) <= MAX_GAIN_CHANGE else 1.0, ratios)
+
+
+def unseen_snow_m(wavelength_um: float) -> float:
+    """Return the largest depth of snow on stable ground that its brightness does not show [m]."""
+    return UNSEEN_SNOW_M if wavelength_um < DARK_SNOW_UM else UNSEEN_DARK_SNOW_M
 
 
 @dataclass(frozen=True)

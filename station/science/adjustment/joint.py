@@ -15,7 +15,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from station.quantities import Bools, Floats, Ints, Reals, SharedParameters
-from station.science.adjustment.ground_change import STABLE, GroundChange, ground_change
+from station.science.adjustment.ground_change import (
+    STABLE,
+    THIN_SNOW,
+    GroundChange,
+    ThinSnow,
+    ground_change,
+)
 from station.science.adjustment.leverage import fit_leverage
 from station.science.adjustment.normal_equations import (
     LineInclination,
@@ -117,15 +123,15 @@ def adjust_scan(
     applied_rad: Floats,
     prior: StatePrior,
     log: LineInclination | None,
-    temperature_c: float | None = None,
+    thin_snow: ThinSnow = THIN_SNOW,
     reference: SharedParameters | None = None,
     wider: Callable[[Floats], tuple[StatePrior, LineInclination | None] | None] = lambda _: None,
 ) -> Adjustment:
     """Return the scanner's state estimated from patches, inclination log and prior.
 
     `applied_rad` (3, lines) is the tilt already applied to the points, as a rotation about east, north and
-    up. `temperature_c` is that of the air at the scanner, None if it was not measured. Rough ground responds
-    to a motion of the beams against those of the `reference` by a little more or less than modelled.
+    up. Rough ground responds to a motion of the beams against those of the `reference` by a little more or
+    less than modelled.
     `wider(estimate)` returns prior and log for a second estimate if the state (p,) is not one that the prior
     expects, else None. Hold-out patches are not used. Source: adjustment.md, 5; equations.md, 6.8.
     """
@@ -133,7 +139,7 @@ def adjust_scan(
     patches = patches.take(patches.ground_class <= GroundClass.STABLE)
     moving = patches.ground_class == GroundClass.MOVING
     misclosure_m = patches.residual_m + tilt_effect(patches.jacobian, applied_rad)
-    change = ground_change(patches, moving, temperature_c)
+    change = ground_change(patches, moving, thin_snow)
     estimation = _estimate(patches, change, misclosure_m, prior, log)
     second = wider(estimation.solution.estimate[: len(params.names)])
     if second is not None:
@@ -221,7 +227,7 @@ def _estimate(
             if same_model and update_m <= CONVERGED_M * np.sqrt(len(residual_m)):
                 break
     assert solution is not None  # noqa: S101 - the loop runs at least once
-    return _Estimation(equations, reduced, solution, weight, robust_weight, change.mean_m)
+    return _Estimation(equations, reduced, solution, weight, robust_weight, change.mean_m(solution.change_m))
 
 
 def _motion(params: ParameterLayout, estimate: Floats, reference: SharedParameters | None) -> Floats:

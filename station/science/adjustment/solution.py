@@ -11,12 +11,13 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from scipy import linalg
+from scipy import linalg, special
 
 from station.quantities import Floats
 from station.science.adjustment.ground_change import (
     CORRELATED_CHANGE_RATIOS,
     START_MODEL,
+    UNLIKELY_LOG_PRIOR,
     ChangeModel,
     GroundChange,
 )
@@ -81,14 +82,21 @@ class Solution:
         """Return the logarithm of a model's posterior odds, up to a constant."""
         if model not in self._log_odds:
             if not len(self._rhs):
-                return self._change.log_prior(model)
+                return model.log_prior
             rest = self._eliminate_knots(model.ratio, model.step)
-            sigma_m = self._change.sigma_m(model)
+            mean_m, sigma_m = self._change.prior_m(model)
             cholesky = cholesky_inplace(rest.normal + np.diag(1 / sigma_m**2))
-            half = linalg.solve_triangular(cholesky, rest.rhs, lower=True, check_finite=False)
+            half, first = (
+                linalg.solve_triangular(cholesky, column, lower=True, check_finite=False)
+                for column in (rest.rhs + mean_m / sigma_m**2, np.eye(len(sigma_m))[0])
+            )
             half_log_determinant = log_determinant(cholesky) / 2 + np.log(sigma_m).sum()
-            self._log_odds[model] = rest.log_odds + float(half @ half / 2 - half_log_determinant)
-            self._log_odds[model] += self._change.log_prior(model)
+            squares = half @ half - np.sum((mean_m / sigma_m) ** 2)
+            log_odds = rest.log_odds + model.log_prior + squares / 2 - half_log_determinant
+            if model.mean_sign and self._change.trend_columns:  # the first unknown is the mean
+                z = model.mean_sign * first @ half / np.linalg.norm(first)
+                log_odds += np.log(2) + max(special.log_ndtr(z), -UNLIKELY_LOG_PRIOR)
+            self._log_odds[model] = float(log_odds)
         return self._log_odds[model]
 
     def _eliminate_knots(self, ratio: int, step: int) -> WithoutKnots:
@@ -120,25 +128,26 @@ class Solution:
 
     def _hill_climb(self, model: ChangeModel) -> ChangeModel:
         """Return a model whose neighbours of the same correlation are less likely."""
-        bare = self._change.bare_columns > 0
-        while (best := max([model, *model.neighbours(bare=bare)], key=self.log_odds)) != model:
+        while (best := max([model, *model.neighbours()], key=self.log_odds)) != model:
             model = best
         return model
 
     @cached_property
-    def _factor(self) -> Floats:
-        """Cholesky factor (k, k) of the change's normal matrix with the most likely model."""
-        return cholesky_inplace(self._normal + self._change.precision_at(self.model))
+    def _equations(self) -> tuple[Floats, Floats]:
+        """Cholesky factor (k, k) of the change's normal matrix with the most likely model, and its rhs."""
+        precision, information = self._change.precision_at(self.model)
+        return cholesky_inplace(self._normal + precision), self._rhs + information
 
     @cached_property
     def change_m(self) -> Floats:
         """Estimated change (k,) [m]."""
-        return np.asarray(linalg.cho_solve((self._factor, True), self._rhs, check_finite=False))
+        cholesky, rhs = self._equations
+        return np.asarray(linalg.cho_solve((cholesky, True), rhs, check_finite=False))
 
     @property
     def heave_variance_m2(self) -> Floats:
         """Posterior variance of the heaves (heave_columns,) [m²]."""
-        cholesky = self._factor
+        cholesky, _ = self._equations
         columns = np.eye(len(cholesky))[:, len(cholesky) - self._change.heave_columns :]
         half = linalg.solve_triangular(cholesky, columns, lower=True, check_finite=False)
         return np.asarray(np.sum(half**2, axis=0))
@@ -162,19 +171,19 @@ class Solution:
         size = len(self._rhs)
         mean_m, covariance, bias = np.zeros(size), np.zeros((size, size)), np.zeros((size, size))
         for model, share in zip(models, weight, strict=True):
-            precision = self._change.precision_at(model)
+            precision, information = self._change.precision_at(model)
             model_covariance = ScaledCholesky(self._normal + precision).inverse()
-            change_m = model_covariance @ self._rhs
+            change_m = model_covariance @ (self._rhs + information)
             mean_m += share * change_m
             covariance += share * (model_covariance + np.outer(change_m, change_m))
             bias += share * (model_covariance @ precision @ model_covariance)
         covariance -= np.outer(mean_m, mean_m)
-        information = ScaledCholesky(covariance).inverse()
+        mixture_precision = ScaledCholesky(covariance).inverse()
         normal, first = self._reduced.normal.copy(), self._state_size
-        normal[first:, first:] += information - self._normal
+        normal[first:, first:] += mixture_precision - self._normal
         size_m = float(np.sqrt(weight @ [model.size_m**2 for model in models]))
         scale = np.sqrt(np.diag(bias))
-        change_bias = np.tril(cholesky_inplace(bias / np.outer(scale, scale))).T * scale @ information
+        change_bias = np.tril(cholesky_inplace(bias / np.outer(scale, scale))).T * scale @ mixture_precision
         return Mixture(self._with_change(mean_m), ScaledCholesky(normal), change_bias, size_m)
 
     def _likely_models(self) -> list[ChangeModel]:
@@ -185,5 +194,5 @@ class Solution:
             model = frontier.pop()
             if model not in likely and self.log_odds(model) >= limit:
                 likely.add(model)
-                frontier += model.neighbours(bare=self._change.bare_columns > 0, ratios=True)
+                frontier += model.neighbours(ratios=True)
         return sorted(likely)

@@ -387,7 +387,7 @@ def adjusted_tilt(tilt_deg, reference_deg, response_error, ratio, ground_class=G
     motion, reference = tilt_ahead(tilt_deg), replace(reference_of(1e-9), estimate=tilt_ahead(reference_deg))
     residual_m = ground.jacobian().to_sparse() @ (motion - response_error * (motion - reference.estimate))
     patches = ground.patches(residual_m, 0.002, ground_class, sampling_ratio=ratio)
-    return adjust_scan(patches, NO_TILT, knot_prior(PARAMS), None, None, reference)
+    return adjust_scan(patches, NO_TILT, knot_prior(PARAMS), None, reference=reference)
 
 
 @pytest.mark.parametrize(
