@@ -98,6 +98,17 @@ def test_snow_is_bright_at_1064_nm_and_dark_at_1550_nm(wavelength_um, now, then,
     assert changed(wavelength_um, now, then, gain=gain, steep=STEEP) == expected
 
 
+@pytest.mark.parametrize(
+    ("wavelength_um", "rock", "snow"), [(NEAR_INFRARED_UM, 0.25, 0.60), (SHORT_WAVE_UM, 0.30, 0.10)]
+)
+def test_snow_shows_at_the_depth_up_to_which_it_may_be_unseen(wavelength_um, rock, snow):
+    """Patches of it cover rock by a share that grows with the depth, up to all of it at 3 cm."""
+    depths_m = np.linspace(0.0, 0.03, 301)
+    shows = [changed(wavelength_um, rock + (snow - rock) * depth / 0.03, rock) for depth in depths_m]
+    seen_m = depths_m[np.argmax(shows)]
+    assert 0.95 * seen_m < ground_classes.unseen_snow_m(wavelength_um) < 2 * seen_m
+
+
 @pytest.mark.parametrize("wavelength_um", [NEAR_INFRARED_UM, SHORT_WAVE_UM])
 @pytest.mark.parametrize("pair", [(np.nan, 0.3), (0.3, np.nan), (np.nan, np.nan), (0.3, 0.0)])
 def test_without_brightness_only_steep_ground_is_known_to_be_unchanged(wavelength_um, pair):

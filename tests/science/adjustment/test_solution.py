@@ -8,7 +8,7 @@ import pytest
 from scipy.stats import multivariate_normal, norm
 
 from station.quantities import VarianceComponents
-from station.science.adjustment import ground_change, prior, solution
+from station.science.adjustment import ground_change, ground_classes, prior, solution
 from station.science.adjustment.ground_change import ChangeModel
 from station.science.adjustment.normal_equations import NormalEquations
 from station.science.adjustment.patches import GroundClass, Patches
@@ -83,6 +83,27 @@ def test_thin_snow_lies_where_the_air_is_colder_than_8_degrees():
     up = 5
     sigma_m = [sigma_of(solved[-1].mixture(), up + 1)[up] for solved in (unknown, cold, mild, hot)]
     assert sigma_m[0] == sigma_m[1] > 1.01 * sigma_m[2] > 1.01 * sigma_m[3]
+
+
+@pytest.mark.parametrize(
+    ("model", "depth_m"),
+    [
+        (ChangeModel(0, 9, 5, snow=1, mean=1), ground_classes.unseen_snow_m(1.064)),
+        (
+            ChangeModel(0, 0, 0, snow=1),
+            np.hypot(0.00024, 0.0005),
+        ),  # no deeper than the change of other ground
+        (ChangeModel(0, 9, 5, snow=0, mean=1), 0.0),
+        (ChangeModel(0, 9, 5, snow=2, mean=1), 0.0),
+    ],
+)
+def test_thin_snow_is_of_any_depth_that_brightness_does_not_show(moderate, model, depth_m):
+    _, change, _, _ = moderate
+    thin_snow = slice(change.trend_columns, change.trend_columns + change.snow_columns)
+    mean_m, sigma_m = (values[thin_snow] for values in change.prior_m(model))
+    draws_m = np.random.default_rng(1).uniform(0, depth_m, 100_000)
+    assert mean_m == pytest.approx(np.full(3, draws_m.mean()), rel=0.03)
+    assert sigma_m == pytest.approx(np.full(3, draws_m.std()), rel=0.03, abs=1e-5)
 
 
 @pytest.fixture(scope="module")
