@@ -162,14 +162,14 @@ def test_a_crest_on_rough_ground_is_as_uncertain_as_repetitions_show():
 @pytest.mark.parametrize("noise_m", [0.0, 0.05, 0.2, 0.6])
 @pytest.mark.parametrize("length_cells", [0.5, 2.0])
 def test_a_contour_is_where_rough_ground_crosses_the_height(noise_m, length_cells):
-    """1,000 slopes, each with relief of 0.3 m and this length of correlation, and noise of its own.
+    """500 slopes, each with relief of 0.3 m and this length of correlation, and noise of its own.
 
     The truth is between two true heights. Positions are as good as those of a line through four heights or
     between two measured ones, whichever is better on such ground.
     """
     rng, distance_m, noise_m2 = np.random.default_rng(4), np.arange(0.0, 400.0, 10.0), np.full(40, noise_m**2)
     z, errors_m = [], {"position": [], "line": [], "two": []}
-    reliefs_m = ndimage.gaussian_filter1d(rng.standard_normal((1000, 80)), length_cells, axis=1)[:, 20:60]
+    reliefs_m = ndimage.gaussian_filter1d(rng.standard_normal((500, 80)), length_cells, axis=1)[:, 20:60]
     reliefs_m *= 0.3 / np.sqrt(np.sum(ndimage.gaussian_filter1d(np.eye(80)[40], length_cells) ** 2))
     for relief_m in reliefs_m:
         true_m = 100.0 - 0.5 * distance_m + relief_m
