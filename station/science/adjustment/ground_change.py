@@ -53,8 +53,9 @@ UNLIKELY_LOG_PRIOR = 12.0
 SNOW_LOG_PRIORS = (0.0, 3.0, UNLIKELY_LOG_PRIOR)
 SMALL_TREND_LOG_PRIOR = 2.0  # against each factor e by which trends are smaller than the change between knots
 CORRELATION_AZIMUTH_KNOTS, CORRELATION_RANGE_KNOTS = 4.0, 2.5  # correlation lengths, in knots
-# Mean and sigma of thin snow, over its largest depth: any depth that does not show is as likely.
-UNIFORM = np.sqrt([1 / 4, 1 / 12])
+# Mean and sigma of thin snow over its largest depth: stable ground is bare as likely as under any depth that
+# does not show.
+SNOW_MOMENTS = np.array([1 / 4, np.sqrt(1 / 6 - 1 / 16)])
 NO_CHANGE_M = 1e-6
 # Of the air over thin snow. At most of the warmest places half of what falls at 2.4 °C is snow (Jennings et
 # al., 2018), and a thermometer in the sun shows up to 5 K too much.
@@ -194,7 +195,7 @@ class GroundChange:
         if model.mean > 1:
             trends[1, SLOPES] = np.maximum(trends[1, SLOPES], FREE_SLOPE_SIGMA_M)
         bare = trends if model.snow else np.repeat(unchanged, TRENDS, axis=1)
-        thin_snow = depth_m * UNIFORM[:, None] if model.snow == 1 else unchanged
+        thin_snow = depth_m * SNOW_MOMENTS[:, None] if model.snow == 1 else unchanged
         heave = np.array([[0.0], [self.heave_m]])
         mean_m, sigma_m = np.hstack(
             [

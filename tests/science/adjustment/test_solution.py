@@ -97,11 +97,12 @@ def test_thin_snow_lies_where_the_air_is_colder_than_8_degrees():
         (ChangeModel(0, 9, 5, snow=2, mean=1), 0.0),
     ],
 )
-def test_thin_snow_is_of_any_depth_that_brightness_does_not_show(moderate, model, depth_m):
+def test_thin_snow_is_none_or_of_any_depth_that_brightness_does_not_show(moderate, model, depth_m):
     _, change, _, _ = moderate
     thin_snow = slice(change.trend_columns, change.trend_columns + change.snow_columns)
     mean_m, sigma_m = (values[thin_snow] for values in change.prior_m(model))
-    draws_m = np.random.default_rng(1).uniform(0, depth_m, 100_000)
+    rng = np.random.default_rng(1)
+    draws_m = np.where(rng.uniform(size=100_000) < 0.5, 0.0, rng.uniform(0, depth_m, 100_000))
     assert mean_m == pytest.approx(np.full(3, draws_m.mean()), rel=0.03)
     assert sigma_m == pytest.approx(np.full(3, draws_m.std()), rel=0.03, abs=1e-5)
 
