@@ -51,18 +51,17 @@ MEAN_LOG_PRIORS = (0.0, 3.0, 4.5)
 # does not melt. Snow has fallen in one scan of twenty.
 UNLIKELY_LOG_PRIOR = 12.0
 SNOW_LOG_PRIORS = (0.0, 3.0, UNLIKELY_LOG_PRIOR)
+SNOWFALL = 1  # index of the second
 SMALL_TREND_LOG_PRIOR = 2.0  # against each factor e by which trends are smaller than the change between knots
 CORRELATION_AZIMUTH_KNOTS, CORRELATION_RANGE_KNOTS = 4.0, 2.5  # correlation lengths, in knots
 # Mean and sigma of thin snow over its largest depth: stable ground is bare as likely as under any depth that
 # does not show.
-SNOW_MOMENTS = np.array([1 / 4, np.sqrt(1 / 6 - 1 / 16)])
+THIN_SNOW_MEAN_SIGMA = np.array([1 / 4, np.sqrt(1 / 6 - 1 / 16)])
 NO_CHANGE_M = 1e-6
 # Of the air over thin snow. At most of the warmest places half of what falls at 2.4 °C is snow (Jennings et
 # al., 2018), and a thermometer in the sun shows up to 5 K too much.
 MAX_SNOW_C = 8.0
-SNOW_SLOPES = tuple(
-    np.tan(np.radians((40.0, 45.0, 50.0)))
-)  # upper bounds (tan): all, most, little of the snow
+SNOW_SLOPES = tuple(np.tan(np.radians((40.0, 45.0, 50.0))))  # upper bounds (tan): all, most, some snow
 HEAVE_M = 0.002  # start value of sigma: frost and heat move rock by millimetres
 HEAVE_BLOCK_M = 500.0
 PRIOR_HEAVE_BLOCKS = 4.0  # weight of the start value, in blocks
@@ -195,7 +194,7 @@ class GroundChange:
         if model.mean > 1:
             trends[1, SLOPES] = np.maximum(trends[1, SLOPES], FREE_SLOPE_SIGMA_M)
         bare = trends if model.snow else np.repeat(unchanged, TRENDS, axis=1)
-        thin_snow = depth_m * SNOW_MOMENTS[:, None] if model.snow == 1 else unchanged
+        thin_snow = depth_m * THIN_SNOW_MEAN_SIGMA[:, None] if model.snow == SNOWFALL else unchanged
         heave = np.array([[0.0], [self.heave_m]])
         mean_m, sigma_m = np.hstack(
             [

@@ -22,7 +22,7 @@ DARK_SNOW_UM = 1.4  # wavelength from which snow is darker than rock: water and 
 # to 20 % and rock 20 to 50 %. Rock that is wet now, 0.6 times as bright at worst, stays within.
 BRIGHT_SNOW_RATIOS = (0.5, 1.25)
 DARK_SNOW_RATIOS = (0.55, 1 / 0.55)
-# Largest depth of patchy snow that stays within these limits: it covers rock at a few centimetres, and bright
+# Largest depth of patchy snow that stays within these limits. An estimate: some 3 cm cover rock, and bright
 # snow shows when it covers a fifth of a cell, dark snow when it covers two thirds.
 UNSEEN_SNOW_M, UNSEEN_DARK_SNOW_M = 0.01, 0.02
 MAX_GAIN_CHANGE = 0.15  # of the receiver, usually 5 % from scan to scan; beyond, the ground has changed

@@ -130,8 +130,8 @@ def adjust_scan(
     """Return the scanner's state estimated from patches, inclination log and prior.
 
     `applied_rad` (3, lines) is the tilt already applied to the points, as a rotation about east, north and
-    up. Rough ground responds to a motion of the beams against those of the `reference` by a little more or
-    less than modelled.
+    up. `thin_snow` may lie on stable ground. Rough ground responds to a motion of the beams against those of
+    the `reference` by a little more or less than modelled.
     `wider(estimate)` returns prior and log for a second estimate if the state (p,) is not one that the prior
     expects, else None. Hold-out patches are not used. Source: adjustment.md, 5; equations.md, 6.8.
     """
