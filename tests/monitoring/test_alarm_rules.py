@@ -23,6 +23,7 @@ RULES = """
 [alarms]
 targets = ["hook"]
 stalled_h = 0
+disk_gb = 0
 [alarms.change]
 false_alarms_per_year = 1
 """
