@@ -36,7 +36,7 @@ from station.science.uncertainty.jacobian import HeightJacobian, sight_tilt_of
 from station.science.uncertainty.parameters import GLOBAL, ParameterLayout, interpolate_to_lines
 from station.science.uncertainty.propagation import condense_rows, expand_rows
 
-MAX_ITERATIONS = 8
+MAX_ITERATIONS = 16  # most scans need five to seven
 CONVERGED_M = 0.0003  # stop when an iteration changes the residuals by less (root mean square)
 # Rejection starts once the residual variance is known; before that, moving ground would get whole scan lines
 # rejected.
