@@ -162,8 +162,7 @@ class BlockCodes:
         if jacobian is None or shared is None:
             return np.ones(self.count)
         offset_m = self.surface.observation.offset_m
-        block_m = self._queries.cells * self._series.grid.cell_m
-        ratio = sigma_ratio(jacobian, shared, offset_m, block_m)
+        ratio = sigma_ratio(jacobian, shared, offset_m, self._series.grid.cell_m, self._queries.cells)
         with suppress(StoreError, OSError):
             path.parent.mkdir(parents=True, exist_ok=True)
             replace_file(path, ratio.tobytes())

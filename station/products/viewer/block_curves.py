@@ -102,7 +102,7 @@ def update_curves(
     month = f"{datetime.fromtimestamp(epochs[-1].start_s, UTC):%Y-%m}"
     keys["places"] = tiles.key([month, str(len(known).bit_length())])
     if on_disk.get("places") != keys["places"]:
-        tiles.write_places(_mean_shared(queries, [epoch for tier in wanted.values() for epoch in tier]))
+        tiles.write_places([epoch for tier in wanted.values() for epoch in tier])
         progress()
     for name, tier in wanted.items():
         keys[name] = tiles.key([epoch.ref.epoch_file for epoch in tier])
@@ -134,8 +134,14 @@ def update_curves(
     return tiles.description() | {"versions": {name: key[:8] for name, key in keys.items() if name in filled}}
 
 
-def _mean_shared(queries: BlockQueries, epochs: list[CurveEpoch]) -> SharedParameters | None:
-    """Return the shared parameters with the mean covariance of epochs spread over those given."""
+def _mean_shared(
+    queries: BlockQueries, epochs: list[CurveEpoch], jacobian: HeightJacobian
+) -> SharedParameters | None:
+    """Return the shared parameters with the mean covariance of epochs spread over those given.
+
+    Each counts in units of its mean variance of height, so that an uncertain epoch does not determine how the
+    errors of the others are correlated.
+    """
     chosen = np.unique(np.linspace(0, len(epochs) - 1, min(len(epochs), MAX_BASE)).astype(int))
     known = [
         shared
@@ -145,10 +151,13 @@ def _mean_shared(queries: BlockQueries, epochs: list[CurveEpoch]) -> SharedParam
     known = [shared for shared in known if shared.names == known[-1].names]
     if not known:
         return None
+    weights = [1 / float(jacobian.variance(shared).mean()) for shared in known]
     return replace(
         known[-1],
-        covariance=np.mean([shared.covariance for shared in known], axis=0),
-        line_tilt_variance=np.mean([shared.line_tilt_variance for shared in known], axis=0),
+        covariance=np.average([shared.covariance for shared in known], axis=0, weights=weights),
+        line_tilt_variance=np.average(
+            [shared.line_tilt_variance for shared in known], axis=0, weights=weights
+        ),
     )
 
 
@@ -224,10 +233,12 @@ class _Tiles:
                 folder.write(grouping.name(number), {"times": len(times), "blocks": end - first}, data)
         folder.delete_others()
 
-    def write_places(self, base: SharedParameters | None) -> None:
+    def write_places(self, epochs: list[CurveEpoch]) -> None:
         """Write what no scan changes: heights, geometry and Jacobian of blocks, and the mean covariance."""
         surface, grouping = self.surface, self._groupings[TILE_BLOCKS["places"]]
-        jacobian = surface.jacobian if base is not None else None
+        jacobian = surface.jacobian
+        base = None if jacobian is None else _mean_shared(self._queries, epochs, jacobian)
+        jacobian = None if base is None else jacobian
         reference_m2 = surface.random_m2 / np.maximum(self._queries.cells**2, 1)
         rows = [
             surface.points[2],

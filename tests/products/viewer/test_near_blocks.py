@@ -11,7 +11,8 @@ from station.science.uncertainty.parameters import GLOBAL, ParameterLayout
 BLOCK_M = 10.0
 
 
-def test_the_sigma_of_a_block_is_that_of_the_mean_of_its_cells():
+@pytest.mark.parametrize(("side", "tolerance"), [(2, 0.02), (20, 0.08)])
+def test_the_sigma_of_a_block_is_that_of_the_mean_of_its_cells(side, tolerance):
     params = ParameterLayout(0.0, 360, full_circle=True)
     count = len(params.names)
     sigma = np.full(count, 1e-9)
@@ -20,7 +21,7 @@ def test_the_sigma_of_a_block_is_that_of_the_mean_of_its_cells():
     line_m2[len(GLOBAL) : len(GLOBAL) + params.sight_tilt_knots] = 1e-8
     shared = SharedParameters(params.names, ("1",) * count, np.zeros(count), np.diag(sigma**2), line_m2)
     middle_m = np.array([[150.0, 80.0], [-300.0, 420.0], [2500.0, 900.0]]).T
-    step_m = (np.arange(20) + 0.5) / 20 * BLOCK_M - BLOCK_M / 2
+    step_m = (np.arange(side) + 0.5) / side * BLOCK_M - BLOCK_M / 2
 
     def jacobian(east_m, north_m):
         slope = 0.3 + 0 * east_m
@@ -28,11 +29,11 @@ def test_the_sigma_of_a_block_is_that_of_the_mean_of_its_cells():
         return height_jacobian(params, offset_m, slope, 0.2 * slope, rock=slope > 0)
 
     blocks = jacobian(*middle_m)
-    ratio = sigma_ratio(blocks, shared, (*middle_m, 0.1 * middle_m[0] - 60), BLOCK_M)
-    for index, (east_m, north_m) in enumerate(middle_m.T):
+    ratio = sigma_ratio(blocks, shared, (*middle_m, 0.1 * middle_m[0] - 60), BLOCK_M / side, side)
+    for index, (east_m, north_m) in enumerate(middle_m.T[:2]):
         east, north = (part.ravel() for part in np.meshgrid(east_m + step_m, north_m + step_m))
         cells = jacobian(east, north)
-        mean = np.full(400, 1 / 400)
+        mean = np.full(side**2, side**-2.0)
         gradient = cells.aggregate(mean)
         by_line = cells.aggregate_by_line(mean)
         middle = blocks.take(np.array([index]))
@@ -41,6 +42,6 @@ def test_the_sigma_of_a_block_is_that_of_the_mean_of_its_cells():
         one = np.ones(1)
         one_m2 = middle.aggregate(one) ** 2 @ sigma**2 + 1e-8 * np.sum(middle.aggregate_by_line(one) ** 2)
         expected = np.sqrt(whole_m2 / one_m2)
-        assert ratio[index] == pytest.approx(min(expected, 1.0), abs=0.08)
-    assert ratio[0] < 0.85
-    assert ratio[2] == 1.0
+        assert ratio[index] == pytest.approx(min(expected, 1.0), abs=tolerance)
+    assert ratio[0] < 0.9
+    assert ratio[2] == 1.0  # so far away that its places are not distinguished
