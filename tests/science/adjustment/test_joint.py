@@ -715,6 +715,31 @@ def test_an_avalanche_does_not_change_heights_elsewhere():
     assert with_avalanche.change_size_m <= 0.005
 
 
+def test_a_deposit_with_thin_edges_on_bare_ground_is_rejected_however_many_iterations_it_takes(monkeypatch):
+    rng, (_, root) = np.random.default_rng(3), dense_prior(PARAMS)
+    state = root @ rng.normal(size=len(root))
+    stable, bare = random_sites(4, 100), random_sites(5, 600, sector_deg=(0, 20))
+    ice = replace(random_sites(6, 1500, sector_deg=(20, 40), steep=0.3), stable=False)
+    observed_m = [
+        sites.matrix() @ state + rng.normal(0, 0.01, len(sites.line)) for sites in (stable, bare, ice)
+    ]
+    across, along = (bare.line - 60) / 8, (bare.range_bin - 20) / 4
+    deposit_m = 1.5 * np.maximum(0, 1 - across**2) * np.maximum(0, 1 - along**2)
+    patches = concatenate(
+        stable.patches(observed_m[0]),
+        bare.patches(observed_m[1] + deposit_m, ground_class=GroundClass.MOVING),
+        ice.patches(observed_m[2] - 0.06, ground_class=GroundClass.MOVING),
+    )
+    adjustment = adjust_scan(patches, NO_TILT, knot_prior(PARAMS), None)
+    monkeypatch.setattr(joint, "MAX_ITERATIONS", 100)
+    converged = adjust_scan(patches, NO_TILT, knot_prior(PARAMS), None)
+    np.testing.assert_array_equal(adjustment.estimate, converged.estimate)
+    assert converged.change_size_m == pytest.approx(0.06, abs=0.03)  # that of the ice
+    cells = random_sites(7, 300)
+    error_m = cells.matrix() @ state - adjustment.effect(cells.jacobian())
+    assert 0.6 < np.sqrt(np.mean((error_m / height_sigma(adjustment, cells)) ** 2)) < 1.6  # of one scan
+
+
 def simulate_thin_snow(seed, change_m):
     """Standardised errors and errors, where glacier and all but steep rock changed by `change_m`.
 
