@@ -52,6 +52,7 @@ LATEST = 8  # epochs before they go to the recent tier
 RECENT_DAYS = 2  # before the last one, of which all epochs are in the recent tier
 MAX_RECENT, MAX_OLDER = 132, 110  # epochs of a curve
 MAX_BASE = 24  # epochs whose covariance is averaged
+SAMPLE_BLOCKS = 1000  # whose mean variance is the unit of the covariance of an epoch, about
 CODE_BYTES = {"change": 3, "random": 2, "systematic": 2, "coverage": 1}  # of a value, by name
 LEVEL_BYTES = CODE_BYTES | {"rate": 3, "rate_random": 2, "rate_systematic": 2}  # of a level
 
@@ -140,7 +141,7 @@ def _mean_shared(
     """Return the shared parameters with the mean covariance of epochs spread over those given.
 
     Each counts in units of its mean variance of height, so that an uncertain epoch does not determine how the
-    errors of the others are correlated.
+    errors of the others are correlated. None if no epoch has systematic errors.
     """
     chosen = np.unique(np.linspace(0, len(epochs) - 1, min(len(epochs), MAX_BASE)).astype(int))
     known = [
@@ -149,16 +150,16 @@ def _mean_shared(
         if shared is not None
     ]
     known = [shared for shared in known if shared.names == known[-1].names]
-    if not known:
+    sample = jacobian.take(slice(None, None, max(len(jacobian) // SAMPLE_BLOCKS, 1)))
+    variance_m2 = np.array([sample.variance(shared).mean() for shared in known])
+    weights = np.divide(1, variance_m2, out=np.zeros(len(known)), where=variance_m2 > 0)
+    if not weights.any():
         return None
-    weights = [1 / float(jacobian.variance(shared).mean()) for shared in known]
-    return replace(
-        known[-1],
-        covariance=np.average([shared.covariance for shared in known], axis=0, weights=weights),
-        line_tilt_variance=np.average(
-            [shared.line_tilt_variance for shared in known], axis=0, weights=weights
-        ),
+    covariance, line_tilt_variance = (
+        np.average([getattr(shared, name) for shared in known], axis=0, weights=weights)
+        for name in ("covariance", "line_tilt_variance")
     )
+    return replace(known[-1], covariance=covariance, line_tilt_variance=line_tilt_variance)
 
 
 class _Grouping:
@@ -238,7 +239,6 @@ class _Tiles:
         surface, grouping = self.surface, self._groupings[TILE_BLOCKS["places"]]
         jacobian = surface.jacobian
         base = None if jacobian is None else _mean_shared(self._queries, epochs, jacobian)
-        jacobian = None if base is None else jacobian
         reference_m2 = surface.random_m2 / np.maximum(self._queries.cells**2, 1)
         rows = [
             surface.points[2],
@@ -247,7 +247,7 @@ class _Tiles:
             np.sqrt(reference_m2),
             self._codes.near_ratio,
         ]
-        if jacobian is not None:
+        if jacobian is not None and base is not None:
             rows += [*jacobian.pose, jacobian.sight_tilt, jacobian.refraction, jacobian.cross_tilt]
             rows += [jacobian.knot_position]
         values = np.array(rows, np.float64)[:, grouping.order].astype("<f4")

@@ -26,13 +26,15 @@ def sigma_ratio(
 ) -> Floats:
     """Return the systematic sigma of the mean of each block (n,), in sigmas of its middle.
 
-    A block is `cells` wide and long; `offset_m` is that of its middle from the scanner, on the grid. In
-    it only the azimuth of places matters: the other derivatives change linearly. Source: equations.md, 6.2.
+    A block is `cells` wide and long; `offset_m` is that of its middle from the scanner, on the grid.
+    Within it only the azimuth of places matters: the other derivatives change linearly.
+    Source: equations.md, 6.2.
     """
-    plane, block_m, places = jacobian.params.plane, cells * cell_m, min(cells, MAX_PLACES)
+    plane, block_m = jacobian.params.plane, cells * cell_m
     east_m, north_m, _ = plane.in_map_axes(offset_m)
     ratio = np.ones(len(jacobian))
     near = np.flatnonzero(np.hypot(east_m, north_m) * TILT_KNOT_RAD * MIN_SPAN < block_m)
+    places = min(cells, MAX_PLACES)
     step_m = (np.arange(places) + 0.5) / places * block_m - block_m / 2
     step_x_m, step_y_m = (steps.ravel() for steps in np.meshgrid(step_m, step_m))
     step_east_m, step_north_m, _ = plane.in_map_axes((step_x_m, step_y_m, 0.0))

@@ -4,14 +4,19 @@ import base64
 import json
 import re
 import zlib
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from station.archive.series.index import SeriesIndex
+from station.products.viewer import block_curves
 from station.products.viewer.block_codes import CurveEpoch, sigma_code
 from station.products.viewer.block_curves import curve_tiers, update_curves
+from station.quantities import SharedParameters
 from station.queries.aggregates import Aggregates
+from station.science.uncertainty.jacobian import height_jacobian
+from station.science.uncertainty.parameters import ParameterLayout
 
 
 @pytest.fixture
@@ -131,6 +136,30 @@ def test_a_damaged_cache_is_read_from_the_store_again_and_an_old_one_goes(series
     assert (tmp_path / "latest" / "0_0.js").read_bytes() == (fresh / "latest" / "0_0.js").read_bytes()
 
 
+def test_an_uncertain_epoch_does_not_determine_how_errors_are_correlated():
+    """One epoch errs by its height, one ten times as much by its tilt, and one not at all."""
+    params, (east_m, north_m) = (
+        ParameterLayout(0.0, 360, full_circle=True),
+        np.mgrid[200:900:100, 300:800:100],
+    )
+    offset_m = tuple(part.ravel() * 1.0 for part in (east_m, north_m, 0 * east_m))
+    jacobian = height_jacobian(params, offset_m, *np.zeros((2, east_m.size)), rock=np.ones(east_m.size, bool))
+    up, tilt = (params.names.index(name) for name in ("translation_up", "tilt_east"))
+    rms_m = np.sqrt(np.mean(offset_m[1] ** 2))  # of the heights, by one radian about east
+
+    def epoch(parameter, sigma):
+        count = len(params.names)
+        variance = np.where(np.arange(count) == parameter, sigma**2, 0.0)
+        return SharedParameters(params.names, ("1",) * count, 0 * variance, np.diag(variance), 0 * variance)
+
+    epochs = {"a": epoch(up, 0.01), "b": epoch(tilt, 0.1 / rms_m), "c": epoch(up, 0.0)}
+    queries = SimpleNamespace(shared=epochs.get)
+    mean = block_curves._mean_shared(queries, [SimpleNamespace(ref=name) for name in epochs], jacobian)
+    sigma = np.sqrt(np.diag(mean.covariance))
+    assert sigma[up] == pytest.approx(sigma[tilt] * rms_m, rel=1e-6)
+    assert block_curves._mean_shared(queries, [SimpleNamespace(ref="c")], jacobian) is None
+
+
 def test_codes_of_sigmas_are_within_one_percent():
     sigma_m = np.geomspace(1e-5, 10, 1001)
     decoded_m = 1e-5 * np.exp((sigma_code(sigma_m) - 1) * 0.02)
@@ -140,7 +169,6 @@ def test_codes_of_sigmas_are_within_one_percent():
 
 @pytest.mark.parametrize("noise_m", [0.005, 0.05])
 def test_a_tap_of_250_epochs_is_within_30_kb(noise_m):
-    from station.products.viewer import block_curves
     from station.products.viewer.tiles import byte_planes, tile_script
 
     rng, size = np.random.default_rng(1), 0
