@@ -164,7 +164,8 @@ def test_response_of_rough_ground_counts_from_the_state_in_the_scans_of_the_refe
     (below, _), (here, estimate_rad), (above, _) = (tilt_variance(stored[0] + each) for each in offsets_rad)
     curvature = (above - 2 * here + below) / step_rad**2
     vertex_rad = stored[0] - (above - below) / (2 * step_rad) / curvature
-    # If moving and stable ground err by all of a motion, x₁ + x₂ is 1 of it, and x₁² + x₂² is 0.5 to 1.
+    # If all ground errs by all of a motion, Σ x is 1 of it for errors in common, and Σ x² is 0.5 to 1; less
+    # for errors of sectors.
     assert 0.4 < curvature / 2 < 1.1
     assert vertex_rad == pytest.approx(estimate_rad, abs=0.15 * step_rad)
 

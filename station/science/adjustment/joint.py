@@ -47,6 +47,8 @@ EXCESS_BOUNDS_M = (0.002, 0.02)  # of the excess sigma of stable patches over th
 MAX_MOVING_EXCESS_M = 1.0  # upper bound for moving patches
 # Of the response of patches to a motion of the beams, over their sampling ratio (equations.md, 6.8).
 RESPONSE_ERROR, MAX_RESPONSE_ERROR = 0.2, 0.05
+COMMON_RESPONSE_ERROR = 0.65  # share of it that all ground of a kind has in common; the rest is by sector
+RESPONSE_SECTOR_RAD = math.radians(12.0)
 MAX_RESPONSE_TILT_RAD = math.radians(0.01)  # beyond, shots are taken to jump as often as they slide
 MAX_GROUP_SIZE = 40.0  # patches that share one error
 HEADING_CLOCKWISE = np.array([1.0, 1.0, -1.0])  # against a rotation about up
@@ -64,8 +66,8 @@ class Adjustment:
     prior's, 1 if the observations alone determine it. `log` is the inclination log that was used, and
     `predicted_log_rad` (lines,) is what the adjustment predicts for it, without the errors of the sensor.
     `unapplied_rad` (3,) is the estimated rotation about east, north and up that the points lack, as a mean
-    over the lines. `response_shifts` (2, u) is how far the estimate moves if moving ground, and if stable
-    ground, responds to the motion of the beams by one sigma more than modelled.
+    over the lines. `response_shifts` (k, u) is how far the estimate moves by each of k independent errors
+    of the response of ground to the motion of the beams, of one sigma each.
     """
 
     params: ParameterLayout
@@ -158,9 +160,10 @@ def adjust_scan(
     )
     leverage_m2 = fit_leverage(patches, estimation.weight, equations, posterior)
     state, predicted_log_rad = _state_and_log(params, mixture.estimate, reduced, log)
-    error_m = _response_error(patches, equations.state_effect(_motion(params, mixture.estimate, reference)))
+    motion_m = equations.state_effect(_motion(params, mixture.estimate, reference))
     of_errors = [
-        equations.of_errors(reduced, estimation.weight, error_m * (moving == kind)) for kind in (True, False)
+        equations.of_errors(reduced, estimation.weight, error_m)
+        for error_m in _response_errors(patches, moving, motion_m)
     ]
     sigma = np.sqrt(np.diag(posterior.to_shared_parameters(state).covariance))
     return Adjustment(
@@ -244,9 +247,21 @@ def _motion(params: ParameterLayout, estimate: Floats, reference: SharedParamete
     return motion
 
 
-def _response_error(patches: Patches, motion_m: Floats) -> Floats:
-    """Return one sigma of the response of patches (n,) to what the motion of the beams does to them [m]."""
-    return np.asarray(np.minimum(RESPONSE_ERROR * patches.sampling_ratio, MAX_RESPONSE_ERROR) * motion_m)
+def _response_errors(patches: Patches, moving: Bools, motion_m: Floats) -> Floats:
+    """Return independent errors (k, n) of the response of patches to the motion of the beams [m].
+
+    `motion_m` (n,) is what the motion does to their heights. Moving and stable ground each have an error in
+    common, and one in every sector of azimuth.
+    """
+    error_m = np.minimum(RESPONSE_ERROR * patches.sampling_ratio, MAX_RESPONSE_ERROR) * motion_m
+    azimuth_rad = patches.jacobian.params.line_azimuth_rad
+    sector = ((azimuth_rad - azimuth_rad[0]) / RESPONSE_SECTOR_RAD).astype(np.int64)[patches.jacobian.line]
+    kind = np.where(moving, 0, 1)
+    of_kind = np.arange(2)[:, None] == kind
+    key = 2 * sector + kind
+    of_sector = np.unique(key)[:, None] == key
+    own = math.sqrt(1 - COMMON_RESPONSE_ERROR**2)
+    return np.asarray(np.concatenate([COMMON_RESPONSE_ERROR * of_kind, own * of_sector]) * error_m)
 
 
 def _mean_sigma(patches: Patches, moving: Bools, posterior: Posterior) -> float:
