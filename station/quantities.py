@@ -359,6 +359,7 @@ class Reference:
     stable: Bools  # (ny, nx) steep and without change in the scans
     components: VarianceComponents  # of the station, estimated from its scans
     visibility: Floats32  # (ny, nx) share of its scans that observed the cell; NaN where unknown
+    point_count: NDArray[np.float16]  # (ny, nx) mean of the scans that observed the cell; NaN if unknown
     time_s: float = np.nan  # mean start of its scans, since 1970; NaN if unknown
     sop_scan_count: int | None = None  # of its scans that an SOP is from; None if tilt counts from none
 
@@ -382,4 +383,5 @@ class Reference:
             stable=np.zeros(grid.shape, bool) if stable is None else stable,
             components=VarianceComponents(),
             visibility=np.full(grid.shape, np.nan, np.float32),
+            point_count=np.full(grid.shape, np.nan, np.float16),
         )

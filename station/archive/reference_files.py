@@ -84,6 +84,10 @@ _VARIABLES = (
         "reference_visibility", ("y", "x"), "f4", "share of the scans that observed the cell", "1", None, 3
     ),
     Variable(
+        "reference_point_count", ("y", "x"), "f4", "number of points of the cell in a scan", "1", None, 2,
+        None, "mean of the scans that observed it",
+    ),
+    Variable(
         "shared_parameter", ("parameter",), "f8",
         "mean state of the scanner in the scans of the reference, relative to the SOP",
         comment="units are those in parameter_unit; change is not corrected for it",
@@ -238,6 +242,7 @@ def _raster_rows(reference: Reference, rows: slice) -> list[np.ndarray[Any, Any]
         reference.intensity[rows],
         reference.stable[rows],
         reference.visibility[rows],
+        reference.point_count[rows].astype(np.float32),  # which holds the fill value
     ]
 
 
@@ -355,6 +360,7 @@ def _reference_from_file(file: h5py.File, path: Path, series: Series) -> Referen
     rasters: dict[str, Any] = {
         field: LazyRaster(path, name, transform) for field, name, transform in _RASTER_FIELDS if name in file
     }
+    rasters.setdefault("point_count", np.broadcast_to(np.float16(np.nan), grid.shape))  # of early versions
     return Reference(
         grid=grid,
         version=text_attribute(file, "reference_version"),
@@ -391,4 +397,5 @@ _RASTER_FIELDS: tuple[tuple[str, str, Callable[[np.ndarray[Any, Any]], np.ndarra
     ("intensity", "reference_intensity", _replace_fill),
     ("stable", "reference_stable", lambda values: values == 1),
     ("visibility", "reference_visibility", _replace_fill),
+    ("point_count", "reference_point_count", lambda values: _replace_fill(values).astype(np.float16)),
 )

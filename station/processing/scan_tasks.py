@@ -235,7 +235,7 @@ def _compute_epoch(
     if adjustment is not None and viewing is not None:
         scalars |= holdout_statistics(measurement, viewing) | {"change_step": adjustment[1].change_size_m}
         scalars |= {
-            "random_variance_factor": errors.factors.median_random(viewing.cells["noise_class"][:]),
+            "random_variance_factor": errors.factors.median_random,
             "systematic_variance_factor": errors.factors.systematic,
         }
         scalars |= dict(zip(LEVERAGE_VARIABLES, adjustment[1].leverage_m2, strict=True))

@@ -132,6 +132,7 @@ def test_the_reference_reads_back_and_its_older_versions_remain(series):
     variance = np.where(np.isnan(elevation), np.nan, 0.0004).astype(np.float32)
     steep = elevation > 2900.0
     visibility = np.where(steep, 0.875, np.nan).astype(np.float32)
+    point_count = np.where(steep, 2.375, np.nan).astype(np.float16)
     shared = SharedParameters(("tilt_east",), ("rad",), np.zeros(1), np.array([[3e-11]]), np.array([2e-12]))
     for version in ("1", "2"):
         reference = replace(
@@ -142,6 +143,7 @@ def test_the_reference_reads_back_and_its_older_versions_remain(series):
             scan_ids=("a", "b"),
             components=VarianceComponents(tilt_rad=0.0002),
             visibility=visibility,
+            point_count=point_count,
             sop_scan_count=1,
         )
         reference_files.write_reference(series, reference)
@@ -156,8 +158,17 @@ def test_the_reference_reads_back_and_its_older_versions_remain(series):
     assert actual.components == VarianceComponents(tilt_rad=0.0002)
     assert np.array_equal(actual.stable, steep)
     assert np.array_equal(actual.visibility, visibility, equal_nan=True)
+    assert actual.point_count == pytest.approx(point_count, abs=0.005, nan_ok=True)
     assert reference_files.read_variance_components(series) == actual.components
     assert (series.folder / "reference_1.nc").is_file()
+
+
+def test_a_reference_of_an_early_version_does_not_tell_the_usual_numbers_of_points(series):
+    reference = Reference.from_elevation(series.grid, "1", np.full(series.grid.shape, 2900.0))
+    reference_files.write_reference(series, reference)
+    with h5py.File(series.folder / "reference_1.nc", "r+") as file:
+        del file["reference_point_count"]
+    assert np.isnan(reference_files.read_reference(series, "1").point_count).all()
 
 
 def run_with_full_disk(task, conn):

@@ -63,6 +63,7 @@ def make_reference():
         stable=zeros > 0,
         components=VarianceComponents(),
         visibility=zeros + 1,
+        point_count=np.full(GRID.shape, np.nan, np.float16),
     )
 
 

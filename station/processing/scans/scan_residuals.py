@@ -21,7 +21,7 @@ from station.science.uncertainty.variance_factors import (
     UNIT_FACTORS,
     Residuals,
     VarianceFactors,
-    class_with_excess,
+    class_in_scan,
     estimate_variance_factors,
 )
 
@@ -139,7 +139,12 @@ def variance_factors(
             Residuals(
                 *cells.offset_m[:2],
                 cells.group,
-                class_with_excess(sector.noise_class, cells.point_m2 > sector.point_variance_m2),
+                class_in_scan(
+                    sector.noise_class,
+                    cells.point_m2 > sector.point_variance_m2,
+                    sums.count.astype(np.float32),
+                    sector.point_count,
+                ),
                 sector.in_class(CellClass.STABLE) & ~snow,
                 cells.residual_m.astype(np.float32),
                 scan_m2,

@@ -32,7 +32,7 @@ from station.science.gridding.viewing_geometry import AzimuthSector, ViewingGeom
 from station.science.gridding.viewpoints import PositionErrors, mean_shot_variance
 from station.science.uncertainty import budget, parameters, shot_noise
 from station.science.uncertainty.jacobian import HeightJacobian, height_jacobian
-from station.science.uncertainty.variance_factors import class_with_excess
+from station.science.uncertainty.variance_factors import class_in_scan
 
 FEW_POINTS = 3
 
@@ -143,7 +143,7 @@ class CellEstimator:
 
     `posterior` are the shared parameters of the difference from the reference, `independent` those of the
     scan alone, None if unknown. `correction` returns what to subtract from heights [m], and `snow_test` tells
-    which stable ground is under snow; both are None without an adjustment. `variance_factors` (512,) are
+    which stable ground is under snow; both are None without an adjustment. `variance_factors` (2048,) are
     those of the random variance by noise class, `position_errors` those of several scan positions.
     """
 
@@ -164,7 +164,8 @@ class CellEstimator:
         if not self.scan_geometry.published_budget:
             point_m2 = significance.supported_variance(point_m2, sums.standard_deviation(), sums.count)
         excess = point_m2 > sector.point_variance_m2
-        point_m2 = point_m2 * self.variance_factors.take(class_with_excess(sector.noise_class, excess))
+        noise_class = class_in_scan(sector.noise_class, excess, count, sector.point_count)
+        point_m2 = point_m2 * self.variance_factors.take(noise_class)
         random_m2 = point_m2 / count + sector.reference_variance_m2
         shared_m2: Reals = np.zeros_like(count)
         correction_m: Reals = np.zeros_like(count)

@@ -45,6 +45,7 @@ FLOAT_ARRAYS = [
 CELL_ARRAYS = {  # per cell, by name
     "cell": np.int32,
     **dict.fromkeys(FLOAT_ARRAYS, np.float32),
+    "point_count": np.float16,
     "visibility_bin": np.int32,
     "cell_class": np.uint8,
     "noise_class": np.uint8,
@@ -144,6 +145,7 @@ def cell_arrays(
         "reference_variance_m2": reference_variance_m2,
         "intensity": reference.intensity[rows][known],
         "visibility": reference.visibility[rows][known],
+        "point_count": reference.point_count[rows][known],
         "visibility_bin": visibility_bin,
         "cell_class": cell_class,
         "noise_class": noise_class,

@@ -75,6 +75,7 @@ def build_surface(
         stable=np.zeros(stack.grid.shape, bool),
         components=components,
         visibility=stack.visibility(),
+        point_count=stack.point_count(),
         time_s=float(np.mean(times_s)),
     )
 
@@ -135,6 +136,7 @@ def centre_reference(
         stable=stable,
         components=components,
         visibility=stack.visibility(),
+        point_count=stack.point_count(),
     )
 
 
@@ -159,6 +161,7 @@ def update_reference(
         stable=stable,
         components=components,
         visibility=stack.visibility(),
+        point_count=stack.point_count(),
     )
 
 

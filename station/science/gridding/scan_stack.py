@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy import ndimage
 
 from station.science.geometry.terrain import row_blocks
@@ -16,6 +17,7 @@ if TYPE_CHECKING:
 MAX_DEVIATION_SIGMAS = 6.0  # deviations of a scan are clipped here: larger ones are real change
 CLASS_DEGREES_OF_FREEDOM = 10.0  # weight of a cell's class against the cell's own scatter
 NEIGHBOURHOOD_CELLS = 9  # edge of the square whose mean is what scans share beyond a cell
+MAX_POINT_COUNT = 60_000.0  # stored in two bytes
 ROUGHNESS_CELLS = 1.0  # one sigma of the Gaussian that roughness is pooled with
 
 
@@ -114,6 +116,10 @@ class ScanStack:
             casting="same_kind",
         )
         return intensity
+
+    def point_count(self) -> NDArray[np.float16]:
+        """Mean number of points of each cell in the scans that observed it (ny, nx); NaN in empty cells."""
+        return np.minimum(self._per_scan(self.count), MAX_POINT_COUNT).astype(np.float16)
 
     def visibility(self) -> Floats32:
         """Share of the scans that observed each cell (ny, nx) [1]."""

@@ -51,6 +51,7 @@ class AzimuthSector:
     knot_position: Floats32  # azimuth in tilt knots, fractional
     point_variance_m2: Floats32  # random variance of one point: shot and roughness, times the factor
     reference_variance_m2: Floats32  # random variance of the reference
+    point_count: NDArray[np.float16]  # usual number of points in a scan; NaN if unknown
     cell_class: NDArray[np.uint8]
     noise_class: NDArray[np.uint8]
 

@@ -17,13 +17,18 @@ from numpy.typing import NDArray
 from station.quantities import Bools, Floats, Floats32, Ints, Reals
 from station.science.geometry.robust_statistics import MEDIAN_ABSOLUTE_NORMAL, robust_scale
 
-NOISE_CLASSES = 512  # twice those of the reference's cells: points may scatter as modelled, or more
+CELL_CLASSES = 256  # of the cells of a reference
+COUNT_EDGES = (0.15, 0.4, 0.8)  # between classes of the difference of a number of points from its usual one
+# In a scan the points of a cell may scatter as modelled or more, and be as many as usual or not.
+NOISE_CLASSES = CELL_CLASSES * 2 * (len(COUNT_EDGES) + 1)
 RANGE_CLASS_M = 500.0
 RATIO_EDGES = (0.025, 0.05, 0.1, 0.2, 0.4, 0.8)  # between classes of the sampling ratio
+RATIO_CLASSES = len(RATIO_EDGES) + 1
 MIN_GROUP_CELLS = 3  # of cells whose mean is taken off
 MIN_CLASS_CELLS = 30  # in a class: fewer do not show a variance
 PRIOR_CELLS = 30.0  # weight of the model against the cells of a class
-MIN_STABLE_CELLS = 200  # of a class, from which moving ground, which may have changed, is not needed
+# Stable cells of a class, at any number of points, from which moving ground is not used: it may have changed.
+MIN_STABLE_CELLS = 200
 BLOCK_M = 100.0
 MIN_BLOCK_CELLS = 5
 CORRELATED_BLOCKS = 9.0  # blocks that share their systematic error: it varies over some 300 m
@@ -40,17 +45,11 @@ BISECTIONS = 30
 
 @dataclass(frozen=True)
 class VarianceFactors:
-    """Factors of the modelled variances of one scan [1]: random by noise class (512,), and systematic."""
+    """Factors of the modelled variances of one scan [1]: random by noise class (2048,), and systematic."""
 
     random: Floats32
     systematic: float
-
-    def median_random(self, noise_class: NDArray[np.uint8]) -> float:
-        """Return the median of the random factors of cells (n,) of these noise classes, the lower of two."""
-        classes, cells = np.unique(noise_class, return_counts=True)
-        order = np.argsort(self.random[classes])
-        middle = np.searchsorted(np.cumsum(cells[order]), (len(noise_class) + 1) // 2)
-        return float(self.random[classes[order[middle]]])
+    median_random: float = 1.0  # of the cells of the scan
 
 
 UNIT_FACTORS = VarianceFactors(np.ones(NOISE_CLASSES, np.float32), 1.0)
@@ -87,9 +86,9 @@ class Residuals:
 def noise_class(range_m: Reals, sampling_ratio: Reals, dense: Bools) -> Ints:
     """Return the noise class (n,) of cells, 0 to 255: range, roughness against grazing angle, sampling."""
     ratio_class = np.digitize(sampling_ratio, RATIO_EDGES)
-    last = NOISE_CLASSES // (4 * (len(RATIO_EDGES) + 1)) - 1
+    last = CELL_CLASSES // (2 * RATIO_CLASSES) - 1
     range_class = np.minimum((range_m / RANGE_CLASS_M).astype(np.int64), last)
-    return np.asarray((range_class * (len(RATIO_EDGES) + 1) + ratio_class) * 2 + dense)
+    return np.asarray((range_class * RATIO_CLASSES + ratio_class) * 2 + dense)
 
 
 def sampling_ratio(noise_class: NDArray[np.uint8]) -> Floats32:
@@ -101,25 +100,33 @@ def sampling_ratio(noise_class: NDArray[np.uint8]) -> Floats32:
 
 def _ratio_class(noise_class: NDArray[np.integer[Any]]) -> Ints:
     """Return the class (n,) of the sampling ratio alone, 0 to 6, of noise classes 0 to 255."""
-    return np.asarray(noise_class // 2 % (len(RATIO_EDGES) + 1))
+    return np.asarray(noise_class // 2 % RATIO_CLASSES)
 
 
-def class_with_excess(noise_class: NDArray[np.uint8], excess: Bools) -> Ints:
-    """Return the noise class (n,) of cells in a scan, 0 to 511, by `excess` of its scatter too."""
-    return np.asarray(noise_class + np.where(excess, NOISE_CLASSES // 2, 0))
+def class_in_scan(
+    noise_class: NDArray[np.uint8], excess: Bools, count: Reals, usual_count: NDArray[np.float16]
+) -> Ints:
+    """Return the noise class (n,) of cells in a scan, 0 to 2047, by its scatter and number of points too.
+
+    Where a shot is missing or one too many, the shots of the cell lie elsewhere than in other scans.
+    """
+    unusual = np.abs(count - usual_count.astype(np.float32))
+    count_class = np.digitize(np.nan_to_num(unusual), COUNT_EDGES)
+    return np.asarray(noise_class + CELL_CLASSES * (excess + 2 * count_class))
 
 
 def estimate_variance_factors(residuals: Residuals) -> VarianceFactors:
     """Return the variance factors that the residuals of a scan show."""
     random = _random_factors(residuals)
-    return VarianceFactors(random, _systematic_factor(residuals, random))
+    of_cells = random[residuals.noise_class]
+    return VarianceFactors(random, _systematic_factor(residuals, random), float(np.median(of_cells)))
 
 
 def _random_factors(residuals: Residuals) -> Floats32:
-    """Return the factor of the random variance by noise class (512,), from deviations from means of groups.
+    """Return the factor of the random variance by noise class (2048,), from deviations from means of groups.
 
-    Classes of the same roughness and scatter, at all ranges, are drawn to their common factor, and that to
-    the model.
+    A class is drawn to the common factor of its roughness, scatter and number of points at all ranges, that
+    to the one of any number of points, and that to the model.
     """
     weight = 1 / (residuals.scan_m2 + residuals.reference_m2).astype(np.float64)
     groups = int(residuals.group.max(initial=0)) + 1
@@ -132,37 +139,41 @@ def _random_factors(residuals: Residuals) -> Floats32:
         weight / np.maximum(1 - own_share, 1 / MIN_GROUP_CELLS)
     )
     usable = count[residuals.group] >= MIN_GROUP_CELLS
-    has_excess, of_cells = np.divmod(np.arange(NOISE_CLASSES), NOISE_CLASSES // 2)
-    roughness = _ratio_class(of_cells) + has_excess * (len(RATIO_EDGES) + 1)
-    common = np.ones(int(roughness.max()) + 1, np.float32)
-    common = _factors_by_class(residuals, ratio, usable, roughness[residuals.noise_class], common)
-    return _factors_by_class(residuals, ratio, usable, residuals.noise_class, common[roughness])
+    in_scan, of_cells = np.divmod(np.arange(NOISE_CLASSES), CELL_CLASSES)
+    roughness = _ratio_class(of_cells) + RATIO_CLASSES * in_scan
+    factors = np.ones(NOISE_CLASSES, np.float32)
+    for classes in (roughness % (2 * RATIO_CLASSES), roughness, np.arange(NOISE_CLASSES)):
+        factors = _factors_by_class(residuals, ratio, usable, classes, factors)
+    return factors
 
 
 def _factors_by_class(
-    residuals: Residuals, ratio: Floats, usable: Bools, classes: NDArray[np.integer[Any]], prior: Floats32
+    residuals: Residuals, ratio: Floats, usable: Bools, classes: Ints, prior: Floats32
 ) -> Floats32:
-    """Return the factors (k,) of classes of cells (n,), drawn to a prior (k,) where there are few.
+    """Return the factors (2048,) by noise class, common to those with the same number in `classes` (2048,).
 
-    `ratio` is a deviation over its modelled sigma; only usable ones count.
+    Where there are few cells they are drawn to a prior (2048,). `ratio` is a deviation over its modelled
+    sigma; only usable ones count.
     """
-    factors, upper_bounds = prior.copy(), _moving_upper_bounds(residuals, classes, len(prior))
-    order = np.argsort(classes, kind="stable")
-    order = order[usable[order]]
-    edges = np.searchsorted(classes[order], np.arange(len(prior) + 1))
+    at_any_count = classes[np.arange(NOISE_CLASSES) % (2 * CELL_CLASSES)]
+    stable = residuals.noise_class[usable & residuals.stable]
+    stable_count = np.bincount(at_any_count[stable], minlength=NOISE_CLASSES)[at_any_count]
+    needs_moving = (stable_count < MIN_STABLE_CELLS)[residuals.noise_class]
+    of_cells = classes[residuals.noise_class]
+    factors, upper_bounds = prior.copy(), _moving_upper_bounds(residuals, of_cells, NOISE_CLASSES)
+    order = np.argsort(of_cells, kind="stable")
+    order = order[(usable & (residuals.stable | needs_moving))[order]]
+    edges = np.searchsorted(of_cells[order], np.arange(NOISE_CLASSES + 1))
     for index in np.flatnonzero(np.diff(edges) >= MIN_CLASS_CELLS):
-        members = order[edges[index] : edges[index + 1]]
-        stable = members[residuals.stable[members]]
+        members, same = order[edges[index] : edges[index + 1]], classes == index
         upper_bound = FACTOR_BOUNDS[1]
-        if len(stable) >= MIN_STABLE_CELLS:
-            members = stable
-        else:
+        if needs_moving[members[0]]:
             upper_bound = max(upper_bounds[index], FACTOR_BOUNDS[0])
         reference_share = float(residuals.reference_m2[members].sum() / residuals.scan_m2[members].sum())
         variance = robust_scale(ratio[members]) ** 2
         variance += (variance - 1) * reference_share
-        factor = (len(members) * variance + PRIOR_CELLS * prior[index]) / (len(members) + PRIOR_CELLS)
-        factors[index] = np.clip(factor, FACTOR_BOUNDS[0], upper_bound)
+        weighted = len(members) * variance + PRIOR_CELLS * prior[same]
+        factors[same] = np.clip(weighted / (len(members) + PRIOR_CELLS), FACTOR_BOUNDS[0], upper_bound)
     return factors
 
 

@@ -109,6 +109,18 @@ def test_visibility_is_the_share_of_scans_that_observed_a_cell():
     assert np.unique(updated.visibility[25:]).tolist() == [0.25]
 
 
+def test_point_count_is_the_mean_of_the_scans_that_observed_a_cell():
+    reference, _ = reference_and_truth()
+    stack = ScanStack(GRID)
+    for shots in (0, 1, 3, 0, 3):
+        gridder = Gridder(GRID, None, POSITION[2])
+        gridder.add(gridder.cell_indices(np.full(shots, 4), np.full(shots, 5)), np.zeros(shots), None)
+        stack.add(gridder)
+    updated = update_reference(reference, stack, POSITION, "2", VarianceComponents())
+    assert updated.point_count[5, 4] == np.float16(7 / 3)
+    assert np.isnan(updated.point_count[5, 5])
+
+
 def test_refraction_of_consecutive_scans_is_correlated():
     """Eight hourly scans count as little more than one for refraction, as eight for all else."""
     names = ("tilt_east", "refraction", "refraction_030.0")

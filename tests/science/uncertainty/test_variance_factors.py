@@ -6,9 +6,10 @@ import pytest
 from station.quantities import ChangeErrors, SharedParameters
 from station.science.geometry.robust_statistics import robust_scale
 from station.science.uncertainty.variance_factors import (
+    CELL_CLASSES,
     NOISE_CLASSES,
     Residuals,
-    VarianceFactors,
+    class_in_scan,
     estimate_variance_factors,
     noise_class,
     sampling_ratio,
@@ -85,6 +86,59 @@ def test_a_hut_hardly_changes_the_systematic_variance():
     assert 1 < found < 20  # of 100: 30 blocks count as three independent ones, as many as the model
 
 
+def with_a_shot_too_many(observed, share):
+    """Return the residuals of which a share of the cells have a shot too many, and where those are."""
+    more = np.random.default_rng(8).random(len(observed.x_m)) < share
+    usual = np.full(len(more), POINTS, np.float16)
+    classes = class_in_scan(observed.noise_class, np.zeros(len(more), bool), POINTS + more, usual)
+    return Residuals(**{**vars(observed), "noise_class": classes}), more
+
+
+def test_cells_with_a_shot_too_many_have_a_factor_of_their_own():
+    observed, more = with_a_shot_too_many(residuals(7, (0.25, 0.25)), 0.3)
+    residual_m = np.where(more, 3, 1) * observed.residual_m
+    found = estimate_variance_factors(Residuals(**{**vars(observed), "residual_m": residual_m}))
+    for part, factor in ((~more, 0.25), (more, 9 * (0.25 + 0.125) - 0.125)):
+        classes = np.unique(observed.noise_class[part])
+        assert found.random[classes] == pytest.approx(np.full(2, factor), rel=0.05)
+    assert found.median_random == pytest.approx(0.25, rel=0.05)
+
+
+def test_few_cells_with_a_shot_too_many_have_the_factor_of_the_others():
+    observed, more = with_a_shot_too_many(residuals(7, (0.25, 0.25)), 5e-5)
+    found = estimate_variance_factors(observed).random[np.unique(observed.noise_class[more])]
+    assert 3 < more.sum() < 30
+    assert found == pytest.approx([0.25, 0.25], rel=0.05)
+
+
+def test_moving_ground_does_not_tell_the_noise_of_the_few_stable_cells_with_a_shot_too_many():
+    """Some 20: others of the same class, with the usual number of points, are enough."""
+    observed, more = with_a_shot_too_many(residuals(3, (1.0, 1.0), stable_share=0.01), 0.006)
+    drifts_m = np.where(observed.stable, 0, np.random.default_rng(4).normal(0, 0.1, len(more)))
+    changed = Residuals(**{**vars(observed), "residual_m": observed.residual_m + drifts_m})
+    found = estimate_variance_factors(changed).random[np.unique(observed.noise_class[more])]
+    assert np.count_nonzero(more & ~observed.stable) > 2000
+    assert found == pytest.approx([1, 1], rel=0.2)  # with moving ground 3
+
+
+def test_class_in_scan_parts_scatter_and_number_of_points():
+    cell_class = np.array([0, 7, 255], np.uint8)
+    usual = np.full(3, 2.5, np.float16)
+    every = {
+        tuple(class_in_scan(cell_class, np.full(3, excess), np.full(3, count), usual))
+        for excess in (False, True)
+        for count in (2.5, 2.2, 3.0, 1.0)
+    }
+    assert sorted(np.concatenate([*every])) == sorted(
+        (cell_class + CELL_CLASSES * np.arange(8)[:, None]).flat
+    )
+    unknown = np.full(3, np.nan, np.float16)  # as in references of early versions
+    assert np.array_equal(class_in_scan(cell_class, np.zeros(3, bool), np.arange(1, 4), unknown), cell_class)
+    # As many too few as too many.
+    pair = [class_in_scan(cell_class, np.zeros(3, bool), np.full(3, count), usual) for count in (2, 3)]
+    assert np.array_equal(*pair)
+
+
 def test_change_of_moving_ground_does_not_widen_the_noise_of_stable_ground():
     quiet = residuals(3, (1.0, 1.0), stable_share=0.5)
     drifts_m = np.where(quiet.stable, 0, np.random.default_rng(4).normal(0, 0.1, len(quiet.x_m)))
@@ -135,13 +189,6 @@ def test_the_sampling_ratio_of_a_class_is_the_geometric_mean_of_its_edges(ratio,
     range_m = np.array([100.0, 2200.0, 8900.0])
     classes = noise_class(range_m, np.full(3, ratio), np.array([True, False, True])).astype(np.uint8)
     assert sampling_ratio(classes) == pytest.approx(np.full(3, middle), rel=0.003)
-
-
-def test_median_of_random_factors_counts_cells():
-    rng = np.random.default_rng(2)
-    factors = VarianceFactors(rng.permutation(NOISE_CLASSES).astype(np.float32), 1.0)
-    classes = rng.choice(256, 1001, p=rng.dirichlet(np.ones(256))).astype(np.uint8)
-    assert factors.median_random(classes) == np.median(factors.random[classes])
 
 
 def test_scaled_parameters_have_the_factor_in_every_variance():
