@@ -175,7 +175,7 @@ def test_noise_classes_fit_a_byte_and_part_range_roughness_and_sampling():
         axis.ravel() for axis in np.meshgrid(np.linspace(0, 20_000, 201), np.geomspace(1e-3, 9, 50))
     )
     classes = noise_class(range_m, ratio, np.ones(len(ratio), bool))
-    assert (classes.min(), classes.max() < NOISE_CLASSES) == (1, True)
+    assert (classes.min(), classes.max() < CELL_CLASSES) == (1, True)
     one = np.array([1200.0]), np.array([0.07])
     of_one = noise_class(*one, np.array([True]))
     assert of_one == noise_class(one[0] + 200, one[1] + 0.02, np.array([True]))
