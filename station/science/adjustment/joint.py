@@ -8,7 +8,6 @@ Source: equations.md, 6.3; adjustment.md, 5.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
@@ -22,6 +21,7 @@ from station.science.adjustment.ground_change import (
     ThinSnow,
     ground_change,
 )
+from station.science.adjustment.ground_response import beam_motion, estimate_responses, response_errors
 from station.science.adjustment.leverage import fit_leverage
 from station.science.adjustment.normal_equations import (
     LineInclination,
@@ -33,7 +33,7 @@ from station.science.adjustment.normal_equations import (
 from station.science.adjustment.patches import CHI2_MEDIAN, GroundClass, Patches
 from station.science.adjustment.solution import Solution
 from station.science.uncertainty.jacobian import HeightJacobian, sight_tilt_of
-from station.science.uncertainty.parameters import GLOBAL, ParameterLayout, interpolate_to_lines
+from station.science.uncertainty.parameters import GLOBAL, ParameterLayout
 from station.science.uncertainty.propagation import condense_rows, expand_rows
 
 MAX_ITERATIONS = 16  # most scans need five to seven
@@ -45,11 +45,6 @@ MIN_WEIGHT = 0.1  # a patch of smaller weight counts as rejected
 TUKEY = 4.685  # 95 % efficient for normal errors
 EXCESS_BOUNDS_M = (0.002, 0.02)  # of the excess sigma of stable patches over the random errors of cells
 MAX_MOVING_EXCESS_M = 1.0  # upper bound for moving patches
-# Of the response of patches to a motion of the beams, over their sampling ratio (equations.md, 6.8).
-RESPONSE_ERROR, MAX_RESPONSE_ERROR = 0.2, 0.05
-COMMON_RESPONSE_ERROR = 0.65  # share of it that all ground of a kind has in common; the rest is by sector
-RESPONSE_SECTOR_RAD = math.radians(12.0)
-MAX_RESPONSE_TILT_RAD = math.radians(0.01)  # beyond, shots are taken to jump as often as they slide
 MAX_GROUP_SIZE = 40.0  # patches that share one error
 HEADING_CLOCKWISE = np.array([1.0, 1.0, -1.0])  # against a rotation about up
 
@@ -67,7 +62,7 @@ class Adjustment:
     `predicted_log_rad` (lines,) is what the adjustment predicts for it, without the errors of the sensor.
     `unapplied_rad` (3,) is the estimated rotation about east, north and up that the points lack, as a mean
     over the lines. `response_shifts` (k, u) is how far the estimate moves by each of k independent errors
-    of the response of ground to the motion of the beams, of one sigma each.
+    that remain of the response of ground to the motion of the beams, of one sigma each.
     """
 
     params: ParameterLayout
@@ -133,7 +128,7 @@ def adjust_scan(
 
     `applied_rad` (3, lines) is the tilt already applied to the points, as a rotation about east, north and
     up. `thin_snow` may lie on stable ground. Rough ground responds to a motion of the beams against those of
-    the `reference` by a little more or less than modelled.
+    the `reference` by a little more or less than modelled, which is estimated last.
     `wider(estimate)` returns prior and log for a second estimate if the state (p,) is not one that the prior
     expects, else None. Hold-out patches are not used. Source: adjustment.md, 5; equations.md, 6.8.
     """
@@ -159,12 +154,18 @@ def adjust_scan(
         change.polar_mean(patches, mixture.estimate[equations.size :] / mixture.size_m),
     )
     leverage_m2 = fit_leverage(patches, estimation.weight, equations, posterior)
-    state, predicted_log_rad = _state_and_log(params, mixture.estimate, reduced, log)
-    motion_m = equations.state_effect(_motion(params, mixture.estimate, reference))
-    of_errors = [
-        equations.of_errors(reduced, estimation.weight, error_m)
-        for error_m in _response_errors(patches, moving, motion_m)
-    ]
+    motion_m = equations.state_effect(beam_motion(params, mixture.estimate, reference))
+    error_m = response_errors(patches, moving, motion_m)
+    weighted_m = estimation.weight * error_m
+    of_errors = [equations.of_errors(reduced, weighted) for weighted in weighted_m]
+    response, normal = estimate_responses(
+        equations, of_errors, estimation.solution, weighted_m, error_m, estimation.residual_m
+    )
+    shifts = np.array([mixture.factor.solve(errors.rhs) for errors in of_errors])
+    estimate = mixture.estimate - response @ shifts
+    line_rhs = reduced.line_rhs - response @ [errors.line_rhs for errors in of_errors]
+    state, predicted_log_rad = _state_and_log(params, estimate, replace(reduced, line_rhs=line_rhs), log)
+    state_shifts = [_state(params, shift, errors) for shift, errors in zip(shifts, of_errors, strict=True)]
     sigma = np.sqrt(np.diag(posterior.to_shared_parameters(state).covariance))
     return Adjustment(
         params,
@@ -179,7 +180,7 @@ def adjust_scan(
         log,
         predicted_log_rad,
         state[:3] * HEADING_CLOCKWISE - applied_rad.mean(axis=1),
-        np.array([_state(params, mixture.factor.solve(errors.rhs), errors) for errors in of_errors]),
+        normal.half_solve(np.array(state_shifts)),
     )
 
 
@@ -191,6 +192,7 @@ class _Estimation:
     reduced: ReducedNormals
     solution: Solution
     weight: Floats  # [1 / m²]
+    residual_m: Floats
     robust_weight: Floats  # 0 to 1
     mean_change_m: float  # of moving ground
 
@@ -230,38 +232,8 @@ def _estimate(
             if same_model and update_m <= CONVERGED_M * np.sqrt(len(residual_m)):
                 break
     assert solution is not None  # noqa: S101 - the loop runs at least once
-    return _Estimation(equations, reduced, solution, weight, robust_weight, change.mean_m(solution.change_m))
-
-
-def _motion(params: ParameterLayout, estimate: Floats, reference: SharedParameters | None) -> Floats:
-    """Return by how much the beams moved against those of the reference, as a state by knots (p,)."""
-    motion = np.where(params.moves_beam, estimate[: len(params.names)], 0.0)
-    if reference is not None and reference.names == params.names:
-        motion -= np.where(params.moves_beam, reference.estimate, 0.0)
-    knots = slice(len(GLOBAL), len(GLOBAL) + params.sight_tilt_knots)
-    sight_tilt_rad = sight_tilt_of(params.line_azimuth_rad) @ motion[:2]
-    sight_tilt_rad += interpolate_to_lines(params, motion[knots, None])[:, 0]
-    excess = max(1.0, float(np.abs(sight_tilt_rad).max()) / MAX_RESPONSE_TILT_RAD)
-    motion[:2] /= excess
-    motion[knots] /= excess
-    return motion
-
-
-def _response_errors(patches: Patches, moving: Bools, motion_m: Floats) -> Floats:
-    """Return independent errors (k, n) of the response of patches to the motion of the beams [m].
-
-    `motion_m` (n,) is what the motion does to their heights. Moving and stable ground each have an error in
-    common, and one in every sector of azimuth.
-    """
-    error_m = np.minimum(RESPONSE_ERROR * patches.sampling_ratio, MAX_RESPONSE_ERROR) * motion_m
-    azimuth_rad = patches.jacobian.params.line_azimuth_rad
-    sector = ((azimuth_rad - azimuth_rad[0]) / RESPONSE_SECTOR_RAD).astype(np.int64)[patches.jacobian.line]
-    kind = np.where(moving, 0, 1)
-    of_kind = np.arange(2)[:, None] == kind
-    key = 2 * sector + kind
-    of_sector = np.unique(key)[:, None] == key
-    own = math.sqrt(1 - COMMON_RESPONSE_ERROR**2)
-    return np.asarray(np.concatenate([COMMON_RESPONSE_ERROR * of_kind, own * of_sector]) * error_m)
+    mean_change_m = change.mean_m(solution.change_m)
+    return _Estimation(equations, reduced, solution, weight, residual_m, robust_weight, mean_change_m)
 
 
 def _mean_sigma(patches: Patches, moving: Bools, posterior: Posterior) -> float:

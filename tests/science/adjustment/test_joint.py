@@ -10,7 +10,7 @@ from numpy.testing import assert_allclose
 from scipy.spatial.transform import Rotation
 
 from station.quantities import SharedParameters, VarianceComponents
-from station.science.adjustment import ground_change, joint, prior
+from station.science.adjustment import ground_change, ground_response, joint, prior
 from station.science.adjustment.joint import adjust_scan
 from station.science.adjustment.normal_equations import LineInclination
 from station.science.adjustment.patches import GroundClass, Patches
@@ -453,6 +453,48 @@ def test_sigma_has_the_errors_that_responses_of_sectors_cause():
     ratio = (stated_m2 - without_m2) / expected_m2
     assert np.median(ratio) == pytest.approx(1, abs=0.02)
     assert np.abs(ratio - 1).max() < 0.4  # beside the edge of a sector: errors jump, parameters do not
+
+
+def adjusted_rock_and_ice(seed):
+    """Adjustment of far rock whose sectors respond by some 2 % more or less, and of near smooth ice at rest.
+
+    Also the true state (p,), drawn from the prior.
+    """
+    rng = np.random.default_rng(seed)
+    ground, covariance = random_sites(3, 900, steep=0.3), knot_prior(PARAMS).knot_covariance
+    root = np.linalg.cholesky(covariance + 1e-24 * np.eye(len(covariance)))
+    state = root @ rng.normal(size=len(root))
+    rock, sector = ground.range_bin > 20, (ground.line * 0.2 // 12).astype(int)
+    response = 0.65 * rng.normal() + math.sqrt(1 - 0.65**2) * rng.normal(size=4)[sector]
+    design = ground.jacobian().to_sparse()
+    residual_m = design @ state - np.where(rock, 0.02 * response, 0) * (design @ (PARAMS.moves_beam * state))
+    residual_m += rng.normal(0, 0.002, len(rock))
+    ground_class = np.where(rock, GroundClass.STABLE, GroundClass.MOVING)
+    patches = ground.patches(residual_m, 0.002, ground_class, sampling_ratio=np.where(rock, 0.1, 0.0))
+    return adjust_scan(patches, NO_TILT, knot_prior(PARAMS), None, reference=reference_of(1e-9)), state
+
+
+def rms(values):
+    return float(np.sqrt(np.mean(np.square(values))))
+
+
+@pytest.mark.integration
+def test_responses_are_estimated_where_smooth_ground_shows_them(monkeypatch):
+    """Against an estimate that takes the response of rock as modelled."""
+    cells = random_sites(4, 100, steep=0.05).jacobian()
+
+    def errors_and_sigma():
+        adjusted = [adjusted_rock_and_ice(seed) for seed in range(40)]
+        errors_m = [adjustment.effect(cells) - cells.effect(state) for adjustment, state in adjusted]
+        variance_m2 = [cells.variance(adjustment.to_shared_parameters()) for adjustment, _ in adjusted]
+        return np.array(errors_m), np.sqrt(variance_m2)
+
+    error_m, sigma_m = errors_and_sigma()
+    monkeypatch.setattr(ground_response, "RESPONSE_ERROR", 1e-9)
+    without_m, too_small_m = errors_and_sigma()
+    assert rms(error_m) < 0.8 * rms(without_m)
+    assert rms(without_m / too_small_m) > 1.25
+    assert 0.5 < rms(error_m / sigma_m) < 1.25  # sigma allows for change of the ice too
 
 
 def reference_of(sigma_rad):
