@@ -24,7 +24,8 @@ from station.processing.scans.epoch_inputs import load_scan_inputs
 from station.processing.scans.scan_air import pressure_fault
 from station.processing.scans.scan_files import scan_file
 from station.quantities import Air, Quality
-from station.science.adjustment import joint
+from station.science.adjustment import ground_response, joint
+from station.science.adjustment.normal_equations import ScaledCholesky
 from station.science.uncertainty.parameters import LINE_GROUPS_PER_KNOT
 from station.simulation.instrument.motion import sensor_faults
 from station.simulation.station import simulate, small
@@ -135,12 +136,17 @@ def test_missing_log_increases_the_tilt_sigma(folder):
 def test_response_of_rough_ground_counts_from_the_state_in_the_scans_of_the_reference(folder, monkeypatch):
     """Its variance is a parabola of that state with the estimate as its vertex (equations.md, 6.8).
 
-    Ground is taken to respond very unlike the model, so that the response is most of the variance. That of
-    the other tilts is small against the steps.
+    Ground is taken to respond very unlike the model, so that the response is most of the variance, and
+    residuals to show nothing of it. The variance of the other tilts is small against the steps.
     """
-    monkeypatch.setattr(joint, "RESPONSE_ERROR", 20.0)
-    monkeypatch.setattr(joint, "MAX_RESPONSE_ERROR", 1.0)
-    monkeypatch.setattr(joint, "MAX_RESPONSE_TILT_RAD", 1.0)
+    monkeypatch.setattr(ground_response, "RESPONSE_ERROR", 50.0)
+    monkeypatch.setattr(ground_response, "MAX_RESPONSE_ERROR", 1.0)
+    monkeypatch.setattr(ground_response, "MAX_RESPONSE_TILT_RAD", 1.0)
+
+    def nothing_seen(_, of_errors, *__):
+        return np.zeros(len(of_errors)), ScaledCholesky(np.eye(len(of_errors)))
+
+    monkeypatch.setattr(joint, "estimate_responses", nothing_seen)
     site = edited_site(folder)
     scans = [scan_file(site, path) for path in sorted(site.scans.inbox.glob("*.laz"))]
     reference_tasks.build_reference_version(site, scans, "1", lambda: None)
