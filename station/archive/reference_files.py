@@ -56,13 +56,8 @@ _VARIABLES = (
         None, 4, None, "one standard deviation of a single cell",
     ),
     Variable(
-        "reference_roughness",
-        ("y", "x"),
-        "f4",
-        "standard deviation of the terrain around the reference surface within the cell",
-        "m",
-        None,
-        4,
+        "reference_roughness", ("y", "x"), "f4",
+        "standard deviation of the terrain around the reference surface within the cell", "m", None, 4,
     ),
     Variable(
         "reference_variance_factor",

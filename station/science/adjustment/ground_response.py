@@ -19,7 +19,8 @@ from station.science.adjustment.solution import Solution
 from station.science.uncertainty.jacobian import sight_tilt_of
 from station.science.uncertainty.parameters import GLOBAL, ParameterLayout, interpolate_to_lines
 
-RESPONSE_ERROR, MAX_RESPONSE_ERROR = 0.2, 0.05  # over the sampling ratio of patches
+RESPONSE_ERROR = 0.2  # of the response of a patch, over its sampling ratio
+MAX_RESPONSE_ERROR = 0.05
 COMMON_RESPONSE_ERROR = 0.65  # share of it that all ground of a kind has in common; the rest is by sector
 RESPONSE_SECTOR_RAD = math.radians(12.0)
 MAX_RESPONSE_TILT_RAD = math.radians(0.01)  # beyond, shots are taken to jump as often as they slide
@@ -43,7 +44,8 @@ def response_errors(patches: Patches, moving: Bools, motion_m: Floats) -> Floats
     """Return independent errors (k, n) of the response of patches to the motion of the beams [m].
 
     `motion_m` (n,) is what the motion does to their heights. Moving and stable ground each have an error in
-    common, and one in every sector of azimuth. Stable ground responds alike at any sampling ratio.
+    common, and one in every sector of azimuth. All stable ground has the mean error: its response depends
+    little on the sampling ratio.
     """
     share = np.minimum(RESPONSE_ERROR * patches.sampling_ratio, MAX_RESPONSE_ERROR)
     if not moving.all():
@@ -62,18 +64,18 @@ def estimate_responses(
     equations: NormalEquations,
     of_errors: Sequence[ReducedNormals],
     solution: Solution,
-    weighted_m: Floats,
+    weight: Floats,
     error_m: Floats,
     residual_m: Floats,
 ) -> tuple[Floats, ScaledCholesky]:
     """Return the responses (k,) that residuals (n,) show, in units of their errors, and their normal matrix.
 
-    `of_errors` are the equations of each of the errors (k, n), `weighted_m` (k, n) those times the weights
-    [1/m]. The change of the ground is that of the most likely model.
+    `of_errors` are the equations of each of the errors (k, n), `weight` (n,) those of the patches [1/m²]. The
+    change of the ground is that of the most likely model.
     """
-    factor, fitted_m = solution.factor, np.empty_like(error_m)
+    factor, weighted_per_m, fitted_m = solution.factor, weight * error_m, np.empty_like(error_m)
     for row, errors in enumerate(of_errors):
         shift = factor.solve(errors.rhs)
         fitted_m[row] = equations.effect(shift, errors.back_substitute(shift))
-    normal = ScaledCholesky(np.eye(len(error_m)) + weighted_m @ (error_m - fitted_m).T)
-    return normal.solve(weighted_m @ residual_m), normal
+    normal = ScaledCholesky(np.eye(len(error_m)) + weighted_per_m @ (error_m - fitted_m).T)
+    return normal.solve(weighted_per_m @ residual_m), normal

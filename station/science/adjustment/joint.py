@@ -156,10 +156,9 @@ def adjust_scan(
     leverage_m2 = fit_leverage(patches, estimation.weight, equations, posterior)
     motion_m = equations.state_effect(beam_motion(params, mixture.estimate, reference))
     error_m = response_errors(patches, moving, motion_m)
-    weighted_m = estimation.weight * error_m
-    of_errors = [equations.of_errors(reduced, weighted) for weighted in weighted_m]
+    of_errors = [equations.of_errors(reduced, estimation.weight, error) for error in error_m]
     response, normal = estimate_responses(
-        equations, of_errors, estimation.solution, weighted_m, error_m, estimation.residual_m
+        equations, of_errors, estimation.solution, estimation.weight, error_m, estimation.residual_m
     )
     shifts = np.array([mixture.factor.solve(errors.rhs) for errors in of_errors])
     estimate = mixture.estimate - response @ shifts

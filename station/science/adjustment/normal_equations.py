@@ -214,9 +214,9 @@ class NormalEquations:
         rhs, line_rhs = self._right_hand_sides(weight * self._misclosure, line_tilt, coupling)
         return ReducedNormals(normal, rhs, line_tilt, coupling, line_rhs)
 
-    def of_errors(self, reduced: ReducedNormals, weighted_m: Floats) -> ReducedNormals:
-        """Return the equations whose solution is the shift by errors of patches, given times weights (n,)."""
-        weighted = np.concatenate([weighted_m, np.zeros(len(self._log_weight))])
+    def of_errors(self, reduced: ReducedNormals, weight: Floats, error_m: Floats) -> ReducedNormals:
+        """Return the equations whose solution is the shift that errors of patches (n,) cause [m]."""
+        weighted = np.concatenate([weight * error_m, np.zeros(len(self._log_weight))])
         rhs, line_rhs = self._right_hand_sides(weighted, reduced.line_tilt, reduced.coupling)
         return replace(reduced, rhs=rhs, line_rhs=line_rhs)
 
