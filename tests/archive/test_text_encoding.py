@@ -86,12 +86,14 @@ def run(name, *command):
     return subprocess.run([path, *command], capture_output=True, check=True, timeout=120)
 
 
+@pytest.mark.integration
 def test_ncdump_prints_the_texts(built):
     """It prints bytes beyond ASCII in octal."""
     octal = "".join(chr(byte) if byte < 128 else f"\\{byte:03o}" for byte in TEXT.encode())
     assert octal in run("ncdump", "-v", "verdict_reason", built).stdout.decode()
 
 
+@pytest.mark.integration
 def test_cdo_reads_the_file(built):
     assert b"elevation_change" in run("cdo", "infon", built).stdout
 

@@ -81,6 +81,7 @@ def folder_target(tmp_path):
     return folder
 
 
+@pytest.mark.integration
 def test_a_target_gets_what_it_lacks_and_nothing_twice(site_with, add_epoch, folder_target, tmp_path):
     site = site_with(target(folder_target, ["areas", "epochs"]))
     areas = tmp_path / "data/areas.nc"
@@ -95,6 +96,7 @@ def test_a_target_gets_what_it_lacks_and_nothing_twice(site_with, add_epoch, fol
     assert (folder_target / "areas.nc").read_bytes() == b"areas 2"
 
 
+@pytest.mark.integration
 def test_the_newest_come_first_within_the_bytes_of_a_day(site_with, add_epoch, folder_target):
     for hour in range(6):
         add_epoch(hour, size=100_000)
@@ -105,6 +107,7 @@ def test_the_newest_come_first_within_the_bytes_of_a_day(site_with, add_epoch, f
         assert {int(name[-10:-8]) for name in contents(folder_target)} == expected_hours
 
 
+@pytest.mark.integration
 def test_a_file_beyond_the_bytes_of_a_day_is_named(site_with, add_epoch, folder_target):
     add_epoch(0, size=300_000)
     add_epoch(1, size=100_000)
@@ -114,6 +117,7 @@ def test_a_file_beyond_the_bytes_of_a_day_is_named(site_with, add_epoch, folder_
     assert "T000000Z.nc has 0.3 MB, more than daily_mb: increase it" in lines[-1]
 
 
+@pytest.mark.integration
 def test_a_day_is_sent_only_if_the_target_lacks_one_of_its_epochs(site_with, add_epoch, folder_target):
     site = site_with(target(folder_target, ["epochs"]))
     epochs = [add_epoch(hour) for hour in range(3)]
@@ -130,6 +134,7 @@ def test_a_day_is_sent_only_if_the_target_lacks_one_of_its_epochs(site_with, add
     assert names == {"days/test_20250715_r2.nc"}
 
 
+@pytest.mark.integration
 def test_only_its_own_folder_is_written_and_the_service_may_run(
     site_with, add_epoch, folder_target, tmp_path
 ):
@@ -145,6 +150,7 @@ def test_only_its_own_folder_is_written_and_the_service_may_run(
     assert changed == [] or changed == [tmp_path / "data"]
 
 
+@pytest.mark.integration
 def test_two_runs_do_not_meet(site_with, folder_target):
     site = site_with(target(folder_target, ["areas"]))
     publish(site)
@@ -152,6 +158,7 @@ def test_two_runs_do_not_meet(site_with, folder_target):
         publish(site)
 
 
+@pytest.mark.integration
 def test_a_folder_that_is_not_mounted_is_not_created(site_with, add_epoch, tmp_path):
     add_epoch(0)
     site = site_with(target(tmp_path / "usb", ["epochs"]))
@@ -166,6 +173,7 @@ def test_a_folder_that_is_not_mounted_is_not_created(site_with, add_epoch, tmp_p
     assert not [fault for fault in queue_status(site)["faults"] if fault.startswith("not published")]
 
 
+@pytest.mark.integration
 def test_a_full_target_keeps_no_other_from_its_files(site_with, add_epoch, folder_target, tmp_path):
     full = tmp_path / "full"
     full.mkdir()

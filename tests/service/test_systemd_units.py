@@ -29,17 +29,20 @@ def analyze():
     )
 
 
+@pytest.mark.integration
 def test_systemd_accepts_the_unit(analyze, service_unit):
     result = analyze("verify", str(service_unit))
     assert (result.returncode, result.stderr) == (0, "")
 
 
+@pytest.mark.integration
 def test_systemd_rejects_an_unknown_key(analyze, service_unit, tmp_path):
     broken = tmp_path / "broken@.service"
     broken.write_text(service_unit.read_text().replace("WatchdogSec=", "WatchdogSecs="))
     assert "WatchdogSecs" in analyze("verify", str(broken)).stderr
 
 
+@pytest.mark.integration
 def test_unit_is_hardened(analyze, service_unit):
     report = analyze("security", "--offline=yes", str(service_unit)).stdout
     exposure = float(re.search(r"Overall exposure level for \S+: ([\d.]+)", report).group(1))
@@ -57,6 +60,7 @@ def test_timeouts_match_those_of_the_service(service_unit):
     assert keys["Type"] == "notify"
 
 
+@pytest.mark.integration
 def test_alarms_have_their_own_unit_and_timer(analyze, service_unit):
     """Only the alarms need a network; the process that reads scans has none."""
     service, timer = (service_unit.with_name(f"station-alarms@.{kind}") for kind in ("service", "timer"))
@@ -68,6 +72,7 @@ def test_alarms_have_their_own_unit_and_timer(analyze, service_unit):
     assert limit_s > 2 * SEND_TIMEOUT_S + 60  # alarms, then the digest
 
 
+@pytest.mark.integration
 def test_publishing_can_write_to_its_own_folder_only(analyze, service_unit):
     service, timer = (service_unit.with_name(f"station-publish@.{kind}") for kind in ("service", "timer"))
     result = analyze("verify", str(service), str(timer))
@@ -81,6 +86,7 @@ def test_publishing_can_write_to_its_own_folder_only(analyze, service_unit):
     ]
 
 
+@pytest.mark.integration
 def test_metrics_drop_in_opens_only_the_loopback(analyze, service_unit, tmp_path):
     (tmp_path / "station@.service.d").mkdir()
     copied_unit = shutil.copy(service_unit, tmp_path)
