@@ -11,8 +11,10 @@ import pytest
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 pytest_plugins = ["support.epochs", "support.site"]
 LONGEST = (  # files whose integration tests take longest, which begin first
-    "test_truth", "test_kills", "test_large", "test_simulated_world", "test_earlier_findings",
-    "test_products_truth", "test_docs_snippets", "test_reprocessing", "test_world", "test_pose_stability",
+    "test_truth", "test_large", "test_soak", "test_earlier_findings", "test_products_truth",
+    "test_docs_snippets", "test_kills", "test_joint", "test_simulated_world", "test_reprocessing",
+    "test_world", "test_pose_stability", "test_products_of_kinds", "test_worker",
+    "test_several_files_end_to_end", "test_alarm_rules", "test_fuzz", "test_end_to_end",
 )  # fmt: skip
 PROJECT = Path(__file__).resolve().parents[1]
 

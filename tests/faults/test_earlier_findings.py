@@ -28,6 +28,7 @@ def _read_unchecked(path):
     return json.loads(path.read_text())["content"] if path.is_file() else None
 
 
+SEEDS = (2, 0, 1)  # of worlds; the first shows most findings
 OPTIONAL_INPUTS = ("areas_broken",)  # of which no fault may stop the service
 REMEDIES = {  # by number of the finding: faults that show it, and what takes the remedy out
     "B1 a fork server without its socket is kept for ever": (
@@ -105,7 +106,7 @@ def test_what_an_attack_found_is_found_without_its_remedy(
     monkeypatch.setattr(simulated_world, "MAX_RECOVERY_S", simulated_world.DAY_S)
     for target, name, substitute in patches:
         monkeypatch.setattr(target, name, substitute)
-    for seed in range(3):
+    for seed in SEEDS:
         world = simulated_world.make_world(tmp_path / str(seed), template, seed, 2 * SCANS_PER_BURST)
         world.plan_faults(*kinds)
         try:
