@@ -12,6 +12,7 @@ Source: equations.md, 6.3; adjustment.md, 5.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -20,7 +21,7 @@ from scipy import sparse
 
 from station.quantities import Bools, Floats, Ints, Reals
 from station.science.adjustment.ground_classes import UNSEEN_SNOW_M
-from station.science.adjustment.normal_equations import ScaledCholesky
+from station.science.adjustment.normal_equations import ScaledCholesky, cholesky_inplace
 from station.science.adjustment.patches import Patches
 from station.science.geometry.air import LAPSE_K_PER_M
 from station.science.uncertainty import common_mode
@@ -56,7 +57,7 @@ SMALL_TREND_LOG_PRIOR = 2.0  # against each factor e by which trends are smaller
 CORRELATION_AZIMUTH_KNOTS, CORRELATION_RANGE_KNOTS = 4.0, 2.5  # correlation lengths, in knots
 # Mean and sigma of thin snow over its largest depth: stable ground is bare as likely as under any depth that
 # does not show.
-THIN_SNOW_MEAN_SIGMA = np.array([1 / 4, np.sqrt(1 / 6 - 1 / 16)])
+THIN_SNOW_MEAN_SIGMA = np.array([1 / 4, math.sqrt(1 / 6 - 1 / 16)])
 NO_CHANGE_M = 1e-6
 # Of the air over thin snow. At most of the warmest places half of what falls at 2.4 °C is snow (Jennings et
 # al., 2018), and a thermometer in the sun shows up to 5 K too much.
@@ -90,17 +91,17 @@ class ChangeModel(NamedTuple):
     @property
     def step_m(self) -> float:
         """One sigma of the change between its knots [m]."""
-        return CHANGE_STEPS_M[self.step] * float(np.hypot(1.0, CORRELATED_CHANGE_RATIOS[self.ratio]))
+        return CHANGE_STEPS_M[self.step] * math.hypot(1.0, CORRELATED_CHANGE_RATIOS[self.ratio])
 
     @property
     def size_m(self) -> float:
         """One sigma of the change of moving ground about its mean [m]."""
-        return float(np.hypot(self.step_m, TREND_SIZES_M[self.trend]))
+        return math.hypot(self.step_m, TREND_SIZES_M[self.trend])
 
     @property
     def log_prior(self) -> float:
         """Logarithm of the prior odds: correlation, small trends and snow need evidence."""
-        below = max(float(np.log(self.step_m / TREND_SIZES_M[self.trend])), 0.0)
+        below = max(math.log(self.step_m / TREND_SIZES_M[self.trend]), 0.0)
         evidence = CORRELATION_LOG_PRIORS[self.ratio] + SMALL_TREND_LOG_PRIOR * below
         return MEAN_LOG_PRIORS[self.mean] - SNOW_LOG_PRIORS[self.snow] - evidence
 
@@ -185,25 +186,24 @@ class GroundChange:
 
     def prior_m(self, model: ChangeModel) -> tuple[Floats, Floats]:
         """Return mean and sigma of the independent unknowns of a model [m]: trends, depths of snow, heave."""
-        unchanged = np.array([[0.0], [NO_CHANGE_M]])
-        trends = np.stack([np.zeros(TRENDS), np.full(TRENDS, TREND_SIZES_M[model.trend])])
-        trends[1, 0] *= MEAN_RATIO
-        depth_m = min(self.thin_snow_m, float(np.hypot(model.step_m, trends[1, 0])))
+        trends_m = np.full(TRENDS, TREND_SIZES_M[model.trend])
+        trends_m[0] *= MEAN_RATIO
+        depth_m = min(self.thin_snow_m, math.hypot(model.step_m, trends_m[0]))
         if model.mean:
-            depth_m, trends[1, 0] = self.thin_snow_m, FREE_MEAN_SIGMA_M
+            depth_m, trends_m[0] = self.thin_snow_m, FREE_MEAN_SIGMA_M
         if model.mean > 1:
-            trends[1, SLOPES] = np.maximum(trends[1, SLOPES], FREE_SLOPE_SIGMA_M)
-        bare = trends if model.snow else np.repeat(unchanged, TRENDS, axis=1)
-        thin_snow = depth_m * THIN_SNOW_MEAN_SIGMA[:, None] if model.snow == SNOWFALL else unchanged
-        heave = np.array([[0.0], [self.heave_m]])
-        mean_m, sigma_m = np.hstack(
-            [
-                trends[:, : self.trend_columns - self.bare_columns],
-                bare[:, : self.bare_columns],
-                np.repeat(thin_snow, self.snow_columns, axis=1),
-                np.repeat(heave, self.heave_columns, axis=1),
-            ]
-        )
+            trends_m[SLOPES] = np.maximum(trends_m[SLOPES], FREE_SLOPE_SIGMA_M)
+        first_bare, first_snow = self.trend_columns - self.bare_columns, self.trend_columns
+        first_heave = first_snow + self.snow_columns
+        sigma_m = np.full(first_heave + self.heave_columns, NO_CHANGE_M)
+        mean_m = np.zeros(len(sigma_m))
+        sigma_m[:first_bare] = trends_m[:first_bare]
+        if model.snow:
+            sigma_m[first_bare:first_snow] = trends_m[: self.bare_columns]
+        if model.snow == SNOWFALL:
+            thin_snow = np.s_[first_snow:first_heave]
+            mean_m[thin_snow], sigma_m[thin_snow] = depth_m * THIN_SNOW_MEAN_SIGMA
+        sigma_m[first_heave:] = self.heave_m
         return mean_m, sigma_m
 
     def knot_precision(self, ratio: int, step: int) -> tuple[Floats, float]:
@@ -221,6 +221,14 @@ class GroundChange:
         information = np.zeros(len(precision))
         information[independent] = mean_m / sigma_m**2
         return precision, information
+
+    def times_root_precision(self, matrix: Floats, model: ChangeModel) -> Floats:
+        """Return the product of a matrix (n, k) and a factor F of the precision F Fᵀ (k, k) of a model."""
+        product, independent = np.empty_like(matrix), self.independent
+        knot_factor = np.tril(cholesky_inplace(self.knot_precision(model.ratio, model.step)[0]))
+        product[:, self.knots] = matrix[:, self.knots] @ knot_factor
+        product[:, independent] = matrix[:, independent] / self.prior_m(model)[1]
+        return product
 
     def mean_m(self, estimate_m: Floats) -> float:
         """Return the mean change of moving ground that an estimate (k,) shows [m]; 0 without any."""

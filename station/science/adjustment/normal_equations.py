@@ -346,10 +346,7 @@ class ScaledCholesky:
 
     def half_solve(self, rhs: Floats) -> Floats:
         """Return L⁻¹ B (n, k) for a right-hand side B (n, k)."""
-        scaled = rhs * self._scale[:, None]
-        return np.asarray(
-            linalg.solve_triangular(self._cholesky, scaled, lower=True, overwrite_b=True, check_finite=False)
-        )
+        return solve_lower(self._cholesky, rhs * self._scale[:, None])
 
     def solve(self, rhs: Floats) -> Floats:
         """Return the solution (n,) for a right-hand side (n,)."""
@@ -377,9 +374,23 @@ class ScaledCholesky:
 
 
 def cholesky_inplace(matrix: Floats) -> Floats:
-    """Return the lower Cholesky factor of a symmetric matrix (n, n), which is overwritten."""
-    cholesky, _ = linalg.cho_factor(matrix.T, lower=True, overwrite_a=True, check_finite=False)
+    """Return the lower Cholesky factor of a symmetric matrix (n, n), which is overwritten.
+
+    By LAPACK itself, as in `solve_lower`: SciPy's checks cost more than the factor of a small matrix. Raises
+    LinAlgError if the matrix is not positive definite.
+    """
+    cholesky, failed = linalg.lapack.dpotrf(matrix.T, lower=True, clean=False, overwrite_a=True)
+    if failed:
+        raise linalg.LinAlgError(f"the leading minor of order {failed} is not positive")
     return np.asarray(cholesky)
+
+
+def solve_lower(cholesky: Floats, rhs: Floats) -> Floats:
+    """Return L⁻¹ B (n, k) for a lower Cholesky factor L (n, n) and a right-hand side B (n, k)."""
+    if not len(cholesky):
+        return rhs
+    solution, _ = linalg.lapack.dtrtrs(cholesky, rhs, lower=True)
+    return np.asarray(solution)
 
 
 def log_determinant(cholesky: Floats) -> float:

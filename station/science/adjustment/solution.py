@@ -26,6 +26,7 @@ from station.science.adjustment.normal_equations import (
     ScaledCholesky,
     cholesky_inplace,
     log_determinant,
+    solve_lower,
 )
 
 NEGLIGIBLE_LOG_ODDS = 4.0  # models so much less likely than the best are left out
@@ -86,10 +87,9 @@ class Solution:
             rest = self._eliminate_knots(model.ratio, model.step)
             mean_m, sigma_m = self._change.prior_m(model)
             cholesky = cholesky_inplace(rest.normal + np.diag(1 / sigma_m**2))
-            half, first = (
-                linalg.solve_triangular(cholesky, column, lower=True, check_finite=False)
-                for column in (rest.rhs + mean_m / sigma_m**2, np.eye(len(sigma_m))[0])
-            )
+            columns = np.zeros((len(sigma_m), 2))
+            columns[:, 0], columns[0, 1] = rest.rhs + mean_m / sigma_m**2, 1.0
+            half, first = solve_lower(cholesky, columns).T
             half_log_determinant = log_determinant(cholesky) / 2 + np.log(sigma_m).sum()
             squares = half @ half - np.sum((mean_m / sigma_m) ** 2)
             log_odds = rest.log_odds + model.log_prior + squares / 2 - half_log_determinant
@@ -109,7 +109,7 @@ class Solution:
             precision, determinant = self._change.knot_precision(ratio, step)
             cholesky = cholesky_inplace(self._normal[knots, knots] + precision)
             columns = np.column_stack([self._normal[knots, rest], self._rhs[knots]])
-            half = linalg.solve_triangular(cholesky, columns, lower=True, check_finite=False)
+            half = solve_lower(cholesky, columns)
             coupling, rhs = half[:, :-1], half[:, -1]
             self._without_knots[ratio, step] = WithoutKnots(
                 self._normal[np.ix_(rest, rest)] - coupling.T @ coupling,
@@ -149,7 +149,7 @@ class Solution:
         """Posterior variance of the heaves (heave_columns,) [m²]."""
         cholesky, _ = self._equations
         columns = np.eye(len(cholesky))[:, len(cholesky) - self._change.heave_columns :]
-        half = linalg.solve_triangular(cholesky, columns, lower=True, check_finite=False)
+        half = solve_lower(cholesky, columns)
         return np.asarray(np.sum(half**2, axis=0))
 
     @cached_property
@@ -183,7 +183,8 @@ class Solution:
             change_m = model_covariance @ (self._rhs + information)
             mean_m += share * change_m
             covariance += share * (model_covariance + np.outer(change_m, change_m))
-            bias += share * (model_covariance @ precision @ model_covariance)
+            half = self._change.times_root_precision(model_covariance, model)
+            bias += share * (half @ half.T)
         covariance -= np.outer(mean_m, mean_m)
         mixture_precision = ScaledCholesky(covariance).inverse()
         normal, first = self._reduced.normal.copy(), self._state_size
