@@ -170,6 +170,24 @@ def test_mixture_has_the_moments_of_all_models(moderate):
     assert sigma_of(mixture, 6) == pytest.approx(sigma[:6], rel=0.05)
 
 
+def test_part_of_the_covariance_that_comes_from_the_change_is_that_of_its_prior(moderate):
+    """By propagating the prior of each model, instead of the observations, to its estimate of the change."""
+    _, change, size, solved = moderate
+    mixture, state, models = solved.mixture(), slice(size), solved._likely_models()
+    odds = np.array([solved.log_odds(model) for model in models])
+    weight = np.exp(odds - odds.max())
+    from_prior = 0.0
+    for share, model in zip(weight / weight.sum(), models, strict=True):
+        normal, (precision, _) = solved._reduced.normal.copy(), change.precision_at(model)
+        normal[size:, size:] += precision
+        gain = np.linalg.inv(normal)[size:, size:] @ precision  # of the change by its prior mean
+        from_prior = from_prior + share * gain @ np.linalg.inv(precision) @ gain.T
+    normal = np.linalg.inv(mixture.factor.inverse())
+    of_state = np.linalg.solve(normal[state, state], normal[state, size:])
+    root = mixture.change_bias @ np.linalg.inv(normal[size:, size:] - normal[size:, state] @ of_state)
+    assert root.T @ root == pytest.approx(from_prior, rel=1e-5, abs=1e-7 * np.abs(from_prior).max())
+
+
 def test_size_of_change_follows_the_change():
     wave = np.cos(make_patches(2, 0.0).range_bin / 8)
     sizes_m = [solve(2, change_m * wave)[3].mixture().size_m for change_m in (0.0, 0.03, 0.5)]
