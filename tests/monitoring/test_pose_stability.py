@@ -15,7 +15,8 @@ from station.monitoring import pose_stability, status
 from station.operations.batch import process_scans
 from station.quantities import Grid, Measurement, SharedParameters
 from station.science.uncertainty.parameters import GLOBAL
-from station.simulation.station import named, simulate
+from station.simulation.scenario import small
+from station.simulation.station import simulate
 
 GRID = Grid(0.0, 20.0, 10.0, 3, 2)
 START_S = 1_763_683_200.0  # 2025-11-21, a midnight
@@ -126,11 +127,16 @@ def test_damaged_series_is_reported(site):
 def test_simulated_pose_step_is_reported_with_its_size(tmp_path, caplog):
     """The scanner is tilted by 0.02°, turned by 0.01° and shifted by 5 mm between two scans."""
     folder = tmp_path / "station"
-    simulate(folder, named("moved", hours=30))
+    moved = replace(
+        small(hours=21), melt_m_per_h=0.0, avalanche_m=0.0, reference_scans=4,
+        moved_hour=12.5, moved_deg=0.02, moved_m=0.005,
+    )  # fmt: skip
+    simulate(folder, moved)
+    (folder / "site.toml").write_text((folder / "site.toml").read_text() + "[products]\npage = false\n")
     site = read_site(folder / "site.toml")
     process_scans(site, sorted(site.scans.inbox.glob("*.laz")), lambda _: None)
     (line,) = [record.getMessage() for record in caplog.records if "moved=" in record.getMessage()]
-    assert "between 2025-07-15 14:00 and 2025-07-15 15:00" in line
+    assert "between 2025-07-15 12:00 and 2025-07-15 13:00" in line
     tilt, rotation = (float(line.split(word)[1].split()[0]) for word in ("tilted by ", "turned by "))
     assert tilt == pytest.approx(0.02, abs=0.008)
     assert rotation == pytest.approx(0.01, abs=0.003)

@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy import ndimage, stats
+from scipy import ndimage, special
 
 from station.quantities import Bools, Floats
 from station.science.geometry.robust_statistics import MEDIAN_ABSOLUTE_NORMAL
@@ -24,7 +24,7 @@ MIN_VARIANCE = 0.25  # of a block or cell, for its weight, over the usual varian
 LEAST_BEFORE = 3  # of the scans before must have seen a block or cell
 MIN_CELLS = 3
 MIN_VARIANCE_M2 = 1e-12
-MIN_LOG_TAIL = -700.0  # of what numbers can represent
+MIN_TAIL = 1e-304  # of what numbers can represent
 TINY = 1e-9
 
 
@@ -133,8 +133,8 @@ def agreement_sigmas(before_m: Floats, after_m: Floats, random_m: Floats, around
     weights /= weights.sum()
     mean_m, freedom = weights @ change_m, 1 / (weights @ weights) - 1
     mean_m2 = weights**2 @ (change_m - mean_m) ** 2 * (freedom + 1) / freedom
-    log_tail = stats.t.logsf(abs(mean_m) / np.sqrt(max(mean_m2, MIN_VARIANCE_M2)), freedom)
-    return float(np.sign(mean_m) * stats.norm.isf(np.exp(max(log_tail, MIN_LOG_TAIL))))
+    tail = special.stdtr(freedom, -abs(mean_m) / np.sqrt(max(mean_m2, MIN_VARIANCE_M2)))
+    return float(-np.sign(mean_m) * special.ndtri(max(tail, MIN_TAIL)))
 
 
 class _Windows:
