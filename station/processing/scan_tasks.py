@@ -38,7 +38,7 @@ from station.processing.usable_inputs import usable_site
 from station.processing.workers.worker_process import Progress, trim_heap
 from station.products.overview import Overview
 from station.quantities import Reference, VarianceComponents
-from station.queries.aggregates import LEVERAGE_VARIABLES
+from station.queries.epoch_cells import LEVERAGE_VARIABLES
 from station.readers.raster import read_geotiff
 from station.readers.scan import reject_future
 from station.scan_names import scan_id

@@ -15,7 +15,6 @@ from station.archive.derived.computed_rasters import (
 )
 from station.archive.epochs import EpochRef
 from station.archive.netcdf_layout import Series
-from station.archive.small_variables import read_number
 from station.quantities import Bools, Floats, Grid, Quality, Reals
 from station.queries.common_errors import common_error_covariance, shared_of
 from station.queries.epoch_cells import (
@@ -315,14 +314,8 @@ class Aggregates(EpochReader):
         Relative to the reference, it would remove about as much as the error of the reference itself, a tenth
         of a millimetre for an area, which is counted nowhere else.
         """
-        if epoch_cells.members:
-            return None
-        index = epoch_cells.epoch.index
-        with h5py.File(epoch_cells.epoch.path, "r") as file:
-            if not epoch_cells.adjusted or not set(LEVERAGE_VARIABLES) <= set(file):
-                return None
-            moving, stable = (read_number(file, name, index) for name in LEVERAGE_VARIABLES)
-        if not np.isfinite([moving, stable]).all():
+        known = epoch_cells.adjusted and np.isfinite(epoch_cells.noise_leverage).all()
+        if epoch_cells.members or not known:
             return None
         grid, (row, column) = self.grid, np.nonzero(common_cells)
         holdout = ground_classes.is_holdout(grid.x_m[column], grid.y_m[row])
@@ -330,7 +323,7 @@ class Aggregates(EpochReader):
         smooth = jacobian.tan_slope < ground_classes.MAX_MOVING_SLOPE
         ground_class = ground_classes.classify(stable_ground, holdout, smooth, np.zeros_like(stable_ground))
         random_m2 = independent_m2 + epoch_cells.reference.random_variance_m2[common_cells]
-        return leverage(independent_m2, random_m2, ground_class, (moving, stable))
+        return leverage(independent_m2, random_m2, ground_class, epoch_cells.noise_leverage)
 
     def _references_differ(self, epochs: list[EpochCells], cells: Bools) -> Bools:
         """Return True where the reference surfaces of two epochs differ."""
@@ -366,9 +359,6 @@ class Aggregates(EpochReader):
             jacobian = _scaled_to_cells(jacobian, epoch_cells, cells)
         factor = epoch_cells.jacobian_factor
         return jacobian if factor is None else jacobian.scaled(factor[cells])
-
-
-LEVERAGE_VARIABLES = ("adjustment_leverage_moving", "adjustment_leverage_stable")
 
 
 def _scaled_to_cells(jacobian: HeightJacobian, epoch_cells: EpochCells, cells: Bools) -> HeightJacobian:

@@ -35,6 +35,7 @@ MAX_CACHED = 4  # epochs whose parameters are kept: an epoch and those that it i
 PARAMETER_VARIABLES = ("parameter_name", "parameter_unit")
 SHARED_VARIABLES = ("shared_parameter", "shared_parameter_covariance", "shared_parameter_line_tilt_variance")
 POSITIONS = "position_count"
+LEVERAGE_VARIABLES = ("adjustment_leverage_moving", "adjustment_leverage_stable")
 CHANGE_ERROR_VARIABLES = ("change_errors", "change_pattern")  # in the order of the fields of `ChangeErrors`
 
 
@@ -50,6 +51,7 @@ class EpochCells:
     adjusted: bool  # to the reference; `shared` is then relative to it
     has_positions: bool  # several, against each other in error
     epoch: EpochRef
+    noise_leverage: tuple[float, float]  # on the adjustment, of moving and of stable cells; NaN if unknown
     members: tuple[SharedParameters, ...] = ()  # of a mean of epochs, those of each; the first is of `epoch`
     jacobian_factor: Floats32 | None = None  # (ny, nx) of a mean, where some epochs lack a cell
 
@@ -81,7 +83,7 @@ class EpochReader:
         self.series = series
         self.grid = series.grid
         self._references: dict[str | None, Reference] = {}
-        self._shared_cache: dict[EpochRef, SharedParameters] = {}  # areas are queried one by one
+        self._without_cells: dict[EpochRef, EpochCells] = {}  # areas are queried one by one
 
     def reference(self, version: str | None = None) -> Reference:
         """Return the newest reference surface or a version; raise StoreError if there is none."""
@@ -110,24 +112,39 @@ class EpochReader:
         """Return the data of an epoch at the selected cells (ny, nx); raise ValueError on another grid."""
         if cells.shape != self.grid.shape:
             raise ValueError(f"the array has shape {cells.shape}, the grid {self.grid.shape}")
-        return epoch.at(cells) if isinstance(epoch, EpochMean) else self._read(epoch, cells)
+        if isinstance(epoch, EpochMean):
+            return epoch.at(cells)
+        without_cells = self.read_shared(epoch)
+        with h5py.File(epoch.path, "r") as file:
+            change_m, random_m = (read_cells_of(file, name, epoch.index, cells) for name in (CHANGE, RANDOM))
+        return replace(without_cells, change_m=change_m, random_m=random_m)
 
     def read_shared(self, epoch: EpochRef) -> EpochCells:
         """Return the data of an epoch without any cell."""
-        return self._read(epoch, None)
+        if epoch not in self._without_cells:
+            if len(self._without_cells) == MAX_CACHED:
+                self._without_cells.clear()
+            self._without_cells[epoch] = self._read(epoch)
+        return self._without_cells[epoch]
 
-    def _read(self, epoch: EpochRef, cells: Bools | None) -> EpochCells:
+    def _read(self, epoch: EpochRef) -> EpochCells:
         with h5py.File(epoch.path, "r") as file:
-            reference = self.reference(read_text(file, "reference_version", epoch.index))
-            change_m, random_m = (
-                np.empty(0) if cells is None else read_cells_of(file, name, epoch.index, cells)
-                for name in (CHANGE, RANDOM)
-            )
             scanner = read_scanner(file, epoch.index, self.grid)
-            adjusted = read_text(file, "adjustment", epoch.index) == "joint"
-            has_positions = POSITIONS in file and read_number(file, POSITIONS, epoch.index) > 1
-            shared = self._read_shared(file, epoch, scanner)
-        return EpochCells(change_m, random_m, shared, scanner, reference, adjusted, has_positions, epoch)
+            moving, stable = (
+                read_number(file, name, epoch.index) if name in file else np.nan
+                for name in LEVERAGE_VARIABLES
+            )
+            return EpochCells(
+                change_m=np.empty(0),
+                random_m=np.empty(0),
+                shared=self._read_shared(file, epoch, scanner),
+                scanner=scanner,
+                reference=self.reference(read_text(file, "reference_version", epoch.index)),
+                adjusted=read_text(file, "adjustment", epoch.index) == "joint",
+                has_positions=POSITIONS in file and read_number(file, POSITIONS, epoch.index) > 1,
+                epoch=epoch,
+                noise_leverage=(moving, stable),
+            )
 
     def _read_shared(
         self, file: h5py.File, epoch: EpochRef, scanner: tuple[float, ...]
@@ -135,22 +152,16 @@ class EpochReader:
         """Return the shared parameters of an epoch; None if the file does not contain them."""
         if "parameter_name" not in file or not np.isfinite(scanner).all():
             return None
-        if epoch not in self._shared_cache:
-            if len(self._shared_cache) == MAX_CACHED:
-                self._shared_cache.clear()
-            names, units = (
-                tuple(decode_parameters(read_variable(file, name))) for name in PARAMETER_VARIABLES
-            )
-            has_change_errors = set(CHANGE_ERROR_VARIABLES) <= set(file)
-            estimate, covariance, line_tilt_variance, *change_fields = (
-                np.where(is_value(values), values.astype(np.float64), 0.0)  # 0 where not this epoch's
-                for name in (*SHARED_VARIABLES, *(CHANGE_ERROR_VARIABLES if has_change_errors else ()))
-                for values in read_epochs(file, name, epoch.index, 1)
-            )
-            change_errors = ChangeErrors(*change_fields) if change_fields else None
-            shared = SharedParameters(names, units, estimate, covariance, line_tilt_variance, change_errors)
-            self._shared_cache[epoch] = align_to(layout_of_scanner(self.grid, scanner)[0], shared)
-        return self._shared_cache[epoch]
+        names, units = (tuple(decode_parameters(read_variable(file, name))) for name in PARAMETER_VARIABLES)
+        has_change_errors = set(CHANGE_ERROR_VARIABLES) <= set(file)
+        estimate, covariance, line_tilt_variance, *change_fields = (
+            np.where(is_value(values), values.astype(np.float64), 0.0)  # 0 where not this epoch's
+            for name in (*SHARED_VARIABLES, *(CHANGE_ERROR_VARIABLES if has_change_errors else ()))
+            for values in read_epochs(file, name, epoch.index, 1)
+        )
+        change_errors = ChangeErrors(*change_fields) if change_fields else None
+        shared = SharedParameters(names, units, estimate, covariance, line_tilt_variance, change_errors)
+        return align_to(layout_of_scanner(self.grid, scanner)[0], shared)
 
 
 def layout_of_scanner(

@@ -20,6 +20,8 @@ from station.queries.aggregates import Aggregates
 from station.simulation.station import simulate, small
 
 RULES = """
+[products]
+page = false
 [alarms]
 targets = ["hook"]
 stalled_h = 0

@@ -329,7 +329,7 @@ def wait_for(condition, within_s=10.0):
 
 
 def test_service_and_workers_do_not_import_what_they_do_not_need():
-    """Xarray takes 70 MB of each worker and serves users' queries only; scipy.stats takes 0.6 s of a start."""
+    """Xarray takes 70 MB of each worker and serves users only; scipy.stats takes 0.6 s of each start."""
     preloaded = (module for module in fork_server.PRELOAD if module.startswith("station."))
     modules = ", ".join(["station.service.worker", *preloaded])
     code = f"import sys, {modules}; sys.exit(bool({{'xarray', 'pandas', 'scipy.stats'}} & set(sys.modules)))"

@@ -343,20 +343,28 @@ def test_touched_scan_changes_no_value_although_the_reference_falls_due(make_sta
     assert_same_store(station, undisturbed)
 
 
-@integration
-@pytest.mark.parametrize("is_interrupted", [False, True])
-def test_live_scan_measured_ahead_changes_no_value(tmp_path, monkeypatch, is_interrupted):
-    """Once before the first reference, once before its update; then power fails before the journal knows."""
+@pytest.fixture(scope="module")
+def eleven_scans(tmp_path_factory):
+    """Return the folder of a station, on which two references become due, and another that processed it."""
     fork_server.ensure_running((*fork_server.PRELOAD, "pytest"))
-    folder = build(tmp_path / "simulated", hours=11, method="joint")
+    folder = build(tmp_path_factory.mktemp("eleven") / "simulated", hours=11, method="joint")
     text = (folder / "site.toml").read_text()
     (line,) = [line for line in text.splitlines() if line.startswith("scan =")]  # the first scan defines it
     (folder / "site.toml").write_text(text.replace(line, "") + "[products]\npage = false\n")
-    undisturbed, station = (Station(shutil.copytree(folder, tmp_path / name)) for name in ("u", "s"))
+    undisturbed = Station(shutil.copytree(folder, folder.with_name("undisturbed")))
     undisturbed.drop(*range(11))
     undisturbed.finish()
     assert {undisturbed.row(hour).reference for hour in range(11)} == {"1", "2"}
+    yield folder, undisturbed
+    undisturbed.journal.close()
 
+
+@integration
+@pytest.mark.parametrize("is_interrupted", [False, True])
+def test_live_scan_measured_ahead_changes_no_value(eleven_scans, tmp_path, monkeypatch, is_interrupted):
+    """Once before the first reference, once before its update; then power fails before the journal knows."""
+    folder, undisturbed = eleven_scans
+    station = Station(shutil.copytree(folder, tmp_path / "station"))
     station.drop(*range(11))
     station.process_ahead(9)
     assert "waits for" in station.row(9).waiting_reason  # for the first scan under its SOP
@@ -381,7 +389,6 @@ def test_live_scan_measured_ahead_changes_no_value(tmp_path, monkeypatch, is_int
     assert station.row(10).reference == "2"
     assert_same_store(station, undisturbed)
     station.journal.close()
-    undisturbed.journal.close()
 
 
 @integration

@@ -902,6 +902,11 @@ def glacier_mean_errors(seed, change_m):
     return np.array([error_m[box].mean() for box in BOXES]), adjustment.to_shared_parameters()
 
 
+@cache
+def first_mean_errors(draw):
+    return glacier_mean_errors(2 * draw, glacier_change(draw))
+
+
 SECOND_CHANGE = {
     "equal": lambda seed: 0.9 * glacier_change(seed),
     "opposite": lambda seed: -glacier_change(seed),
@@ -916,10 +921,8 @@ def difference_z_std(second_change, draws=70):
     effect = np.array([height_errors.aggregate(box / box.sum()) for box in BOXES])
     independent, with_common = [], []
     for draw in range(draws):
-        (first_m, first), (second_m, second) = (
-            glacier_mean_errors(2 * draw + n, change_m)
-            for n, change_m in enumerate((glacier_change(draw), SECOND_CHANGE[second_change](draw)))
-        )
+        first_m, first = first_mean_errors(draw)
+        second_m, second = glacier_mean_errors(2 * draw + 1, SECOND_CHANGE[second_change](draw))
         variance_m2 = sum(
             np.array(
                 [
