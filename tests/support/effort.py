@@ -2,4 +2,4 @@
 
 import os
 
-SHARE = int(os.environ.get("STATION_TEST_SHARE", "10"))  # one in so many boundaries, years and kills
+SHARE = int(os.environ.get("STATION_TEST_SHARE", "10"))  # one in so many
