@@ -123,8 +123,9 @@ def test_laszip_and_cloudcompare_read_the_points_that_were_written(processed, tm
     np.testing.assert_allclose(opened[:, 3], columns[3], rtol=0, atol=0.0001, equal_nan=True)
 
 
-def test_m3c2_of_py4dgeo_finds_the_stored_change(processed, tmp_path):
+def test_m3c2_of_py4dgeo_finds_the_stored_change(processed, tmp_path, monkeypatch):
     """Vertical M3C2 in a cylinder as wide as a cell, between clouds of two hours: within the stored sigma."""
+    monkeypatch.chdir(tmp_path)  # where py4dgeo writes its log
     site = read_site(processed / "site.toml")
     grid, epochs = site.grid_cells, station.open(processed / "data")
     first, *_, second = export_points(site, Span.parse(None, None), tmp_path)
