@@ -14,8 +14,8 @@ pytest_plugins = ["support.epochs", "support.site"]
 LONGEST = (  # files whose integration tests take longest; those whose faults have no end come last
     "test_truth", "test_large", "test_products_truth", "test_joint", "test_docs_snippets", "test_worker",
     "test_reprocessing", "test_several_files_end_to_end", "test_products_of_kinds", "test_alarm_rules",
-    "test_pose_stability", "test_end_to_end", "test_world", "test_simulated_world", "test_kills", "test_soak",
-    "test_earlier_findings", "test_fuzz",
+    "test_pose_stability", "test_end_to_end", "test_world", "test_earlier_findings", "test_simulated_world",
+    "test_kills", "test_soak", "test_fuzz",
 )  # fmt: skip
 LATEST_START_S = float(os.environ.get("STATION_TESTS_LATEST_START", "inf"))  # of a test, since 1970
 PROJECT = Path(__file__).resolve().parents[1]
