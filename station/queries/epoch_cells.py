@@ -31,7 +31,7 @@ SCANNER_VARIABLES = (
     "scanner_axis_east",
     "scanner_axis_north",
 )
-MAX_CACHED = 4  # epochs whose parameters are kept: an epoch and those that it is compared with
+MAX_CACHED = 4  # epochs of which all but the cells is kept: an epoch and those that it is compared with
 PARAMETER_VARIABLES = ("parameter_name", "parameter_unit")
 SHARED_VARIABLES = ("shared_parameter", "shared_parameter_covariance", "shared_parameter_line_tilt_variance")
 POSITIONS = "position_count"
@@ -51,7 +51,7 @@ class EpochCells:
     adjusted: bool  # to the reference; `shared` is then relative to it
     has_positions: bool  # several, against each other in error
     epoch: EpochRef
-    noise_leverage: tuple[float, float]  # on the adjustment, of moving and of stable cells; NaN if unknown
+    noise_leverage: tuple[float, float]  # of moving and stable cells on the adjustment; NaN if unknown
     members: tuple[SharedParameters, ...] = ()  # of a mean of epochs, those of each; the first is of `epoch`
     jacobian_factor: Floats32 | None = None  # (ny, nx) of a mean, where some epochs lack a cell
 

@@ -23,7 +23,7 @@ from station.service.worker import Worker
 
 pytestmark = pytest.mark.slow
 
-SCANS = int(os.environ.get("STATION_SOAK_SCANS", 600 // SHARE))
+SCANS = 600 // SHARE
 MAX_BACKLOG = 12  # scans; then the faults wait for the service
 START = datetime(2025, 7, 15, tzinfo=UTC)
 CGROUPS = Path("/sys/fs/cgroup")

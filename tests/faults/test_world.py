@@ -49,7 +49,7 @@ def test_full_disk_pauses_the_service(make_station, undisturbed, rng):
 
 @pytest.mark.slow
 def test_full_disk_at_write_boundaries(make_station, undisturbed, rng, capsys):
-    """Each fsync, rename, mkdir and commit fails once, of which each run draws a share; nobody helps."""
+    """Each fsync, rename, mkdir and commit that is drawn fails once; the service recovers without help."""
     station = make_station()
     station.period_s = 0.2
     station.drop(*ALL)

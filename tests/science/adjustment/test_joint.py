@@ -904,6 +904,7 @@ def glacier_mean_errors(seed, change_m):
 
 @cache
 def first_mean_errors(draw):
+    """Of the first of two scans, the same whatever the change of the second."""
     return glacier_mean_errors(2 * draw, glacier_change(draw))
 
 
