@@ -36,8 +36,9 @@ class ScanStack:
         self._intensity_sum, self._intensity_count, self._observed = (
             np.zeros(grid.shape, np.float32) for _ in range(3)
         )
-        self._mean, self._mean_variance, self._deviation, self._squared_deviation = (
-            np.zeros(grid.shape, np.float32) for _ in range(4)
+        self._mean, self._mean_variance = (np.zeros(grid.shape, np.float32) for _ in range(2))
+        self._deviation, self._squared_deviation, self._deviation_variance = (
+            np.zeros(grid.shape, np.float32) for _ in range(3)
         )
         self._scans = 0
 
@@ -50,14 +51,15 @@ class ScanStack:
         """Add a scan.
 
         `known`, on a reference: random variance of a shot [m²] and correction to subtract from heights [m].
-        With the `roughness_m2` of that reference, the scatter of the scans is summed too. All (ny, nx).
+        With the `roughness_m2` of that reference, the scatter of the scans is summed too. All (ny, nx). Cells
+        that a reference lacks are left out: most of them are echoes of the air, elsewhere in each scan.
         """
         self._scans += 1
         for rows in row_blocks(self.grid.ny):
             halo = NEIGHBOURHOOD_CELLS // 2 if roughness_m2 is not None else 0
             window = slice(max(rows.start - halo, 0), min(rows.stop + halo, self.grid.ny))
             inner = slice(rows.start - window.start, rows.stop - window.start)
-            sums = gridder.rasters(window)
+            sums = gridder.rasters(window, on_reference=gridder.reference_cells > 0)
             shot_m2, correction_m = (
                 (block[window] for block in known) if known else np.zeros((2, *sums.count.shape))
             )
@@ -90,7 +92,8 @@ class ScanStack:
     def _add_scatter(self, rows: slice, inner: slice, mean_m: Floats, variance_m2: Reals) -> None:
         """Add the deviations of a scan's cells from those around, which its shared errors do not cause.
 
-        Of the mean of a cell, a deviation lacks what the mean of its neighbourhood contains of the cell.
+        Of the mean of a cell, a deviation lacks what the mean of its neighbourhood contains of the cell; a
+        cell without others around it has none. Source: equations.md, 6.21.
         """
         observed = np.isfinite(mean_m)
         share = ndimage.uniform_filter(observed.astype(np.float64), NEIGHBOURHOOD_CELLS, mode="constant")
@@ -103,7 +106,9 @@ class ScanStack:
         deviation_m = np.clip(np.nan_to_num(deviation_m), -limit_m, limit_m)
         self._deviation[rows] += deviation_m
         self._squared_deviation[rows] += deviation_m**2
-        self._mean_variance[rows] += np.where(observed, variance_m2[inner] * (1 - own_share[inner]), 0.0)
+        observed_m2 = np.where(observed, variance_m2[inner], 0.0)
+        self._mean_variance[rows] += observed_m2
+        self._deviation_variance[rows] += observed_m2 * (1 - own_share[inner])
 
     def intensity(self) -> Floats32:
         """Mean intensity of each cell (ny, nx), 0-1; NaN where unknown."""
@@ -147,7 +152,7 @@ class ScanStack:
 
     def _scatter(self, rows: slice) -> tuple[Floats32, Floats32]:
         """Return variance over scans of the deviations, over the modelled one, and its degrees of freedom."""
-        observed, expected_m2 = self._observed[rows], self._mean_variance[rows]
+        observed, expected_m2 = self._observed[rows], self._deviation_variance[rows]
         degrees = np.where(expected_m2 > 0, np.maximum(observed - 1, 0), np.float32(0))
         scatter_m2 = self._squared_deviation[rows] - self._deviation[rows] ** 2 / np.maximum(observed, 1)
         ratio = np.zeros(degrees.shape, np.float32)

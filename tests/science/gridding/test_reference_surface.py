@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from station.quantities import Grid, Reference, SharedParameters, VarianceComponents
+from station.science.geometry.terrain import bilinear_surface
 from station.science.gridding.gridder import Gridder
 from station.science.gridding.reference_surface import (
     build_surface,
@@ -91,6 +92,40 @@ def test_variance_factor_of_cells_that_vary_more_than_modelled():
     factor = update_reference(reference, stack, POSITION, "2", VarianceComponents()).variance_factor
     assert 6.5 < np.median(factor[varying]) < 9  # nine, drawn towards the class that they share with others
     assert np.median(factor[~varying]) == pytest.approx(1, rel=0.15)
+
+
+def test_echoes_of_the_air_outside_the_surface_do_not_scatter_cells_beside_it():
+    """Each scan has some elsewhere. Their heights count from the datum, hundreds of metres off the ground."""
+    rng = np.random.default_rng(4)
+    beyond = np.zeros(GRID.shape, bool)
+    beyond[:, ::7] = True
+    surface = bilinear_surface(Reference.from_elevation(GRID, "1", np.where(beyond, np.nan, POSITION[2])))
+    ground, air = np.flatnonzero(~beyond), np.flatnonzero(beyond)
+    stack = ScanStack(GRID)
+    for _ in range(40):
+        gridder = Gridder(GRID, surface, POSITION[2])
+        airborne = rng.choice(air, len(air) // 20, replace=False)
+        cell = np.concatenate([ground, airborne])
+        above_m = rng.normal(0, NOISE_M, len(cell))
+        above_m[len(ground) :] += rng.uniform(-600, -100, len(airborne))
+        gridder.add(gridder.cell_indices(cell % GRID.nx, cell // GRID.nx), above_m, None)
+        gridder.finish()
+        stack.add(gridder, (SHOT_M2, np.zeros_like(SHOT_M2)), np.zeros_like(SHOT_M2))
+    factor = stack.variance_factor(np.zeros(GRID.shape, np.int32))
+    assert np.median(factor[~beyond]) == pytest.approx(1, rel=0.05)
+    assert factor[~beyond].max() < 2
+    assert np.isnan(stack.scan_mean()[beyond]).all()
+    assert not stack.visibility()[beyond].any()
+
+
+def test_a_cell_alone_has_no_scatter():
+    stack = ScanStack(GRID)
+    for above_m in (-1.0, 1.0, 0.5):
+        gridder = Gridder(GRID, None, POSITION[2])
+        gridder.add(gridder.cell_indices(np.array([4]), np.array([5])), np.array([above_m]), None)
+        stack.add(gridder, (SHOT_M2, np.zeros_like(SHOT_M2)), np.zeros_like(SHOT_M2))
+    assert stack.variance_factor(np.zeros(GRID.shape, np.int32))[5, 4] == 1
+    assert stack.scan_mean_variance()[5, 4] == pytest.approx(NOISE_M**2 / 3)
 
 
 def test_visibility_is_the_share_of_scans_that_observed_a_cell():
