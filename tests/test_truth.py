@@ -142,12 +142,15 @@ def test_blocks_of_single_scans_are_calibrated(calm):
     z = error_m / sigma_m
     assert np.count_nonzero(whole) > 10_000
     assert 0.8 < np.std(np.clip(z[whole], -5, 5)) < 1.25
+    ratios = []
     for epoch, row, column in np.argwhere(whole)[:: np.count_nonzero(whole) // 12]:
         mask = np.zeros((2 * whole.shape[1], 2 * whole.shape[2]), bool)
         mask[2 * row : 2 * row + 2, 2 * column : 2 * column + 2] = True
         exact_m = np.sqrt(fine.aggregates.variance(mask / 4, fine.aggregates.find_epoch(int(epoch))))
-        ratio = sigma_m[epoch, row, column] / exact_m
-        assert 0.98 < ratio < 1.12  # near the scanner a block spans several scan lines, taken as one
+        ratios.append(sigma_m[epoch, row, column] / exact_m)
+    # A block spans several scan lines, taken as one, which shows where their tilt is most of its variance.
+    assert 0.98 < min(ratios) < np.median(ratios) < 1.03
+    assert max(ratios) < 1.15
 
 
 def test_uncertainty_of_cells_and_areas_is_calibrated(calm):
