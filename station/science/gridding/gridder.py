@@ -345,24 +345,21 @@ class Gridder:
         """Return a copy of the sums of cells (n,) by index, without intensity."""
         return CellSums(self._count.take(cell_index), self._moments.take(cell_index, axis=0), None)
 
-    def rasters(self, rows: slice = slice(None), *, on_reference: bool = False) -> CellSums:
-        """Return a copy of all sums as rasters (r, nx), on some rows of the grid or on all.
+    def rasters(self, rows: slice = slice(None)) -> CellSums:
+        """Return a copy of the sums as rasters (r, nx), on some rows of the grid or on all.
 
-        With `on_reference` without those of other cells, whose heights count from the datum.
+        On a reference they are those of its cells only: heights in others count from the datum.
         """
         cell_index = self.cell_index[rows]
-        end = self.reference_cells if on_reference else self.used
-        present = np.flatnonzero((cell_index >= 0) & (cell_index < end))
-        sums = self.take(cell_index.reshape(-1).take(present))
+        present = np.flatnonzero((cell_index >= 0) & (cell_index < (self.reference_cells or self.used)))
+        present_index = cell_index.reshape(-1).take(present)
+        sums = self.take(present_index)
         count, moments = np.zeros(cell_index.shape, np.int32), np.zeros((*cell_index.shape, 2), np.int64)
         count.reshape(-1)[present], moments.reshape(-1, 2)[present] = sums.count, sums.moments
         intensity_sum = None
         if self._has_intensity:
-            intensity_sum, compared = (
-                np.zeros(cell_index.shape, np.uint32),
-                (cell_index >= 0) & (cell_index < self._intensity_cells),
-            )
-            intensity_sum[compared] = self._intensity_sum.take(cell_index[compared])
+            intensity_sum = np.zeros(cell_index.shape, np.uint32)
+            intensity_sum.reshape(-1)[present] = self._intensity_sum.take(present_index)
         return CellSums(count, moments, intensity_sum)
 
     def release_buffers(self) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:

@@ -59,7 +59,7 @@ class ScanStack:
             halo = NEIGHBOURHOOD_CELLS // 2 if roughness_m2 is not None else 0
             window = slice(max(rows.start - halo, 0), min(rows.stop + halo, self.grid.ny))
             inner = slice(rows.start - window.start, rows.stop - window.start)
-            sums = gridder.rasters(window, on_reference=gridder.reference_cells > 0)
+            sums = gridder.rasters(window)
             shot_m2, correction_m = (
                 (block[window] for block in known) if known else np.zeros((2, *sums.count.shape))
             )

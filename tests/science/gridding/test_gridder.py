@@ -68,11 +68,14 @@ def test_mean_intensity_up_to_the_capacity_of_its_sum(count, mean):
     assert sums.intensity()[0, 0] == pytest.approx(mean, nan_ok=True)
 
 
-def test_no_intensity_outside_the_reference():
+def test_rasters_hold_the_cells_of_the_reference_only():
     elevation_m = np.where(np.arange(GRID.nx) < 4, 3000.0, np.nan) * np.ones((GRID.ny, 1))
     surface = bilinear_surface(Reference.from_elevation(GRID, "1", elevation_m))
-    sums = gridded(scatter(seed=4), surface, intensity=np.full(500, 0.5)).rasters()
-    assert (sums.count > 0).all()
+    gridder = gridded(scatter(seed=4), surface, intensity=np.full(500, 0.5))
+    sums = gridder.rasters()
+    assert (sums.count[:, :4] > 0).all()
+    assert not sums.count[:, 4:].any()
+    assert len(gridder.new_cells()) == GRID.ny * (GRID.nx - 4)
     assert sums.intensity()[:, :4] == pytest.approx(0.5, rel=1e-4)
     assert np.isnan(sums.intensity()[:, 4:]).all()
 
