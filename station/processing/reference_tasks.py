@@ -38,12 +38,17 @@ from station.processing.scans.open_scans import open_scan_for
 from station.processing.scans.scan_inputs import ScanInputs
 from station.processing.site_files import exclusion_reason, series_for, sha256_log
 from station.processing.workers.worker_process import Progress
-from station.quantities import Reference, ScanGeometry, VarianceComponents
+from station.quantities import Floats, Reference, ScanGeometry, SharedParameters, VarianceComponents
 from station.scan_names import scan_id, scan_stem
 from station.science.adjustment.joint import Adjustment
 from station.science.adjustment.variance_components import estimate_variance_components
 from station.science.gridding.gridder import Gridder
-from station.science.gridding.reference_surface import build_surface, centre_reference, update_reference
+from station.science.gridding.reference_surface import (
+    build_surface,
+    centre_reference,
+    mean_of_scans,
+    update_reference,
+)
 from station.science.gridding.scan_stack import ScanStack
 from station.science.gridding.viewing_geometry import ViewingGeometry
 from station.science.gridding.viewpoints import seen_from_viewpoints
@@ -103,12 +108,15 @@ def _build_and_store(site: Site, scans: list[ScanFile], version: str, progress: 
     stack, stacked = _stack_scans(site, scans, surface, progress, centred=True)
     geometry = stacked[-1].inputs.geometry
     components = _estimate_components(surface.components, stacked)
-    reference = centre_reference(surface, stack, geometry.position_m, components)
-    reference = replace(_with_mean_state(reference, stacked), sop_scan_count=_sop_scan_count(site, scans))
+    reference = replace(
+        centre_reference(surface, stack, geometry.position_m, components),
+        shared=_errors_of_mean(stacked, components),
+        sop_scan_count=_sop_scan_count(site, scans),
+    )
     scan_provenance = tuple(scan.provenance.to_attrs() for scan in stacked)
     write_reference(
         series_for(site),
-        reference,
+        _with_mean_state(reference, stacked),
         ReferenceProvenance(version, site.science_hash, scan_provenance=scan_provenance),
     )
     return geometry
@@ -121,10 +129,10 @@ def _surface_pass(
     stack, stacked = _stack_scans(site, scans, surface, progress, centred=True)
     scan_ids = tuple(scan.provenance.scan_id for scan in stacked)
     components = _estimate_components(surface.components if surface else VarianceComponents(), stacked)
-    shared = [scan.inputs.log_only_shared(components) for scan in stacked]
-    times_s = np.array([scan.provenance.start_s for scan in stacked])
+    shared, times_s = _errors_of_mean(stacked, components), _start_times(stacked)
     position_m = stacked[0].inputs.geometry.position_m
-    return build_surface(stack, surface, shared, position_m, version, scan_ids, times_s, components)
+    built = build_surface(stack, surface, shared, position_m, version, scan_ids, times_s, components)
+    return _with_mean_state(built, stacked)
 
 
 def update_reference_version(
@@ -206,6 +214,17 @@ def _warm_cache(site: Site, version: str, geometry: ScanGeometry) -> None:
     reference = open_reference(series_for(site), version)
     if reference is not None:
         load_viewing_geometry(site, geometry, reference)
+
+
+def _start_times(stacked: list[_StackedScan]) -> Floats:
+    """Return the starts of scans (n,) [s since 1970]."""
+    return np.array([scan.provenance.start_s for scan in stacked])
+
+
+def _errors_of_mean(stacked: list[_StackedScan], components: VarianceComponents) -> SharedParameters | None:
+    """Return the errors that all cells of a reference share, by the variance components of its scans."""
+    posteriors = (scan.inputs.log_only_shared(components) for scan in stacked)
+    return mean_of_scans(posteriors, _start_times(stacked))
 
 
 def _with_mean_state(reference: Reference, stacked: list[_StackedScan]) -> Reference:

@@ -156,7 +156,7 @@ def test_reference_from_scans_equals_the_truth_within_its_uncertainty():
             reference = centre_reference(reference, stack, position_m, components)
         else:
             reference = build_surface(
-                stack, reference, [None], position_m, "1", ("a",), np.zeros(1), components
+                stack, reference, None, position_m, "1", ("a",), np.zeros(1), components
             )
     measured = [process_shots(shots, reference)[0] for shots in scans]
     mean_m = np.nanmean([scan.change_m for scan in measured], axis=0)

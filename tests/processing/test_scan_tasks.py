@@ -24,8 +24,7 @@ from station.processing.scans.epoch_inputs import load_scan_inputs
 from station.processing.scans.scan_air import pressure_fault
 from station.processing.scans.scan_files import scan_file
 from station.quantities import Air, Quality
-from station.science.adjustment import ground_response, joint
-from station.science.adjustment.normal_equations import ScaledCholesky
+from station.science.adjustment import ground_response
 from station.science.uncertainty.parameters import LINE_GROUPS_PER_KNOT
 from station.simulation.instrument.motion import sensor_faults
 from station.simulation.station import simulate, small
@@ -133,20 +132,31 @@ def test_missing_log_increases_the_tilt_sigma(folder):
 
 
 @pytest.mark.integration
+def test_errors_of_a_reference_follow_from_the_components_that_its_scans_show(folder):
+    """Those of its first scans on the surface that is stored, not of a pass before: equations.md, 6.3."""
+    site = edited_site(folder)
+    scans = [scan_file(site, path) for path in sorted(site.scans.inbox.glob("*.laz"))]
+    reference_tasks.build_reference_version(site, scans, "1", lambda: None)
+    with netCDF4.Dataset(site.station.data / "reference_1.nc") as file:
+        names, variance = file["parameter_name"][:], np.diag(file["shared_parameter_covariance"][:])
+        component = file.component_refraction_ice
+    hours = np.arange(len(scans))
+    scans_of_the_weather = len(scans) ** 2 / np.exp(-np.abs(np.subtract.outer(hours, hours)) / 6).sum()
+    stated = variance[list(names).index("refraction_ice")]
+    assert stated == pytest.approx(component**2 / scans_of_the_weather, rel=0.01)
+
+
+@pytest.mark.integration
 def test_response_of_rough_ground_counts_from_the_state_in_the_scans_of_the_reference(folder, monkeypatch):
     """Its variance is a parabola of that state with the estimate as its vertex (equations.md, 6.8).
 
-    Ground is taken to respond very unlike the model, so that the response is most of the variance, and
-    residuals to show nothing of it. The variance of the other tilts is small against the steps.
+    All ground is taken to respond by 1 % more or less, which is little against the errors of the log: a log
+    that shows the response would make less of it.
     """
-    monkeypatch.setattr(ground_response, "RESPONSE_ERROR", 50.0)
-    monkeypatch.setattr(ground_response, "MAX_RESPONSE_ERROR", 1.0)
+    response_error = 0.01
+    monkeypatch.setattr(ground_response, "RESPONSE_ERROR", 1e6)
+    monkeypatch.setattr(ground_response, "MAX_RESPONSE_ERROR", response_error)
     monkeypatch.setattr(ground_response, "MAX_RESPONSE_TILT_RAD", 1.0)
-
-    def nothing_seen(_, of_errors, *__):
-        return np.zeros(len(of_errors)), ScaledCholesky(np.eye(len(of_errors)))
-
-    monkeypatch.setattr(joint, "estimate_responses", nothing_seen)
     site = edited_site(folder)
     scans = [scan_file(site, path) for path in sorted(site.scans.inbox.glob("*.laz"))]
     reference_tasks.build_reference_version(site, scans, "1", lambda: None)
@@ -170,9 +180,9 @@ def test_response_of_rough_ground_counts_from_the_state_in_the_scans_of_the_refe
     (below, _), (here, estimate_rad), (above, _) = (tilt_variance(stored[0] + each) for each in offsets_rad)
     curvature = (above - 2 * here + below) / step_rad**2
     vertex_rad = stored[0] - (above - below) / (2 * step_rad) / curvature
-    # If all ground errs by all of a motion, Σ x is 1 of it for errors in common, and Σ x² is 0.5 to 1; less
-    # for errors of sectors.
-    assert 0.4 < curvature / 2 < 1.1
+    # If all ground errs by the same share of a motion, Σ x is that share of it for errors in common, and Σ x²
+    # is 0.5 to 1; less for errors of sectors.
+    assert 0.4 < curvature / 2 / response_error**2 < 1.1
     assert vertex_rad == pytest.approx(estimate_rad, abs=0.15 * step_rad)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import replace
 
 import numpy as np
@@ -23,7 +24,7 @@ Position = tuple[float, float, float]
 def build_surface(
     stack: ScanStack,
     base: Reference | None,
-    posteriors: list[SharedParameters | None],
+    shared: SharedParameters | None,
     position_m: Position | None,
     version: str,
     scan_ids: tuple[str, ...],
@@ -35,9 +36,8 @@ def build_surface(
     A plain mean depends on where its points lie on the slope (equations.md, 4.10), which a later pass of
     residuals repairs. Where cells around are missing, a node of its own would give the surface the slope of
     its sampling error, which exceeds that of the terrain: there the surface is a plane through the cells
-    around. `times_s` (n,) are the starts of the scans. Errors shared within a scan are taken as independent
-    between scans, so that the mean of n scans has an nth of their mean covariance; but refraction is that of
-    the weather, which lasts for hours. Source: equations.md, 6.3.
+    around. `shared` are the errors that all its cells share, see `mean_of_scans`; `times_s` (n,) are the
+    starts of the scans.
     """
     mean_m = stack.mean_residual()
     if base is None:
@@ -45,21 +45,6 @@ def build_surface(
         elevation_m = fit_planes(mean_m) + datum_m
     else:
         elevation_m = fit_planes(base.elevation_m + mean_m, keep_dense=True)
-    known = [posterior for posterior in posteriors if posterior is not None]
-    shared = None
-    if known:
-        total = known[0]
-        for posterior in known[1:]:
-            total = total + posterior
-        separation_s = np.abs(np.subtract.outer(times_s, times_s))
-        correlated = float(np.mean(np.exp(-separation_s / REFRACTION_CORRELATION_S)))
-        share = np.where([name.startswith("refraction") for name in total.names], correlated, 1 / len(known))
-        shared = replace(
-            total,
-            estimate=np.zeros(len(total.names)),
-            covariance=total.covariance / len(known) * np.sqrt(np.outer(share, share)),
-            line_tilt_variance=total.line_tilt_variance / len(known) ** 2,
-        )
     roughness_m2 = stack.roughness()
     return Reference(
         grid=stack.grid,
@@ -77,6 +62,30 @@ def build_surface(
         visibility=stack.visibility(),
         point_count=stack.point_count(),
         time_s=float(np.mean(times_s)),
+    )
+
+
+def mean_of_scans(posteriors: Iterable[SharedParameters | None], times_s: Floats) -> SharedParameters | None:
+    """Return the errors of the mean of scans, with zero estimates; None if those of no scan are known.
+
+    Errors shared within a scan are taken as independent between scans, so that the mean of n scans has an nth
+    of their mean covariance; but refraction is that of the weather, which lasts for hours. `times_s` (n,) are
+    the starts of the scans. Source: equations.md, 6.3.
+    """
+    known = [posterior for posterior in posteriors if posterior is not None]
+    if not known:
+        return None
+    total = known[0]
+    for posterior in known[1:]:
+        total = total + posterior
+    separation_s = np.abs(np.subtract.outer(times_s, times_s))
+    correlated = float(np.mean(np.exp(-separation_s / REFRACTION_CORRELATION_S)))
+    share = np.where([name.startswith("refraction") for name in total.names], correlated, 1 / len(known))
+    return replace(
+        total,
+        estimate=np.zeros(len(total.names)),
+        covariance=total.covariance / len(known) * np.sqrt(np.outer(share, share)),
+        line_tilt_variance=total.line_tilt_variance / len(known) ** 2,
     )
 
 

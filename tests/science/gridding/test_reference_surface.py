@@ -9,9 +9,9 @@ from station.quantities import Grid, Reference, SharedParameters, VarianceCompon
 from station.science.geometry.terrain import bilinear_surface
 from station.science.gridding.gridder import Gridder
 from station.science.gridding.reference_surface import (
-    build_surface,
     errors_of_sop_scan,
     errors_on_map,
+    mean_of_scans,
     update_reference,
 )
 from station.science.gridding.scan_stack import ScanStack
@@ -160,21 +160,12 @@ def test_refraction_of_consecutive_scans_is_correlated():
     """Eight hourly scans count as little more than one for refraction, as eight for all else."""
     names = ("tilt_east", "refraction", "refraction_030.0")
     shared = SharedParameters(names, ("rad", "1", "1"), np.zeros(3), np.diag([4.0, 1.0, 9.0]), np.zeros(3))
-    stack = ScanStack(GRID)
-    gridder = Gridder(GRID, None, 0.0)
-    gridder.finish()
-    stack.add(gridder)
-    hourly_s, daily_s = 3600.0 * np.arange(8), 86_400.0 * np.arange(8)
-    hourly, daily = (
-        build_surface(stack, None, [shared] * 8, None, "1", tuple("abcdefgh"), times_s, VarianceComponents())
-        for times_s in (hourly_s, daily_s)
-    )
+    hourly, daily = (mean_of_scans([shared] * 8, step_s * np.arange(8)) for step_s in (3600.0, 86_400.0))
     separation_h = np.abs(np.subtract.outer(range(8), range(8)))
     effective = 64 / np.exp(-separation_h / 6).sum()
     assert 1.3 < effective < 1.8
-    assert np.diag(hourly.shared.covariance) == pytest.approx([4 / 8, 1 / effective, 9 / effective])
-    assert np.diag(daily.shared.covariance) == pytest.approx(np.array([4, 1, 9]) / 8, rel=0.05)
-    assert hourly.time_s == 3.5 * 3600
+    assert np.diag(hourly.covariance) == pytest.approx([4 / 8, 1 / effective, 9 / effective])
+    assert np.diag(daily.covariance) == pytest.approx(np.array([4, 1, 9]) / 8, rel=0.05)
 
 
 @pytest.mark.parametrize("sop_scan_count", [0, 1])
