@@ -1,4 +1,4 @@
-"""Response of rough ground to a motion of the beams: unknowns that an adjustment estimates last.
+"""Response of rough ground to a motion of the beams: further unknowns of an adjustment.
 
 If the beams move, rough ground rises or falls by a little more or less than its mean surface would. How much
 is not known of any station in advance; the residuals of a scan show it in part.
@@ -8,16 +8,14 @@ Source: equations.md, 6.8.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 
 import numpy as np
+from scipy import sparse
 
-from station.quantities import Bools, Floats, SharedParameters
-from station.science.adjustment.normal_equations import NormalEquations, ReducedNormals, ScaledCholesky
-from station.science.adjustment.patches import Patches
-from station.science.adjustment.solution import Solution
+from station.quantities import Floats, SharedParameters
+from station.science.adjustment.patches import GroundClass, Patches
 from station.science.uncertainty.jacobian import sight_tilt_of
-from station.science.uncertainty.parameters import GLOBAL, ParameterLayout, interpolate_to_lines
+from station.science.uncertainty.parameters import ParameterLayout, interpolate_to_lines
 
 RESPONSE_ERROR = 0.2  # of the response of a patch, over its sampling ratio
 MAX_RESPONSE_ERROR = 0.05
@@ -31,7 +29,7 @@ def beam_motion(params: ParameterLayout, estimate: Floats, reference: SharedPara
     motion = np.where(params.moves_beam, estimate[: len(params.names)], 0.0)
     if reference is not None and reference.names == params.names:
         motion -= np.where(params.moves_beam, reference.estimate, 0.0)
-    knots = slice(len(GLOBAL), len(GLOBAL) + params.sight_tilt_knots)
+    knots = params.knot_slices[0]
     sight_tilt_rad = sight_tilt_of(params.line_azimuth_rad) @ motion[:2]
     sight_tilt_rad += interpolate_to_lines(params, motion[knots, None])[:, 0]
     excess = max(1.0, float(np.abs(sight_tilt_rad).max()) / MAX_RESPONSE_TILT_RAD)
@@ -40,42 +38,24 @@ def beam_motion(params: ParameterLayout, estimate: Floats, reference: SharedPara
     return motion
 
 
-def response_errors(patches: Patches, moving: Bools, motion_m: Floats) -> Floats:
-    """Return independent errors (k, n) of the response of patches to the motion of the beams [m].
+def response_design(patches: Patches, motion_m: Floats) -> sparse.csr_array:
+    """Return the effect (n, k) of one sigma of each response to the motion of the beams on patches [m].
 
-    `motion_m` (n,) is what the motion does to their heights. Moving and stable ground each have an error in
+    `motion_m` (n,) is what the motion does to their heights. Moving and stable ground each have a response in
     common, and one in every sector of azimuth. All stable ground has the mean error: its response depends
     little on the sampling ratio.
     """
+    moving = patches.ground_class == GroundClass.MOVING
     share = np.minimum(RESPONSE_ERROR * patches.sampling_ratio, MAX_RESPONSE_ERROR)
     if not moving.all():
         share[~moving] = np.average(share[~moving], weights=1 / patches.variance_m2[~moving])
     azimuth_rad = patches.jacobian.params.line_azimuth_rad
     sector = ((azimuth_rad - azimuth_rad[0]) / RESPONSE_SECTOR_RAD).astype(np.int64)[patches.jacobian.line]
     kind = np.where(moving, 0, 1)
-    of_kind = np.arange(2)[:, None] == kind
-    key = 2 * sector + kind
-    of_sector = np.unique(key)[:, None] == key
+    of_sector = 2 + np.unique(2 * sector + kind, return_inverse=True)[1]
+    effect_m = share * motion_m
     own = math.sqrt(1 - COMMON_RESPONSE_ERROR**2)
-    return np.asarray(np.concatenate([COMMON_RESPONSE_ERROR * of_kind, own * of_sector]) * share * motion_m)
-
-
-def estimate_responses(
-    equations: NormalEquations,
-    of_errors: Sequence[ReducedNormals],
-    solution: Solution,
-    weight: Floats,
-    error_m: Floats,
-    residual_m: Floats,
-) -> tuple[Floats, ScaledCholesky]:
-    """Return the responses (k,) that residuals (n,) show, in units of their errors, and their normal matrix.
-
-    `of_errors` are the equations of each of the errors (k, n), `weight` (n,) those of the patches [1/m²]. The
-    change of the ground is that of the most likely model.
-    """
-    factor, weighted_per_m, fitted_m = solution.factor, weight * error_m, np.empty_like(error_m)
-    for row, errors in enumerate(of_errors):
-        shift = factor.solve(errors.rhs)
-        fitted_m[row] = equations.effect(shift, errors.back_substitute(shift))
-    normal = ScaledCholesky(np.eye(len(error_m)) + weighted_per_m @ (error_m - fitted_m).T)
-    return normal.solve(weighted_per_m @ residual_m), normal
+    values_m = np.concatenate([COMMON_RESPONSE_ERROR * effect_m, own * effect_m])
+    row = np.arange(len(patches))
+    shape = len(patches), 2 + len(np.unique(of_sector))
+    return sparse.csr_array((values_m, (np.tile(row, 2), np.concatenate([kind, of_sector]))), shape=shape)

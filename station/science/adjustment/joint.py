@@ -9,7 +9,7 @@ Source: equations.md, 6.3; adjustment.md, 5.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -21,7 +21,7 @@ from station.science.adjustment.ground_change import (
     ThinSnow,
     ground_change,
 )
-from station.science.adjustment.ground_response import beam_motion, estimate_responses, response_errors
+from station.science.adjustment.ground_response import beam_motion, response_design
 from station.science.adjustment.leverage import fit_leverage
 from station.science.adjustment.normal_equations import (
     LineInclination,
@@ -34,7 +34,7 @@ from station.science.adjustment.patches import CHI2_MEDIAN, GroundClass, Patches
 from station.science.adjustment.solution import Solution
 from station.science.uncertainty.jacobian import HeightJacobian, sight_tilt_of
 from station.science.uncertainty.parameters import GLOBAL, ParameterLayout
-from station.science.uncertainty.propagation import condense_rows, expand_rows
+from station.science.uncertainty.propagation import expand_rows
 
 MAX_ITERATIONS = 16  # most scans need five to seven
 CONVERGED_M = 0.0003  # stop when an iteration changes the residuals by less (root mean square)
@@ -61,8 +61,7 @@ class Adjustment:
     prior's, 1 if the observations alone determine it. `log` is the inclination log that was used, and
     `predicted_log_rad` (lines,) is what the adjustment predicts for it, without the errors of the sensor.
     `unapplied_rad` (3,) is the estimated rotation about east, north and up that the points lack, as a mean
-    over the lines. `response_shifts` (k, u) is how far the estimate moves by each of k independent errors
-    that remain of the response of ground to the motion of the beams, of one sigma each.
+    over the lines.
     """
 
     params: ParameterLayout
@@ -77,7 +76,6 @@ class Adjustment:
     log: LineInclination | None
     predicted_log_rad: Floats
     unapplied_rad: Floats
-    response_shifts: Floats
 
     def effect(self, jacobian: HeightJacobian) -> Reals:
         """Return the effect of the estimated state on heights (n,) [m], to be subtracted from them."""
@@ -104,9 +102,7 @@ class Adjustment:
 
     def to_shared_parameters(self) -> SharedParameters:
         """Return the estimate and its covariance on knots, for the store."""
-        shared = self.posterior.to_shared_parameters(self.estimate)
-        shifts = condense_rows(self.params, self.response_shifts.T)
-        return replace(shared, covariance=shared.covariance + shifts @ shifts.T)
+        return self.posterior.to_shared_parameters(self.estimate)
 
 
 def tilt_effect(jacobian: HeightJacobian, applied_rad: Floats) -> Reals:
@@ -128,7 +124,7 @@ def adjust_scan(
 
     `applied_rad` (3, lines) is the tilt already applied to the points, as a rotation about east, north and
     up. `thin_snow` may lie on stable ground. Rough ground responds to a motion of the beams against those of
-    the `reference` by a little more or less than modelled, which is estimated last.
+    the `reference` by a little more or less than modelled, which is estimated too.
     `wider(estimate)` returns prior and log for a second estimate if the state (p,) is not one that the prior
     expects, else None. Hold-out patches are not used. Source: adjustment.md, 5; equations.md, 6.8.
     """
@@ -137,11 +133,11 @@ def adjust_scan(
     moving = patches.ground_class == GroundClass.MOVING
     misclosure_m = patches.residual_m + tilt_effect(patches.jacobian, applied_rad)
     change = ground_change(patches, moving, thin_snow)
-    estimation = _estimate(patches, change, misclosure_m, prior, log)
+    estimation = _estimate(patches, change, misclosure_m, prior, log, reference)
     second = wider(estimation.solution.estimate[: len(params.names)])
     if second is not None:
         prior, log = second
-        estimation = _estimate(patches, change, misclosure_m, prior, log)
+        estimation = _estimate(patches, change, misclosure_m, prior, log, reference)
     equations, reduced = estimation.equations, estimation.reduced
     mixture = estimation.solution.mixture()
     posterior = Posterior(
@@ -154,17 +150,7 @@ def adjust_scan(
         change.polar_mean(patches, mixture.estimate[equations.size :] / mixture.size_m),
     )
     leverage_m2 = fit_leverage(patches, estimation.weight, equations, posterior)
-    motion_m = equations.state_effect(beam_motion(params, mixture.estimate, reference))
-    error_m = response_errors(patches, moving, motion_m)
-    of_errors = [equations.of_errors(reduced, estimation.weight, error) for error in error_m]
-    response, normal = estimate_responses(
-        equations, of_errors, estimation.solution, estimation.weight, error_m, estimation.residual_m
-    )
-    shifts = np.array([mixture.factor.solve(errors.rhs) for errors in of_errors])
-    estimate = mixture.estimate - response @ shifts
-    line_rhs = reduced.line_rhs - response @ [errors.line_rhs for errors in of_errors]
-    state, predicted_log_rad = _state_and_log(params, estimate, replace(reduced, line_rhs=line_rhs), log)
-    state_shifts = [_state(params, shift, errors) for shift, errors in zip(shifts, of_errors, strict=True)]
+    state, predicted_log_rad = _state_and_log(params, mixture.estimate, reduced, log)
     sigma = np.sqrt(np.diag(posterior.to_shared_parameters(state).covariance))
     return Adjustment(
         params,
@@ -179,7 +165,6 @@ def adjust_scan(
         log,
         predicted_log_rad,
         state[:3] * HEADING_CLOCKWISE - applied_rad.mean(axis=1),
-        normal.half_solve(np.array(state_shifts)),
     )
 
 
@@ -191,7 +176,6 @@ class _Estimation:
     reduced: ReducedNormals
     solution: Solution
     weight: Floats  # [1 / m²]
-    residual_m: Floats
     robust_weight: Floats  # 0 to 1
     mean_change_m: float  # of moving ground
 
@@ -202,14 +186,25 @@ def _estimate(
     misclosure_m: Floats,
     prior: StatePrior,
     log: LineInclination | None,
+    reference: SharedParameters | None,
 ) -> _Estimation:
-    """Return the estimate by iteration: residual variances, rejection and the size of change depend on it."""
+    """Return the estimate by iteration.
+
+    Residual variances, rejection and the size of change depend on it, and the response of ground on how far
+    the beams have moved.
+    """
     equations = NormalEquations(patches.jacobian, change.design, misclosure_m, prior, log)
     excess_m2 = np.full(len(patches), EXCESS_BOUNDS_M[0] ** 2)
     robust_weight = np.ones(len(patches))
     residual_m = misclosure_m
     solution: Solution | None = None
     for iteration in range(MAX_ITERATIONS):
+        if iteration == WARMUP_ITERATIONS and solution is not None:
+            motion = beam_motion(patches.jacobian.params, solution.estimate, reference)
+            responses_m = response_design(patches, equations.state_effect(motion))
+            equations = NormalEquations(
+                patches.jacobian, change.design, misclosure_m, prior, log, responses_m
+            )
         previous, previous_m = solution, residual_m
         weight = robust_weight / (patches.variance_m2 + excess_m2)
         reduced = equations.reduce(weight)
@@ -232,7 +227,7 @@ def _estimate(
                 break
     assert solution is not None  # noqa: S101 - the loop runs at least once
     mean_change_m = change.mean_m(solution.change_m)
-    return _Estimation(equations, reduced, solution, weight, residual_m, robust_weight, mean_change_m)
+    return _Estimation(equations, reduced, solution, weight, robust_weight, mean_change_m)
 
 
 def _mean_sigma(patches: Patches, moving: Bools, posterior: Posterior) -> float:
@@ -245,23 +240,17 @@ def _mean_sigma(patches: Patches, moving: Bools, posterior: Posterior) -> float:
     return float(np.sqrt(max(variance_m2, 0.0)))
 
 
-def _state(params: ParameterLayout, estimate: Floats, reduced: ReducedNormals) -> Floats:
-    """Return the state by line group (u,) from the unknowns (m,)."""
-    state = expand_rows(params, estimate[: len(params.names), None])[:, 0]
-    state[len(GLOBAL) : len(GLOBAL) + params.line_groups] += reduced.back_substitute(estimate)
-    return np.asarray(state)
-
-
 def _state_and_log(
     params: ParameterLayout, estimate: Floats, reduced: ReducedNormals, log: LineInclination | None
 ) -> tuple[Floats, Floats]:
     """Return the state by line group (u,), and the predicted log (lines,) [rad], free of errors."""
-    state = _state(params, estimate, reduced)
+    state = expand_rows(params, estimate[: len(params.names), None])[:, 0]
     lines = slice(len(GLOBAL), len(GLOBAL) + params.line_groups)
+    state[lines] += reduced.back_substitute(estimate)
     predicted_rad = sight_tilt_of(params.line_azimuth_rad) @ state[:2] + state[lines]
     if log is not None and log.reference_tilt is not None:
         predicted_rad += log.reference_tilt.sight_tilt_rad @ estimate[log.reference_columns(params)]
-    return state, np.asarray(predicted_rad)
+    return np.asarray(state), np.asarray(predicted_rad)
 
 
 def _residual_variance(patches: Patches, residual_m: Floats, kind: Ints) -> Floats:

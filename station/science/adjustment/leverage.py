@@ -51,7 +51,7 @@ def _bisect_slack(
         patches.jacobian.aggregate(mean), patches.jacobian.aggregate_by_line(mean)
     )
     full_effect_m2 = equations.effect(unknowns, line_tilt_rad)
-    unknowns[equations.size :] = 0.0  # drop the share absorbed by the change
+    unknowns[len(patches.jacobian.params.names) :] = 0.0  # drop what change and responses absorb
     state_effect_m2 = equations.effect(unknowns, line_tilt_rad)
     target_m2 = mean @ (patches.variance_m2 * weight * full_effect_m2)
     cell_m2 = patches.variance_m2 * patches.cell_count

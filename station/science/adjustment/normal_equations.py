@@ -1,7 +1,8 @@
 """Normal equations of one scan: its patches, its inclination log and the prior of its state.
 
 The line tilts are eliminated (Schur complement) and recovered by back-substitution. The unknowns that remain
-are the state by knots, the error modes of the inclination log and the change of moving ground.
+are the state by knots, the error modes of the inclination log, the response of rough ground and the change
+of moving ground.
 Source: equations.md, 6.3.
 """
 
@@ -130,9 +131,11 @@ class ReducedNormals:
 
 
 class NormalEquations:
-    """Normal equations of m unknowns: state by knots, systematic errors of the log, change of moving ground.
+    """Normal equations of m unknowns: state by knots, errors of the log, responses, change of moving ground.
 
-    The line tilts are unknowns too, but `reduce` eliminates them.
+    The line tilts are unknowns too, but `reduce` eliminates them. `response_design_m` (n, k) is the effect of
+    one sigma of each response on the patches (`ground_response.response_design`); None for none. The first
+    `size` unknowns are not change.
     """
 
     def __init__(
@@ -142,21 +145,20 @@ class NormalEquations:
         misclosure_m: Floats,
         prior: StatePrior,
         log: LineInclination | None,
+        response_design_m: sparse.csr_array | None = None,
     ) -> None:
         params = jacobian.params
         state_design, state_size = jacobian.to_sparse(), len(prior.knot_covariance)
         self._patch_count = len(jacobian)
         self._line_effect, self._line, self._misclosure = jacobian.sight_tilt, jacobian.line, misclosure_m
         mode_count = 0 if log is None else log.all_modes.shape[1]
-        self.size = state_size + mode_count
-        self._design = sparse.hstack(
-            [state_design, sparse.csr_array((len(jacobian), mode_count)), change_design], format="csr"
-        )
+        modes = sparse.csr_array((len(jacobian), mode_count))
+        responses = sparse.csr_array((len(jacobian), 0)) if response_design_m is None else response_design_m
+        self.size = state_size + mode_count + responses.shape[1]
+        self._design = sparse.hstack([state_design, modes, responses, change_design], format="csr")
         self._log_weight = np.empty(0)
         if log is not None:
-            self._add_log(
-                log, interpolate_to_lines(params, np.eye(params.sight_tilt_knots)), params.line_azimuth_rad
-            )
+            self._add_log(log, params)
         self._precision = np.zeros((self._design.shape[1],) * 2)
         self._precision[range(state_size, self.size), range(state_size, self.size)] = 1.0
         self._add_prior(prior, log)
@@ -186,15 +188,16 @@ class NormalEquations:
         )
         self._precision[columns, columns] += reference_tilt.state.T @ cross_precision
 
-    def _add_log(self, log: LineInclination, interpolation: Floats, azimuth_rad: Floats) -> None:
+    def _add_log(self, log: LineInclination, params: ParameterLayout) -> None:
         """Append the inclination log of each line group as further observations."""
-        design = np.zeros((len(interpolation), self._design.shape[1]))
-        design[:, :2] = sight_tilt_of(azimuth_rad)
-        design[:, len(GLOBAL) : len(GLOBAL) + interpolation.shape[1]] = interpolation
-        design[:, self.size - log.all_modes.shape[1] : self.size] = log.all_modes
+        design = np.zeros((params.line_groups, self._design.shape[1]))
+        knots, first_mode = params.knot_slices[0], len(params.names)
+        design[:, :2] = sight_tilt_of(params.line_azimuth_rad)
+        design[:, knots] = interpolate_to_lines(params, np.eye(params.sight_tilt_knots))
+        design[:, first_mode : first_mode + log.all_modes.shape[1]] = log.all_modes
         self._design = sparse.vstack([self._design, sparse.csr_array(design)], format="csr")
-        self._line_effect = np.concatenate([self._line_effect, np.ones(len(interpolation))])
-        self._line = np.concatenate([self._line, np.arange(len(interpolation))])
+        self._line_effect = np.concatenate([self._line_effect, np.ones(len(design))])
+        self._line = np.concatenate([self._line, np.arange(len(design))])
         self._misclosure = np.concatenate([self._misclosure, log.sight_tilt_rad])
         self._log_weight = log.weight
 
@@ -211,22 +214,10 @@ class NormalEquations:
             + (self._design_transposed @ weighted_design).toarray()
             - line_tilt.quadratic_form(coupling)
         )
-        rhs, line_rhs = self._right_hand_sides(weight * self._misclosure, line_tilt, coupling)
-        return ReducedNormals(normal, rhs, line_tilt, coupling, line_rhs)
-
-    def of_errors(self, reduced: ReducedNormals, weight: Floats, error_m: Floats) -> ReducedNormals:
-        """Return the equations whose solution is the shift that errors of patches (n,) cause [m]."""
-        weighted = np.concatenate([weight * error_m, np.zeros(len(self._log_weight))])
-        rhs, line_rhs = self._right_hand_sides(weighted, reduced.line_tilt, reduced.coupling)
-        return replace(reduced, rhs=rhs, line_rhs=line_rhs)
-
-    def _right_hand_sides(
-        self, weighted: Floats, line_tilt: LineTiltPosterior, coupling: sparse.csr_array
-    ) -> tuple[Floats, Floats]:
-        """Return the right-hand sides (m,) and (lines,) of weighted misclosures of patches and log."""
+        weighted = weight * self._misclosure
         line_rhs = np.asarray(self._line_design_transposed @ weighted)
-        eliminated = coupling.T @ line_tilt.apply(line_rhs[:, None])[:, 0]
-        return self._design_transposed @ weighted - eliminated, line_rhs
+        rhs = self._design_transposed @ weighted - coupling.T @ line_tilt.apply(line_rhs[:, None])[:, 0]
+        return ReducedNormals(normal, rhs, line_tilt, coupling, line_rhs)
 
     def mean_jtj(self, state_size: int) -> Floats:
         """Return the mean of JᵀJ over the patches (state_size, state_size), for the first unknowns."""

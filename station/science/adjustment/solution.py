@@ -163,13 +163,6 @@ class Solution:
         normal, rhs = self._reduced.normal[:state_size], self._reduced.rhs[:state_size]
         return np.concatenate([self._state_factor.solve(rhs - normal[:, state_size:] @ change_m), change_m])
 
-    @property
-    def factor(self) -> ScaledCholesky:
-        """Factored normal matrix (m, m) with the most likely model."""
-        normal, first = self._reduced.normal.copy(), self._state_size
-        normal[first:, first:] += self._change.precision_at(self.model)[0]
-        return ScaledCholesky(normal)
-
     def mixture(self) -> Mixture:
         """Return the mixture of all models that are not negligible."""
         models = self._likely_models()

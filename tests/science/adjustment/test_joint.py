@@ -392,6 +392,12 @@ def adjusted_tilt(tilt_deg, reference_deg, response_error, ratio, ground_class=G
     return adjust_scan(patches, NO_TILT, knot_prior(PARAMS), None, reference=reference)
 
 
+def variance_by_response(rough, smooth, cells):
+    """What the response of rough ground adds to the variance of cells (n,) [m²]."""
+    of_rough, of_smooth = (cells.variance(each.to_shared_parameters()) for each in (rough, smooth))
+    return of_rough - of_smooth
+
+
 @pytest.mark.parametrize(
     ("tilt_deg", "reference_deg", "ratio", "expected_m"),
     [
@@ -403,38 +409,35 @@ def adjusted_tilt(tilt_deg, reference_deg, response_error, ratio, ground_class=G
     ],
 )
 def test_rough_ground_adds_its_response_to_a_tilt_against_the_reference(
-    tilt_deg, reference_deg, ratio, expected_m
+    monkeypatch, tilt_deg, reference_deg, ratio, expected_m
 ):
-    """All of it, if its common part is 0.65 of it; smooth ground adds nothing."""
+    """All of it, if all of it is in common; smooth ground adds nothing."""
+    monkeypatch.setattr(ground_response, "COMMON_RESPONSE_ERROR", 1.0)
     ahead = tuple(np.array([1500 * value]) for value in (math.sin(AHEAD_RAD), math.cos(AHEAD_RAD), 0.0))
     cells = Sites(np.zeros(1, int), np.zeros(1, int), ahead, np.zeros(1), np.zeros(1)).jacobian()
     rough, smooth = (adjusted_tilt(tilt_deg, reference_deg, 0.0, value) for value in (ratio, 0.0))
-    _, common, *_ = rough.response_shifts
-    assert abs(replace(rough, estimate=common / 0.65).effect(cells)[0]) == pytest.approx(
-        expected_m, rel=0.1, abs=2e-4
-    )
-    assert not smooth.response_shifts.any()
+    added_m2 = float(variance_by_response(rough, smooth, cells)[0])
+    assert math.sqrt(max(added_m2, 0.0)) == pytest.approx(expected_m, rel=0.1, abs=2e-4)
 
 
-@pytest.mark.parametrize(("stable_share", "row"), [(1.0, 1), (0.0, 0)])
-def test_shift_by_the_response_is_the_error_that_such_ground_causes(stable_share, row):
+@pytest.mark.parametrize("ground_class", [GroundClass.STABLE, GroundClass.MOVING])
+@pytest.mark.parametrize("common", [1.0, 0.0])
+def test_sigma_has_the_error_that_the_response_of_all_ground_causes(monkeypatch, ground_class, common):
     """Ground that responds by one sigma less, against ground that responds as modelled.
 
-    One sigma of all ground of a kind is 0.65 of it in common, or the rest in every sector.
+    One sigma of all ground is that of a response in common; if each sector has its own, it is one of each.
     """
-    ground_class = np.where(np.arange(600) < 600 * stable_share, GroundClass.STABLE, GroundClass.MOVING)
-    modelled, less = (
-        adjusted_tilt(0.008, 0.0, response_error, 0.1, ground_class) for response_error in (0.0, 0.02)
+    monkeypatch.setattr(ground_response, "COMMON_RESPONSE_ERROR", common)
+    monkeypatch.setattr(ground_response, "RESPONSE_SECTOR_RAD", 2 * math.pi)
+    modelled, less, smooth = (
+        adjusted_tilt(0.008, 0.0, response_error, ratio, ground_class)
+        for response_error, ratio in ((0.0, 0.1), (0.02, 0.0), (0.0, 0.0))
     )
     cells = random_sites(4, 100, steep=0.05).jacobian()
-    caused_m = less.effect(cells) - modelled.effect(cells)
-    by_sector = modelled.response_shifts[2:].sum(axis=0) / math.sqrt(1 - 0.65**2)
-    for shift in (modelled.response_shifts[row] / 0.65, by_sector):
-        stated_m = replace(modelled, estimate=shift).effect(cells)
-        assert -stated_m == pytest.approx(caused_m, abs=0.05 * np.abs(caused_m).max())
-    other_m = replace(modelled, estimate=modelled.response_shifts[1 - row]).effect(cells)
+    caused_m = less.effect(cells) - smooth.effect(cells)
     assert np.abs(caused_m).max() > 0.005
-    assert np.abs(other_m).max() < 1e-9
+    stated_m2 = variance_by_response(modelled, smooth, cells)
+    assert stated_m2 == pytest.approx(caused_m**2, abs=0.1 * np.max(caused_m**2))
 
 
 def test_sigma_has_the_errors_that_responses_of_sectors_cause():
@@ -739,7 +742,7 @@ def test_a_state_that_the_prior_does_not_expect_is_estimated_with_a_wider_one():
     expected = adjust_scan(patches, NO_TILT, wide, None)
     found = adjust_scan(patches, NO_TILT, knot_prior(PARAMS), None, wider=wider)
     assert asked[0][0] == pytest.approx(narrow.estimate[0], rel=0.1)
-    for name in ("estimate", "covariance", "sigma", "redundancy", "response_shifts", "change_size_m"):
+    for name in ("estimate", "covariance", "sigma", "redundancy", "change_size_m"):
         assert_allclose(getattr(found, name), getattr(expected, name), rtol=1e-10)
     assert abs(narrow.estimate[0] - state[0]) > 4 * narrow.sigma[0]
     assert abs(found.estimate[0] - state[0]) < 2 * found.sigma[0]
