@@ -185,6 +185,13 @@ class BilinearSurface:
             + cell_means(self.height_above_datum_m[window])[rows.start - window.start :][: _row_count(rows)]
         )
 
+    def cell_gradients(self, rows: slice) -> tuple[Floats, Floats]:
+        """Mean eastward and northward gradient over each cell (r, nx) of the given rows [1]."""
+        window = _with_neighbours(rows)
+        inner = slice(rows.start - window.start, rows.stop - window.start)
+        east, north = cell_gradients(self.height_above_datum_m[window], self.grid.cell_m)
+        return east[inner], north[inner]
+
     def _corners(self, column: Floats, row: Floats) -> tuple[Reals, ...]:
         """Return heights of the nodes nw, ne, sw, se of points (n,), and their offset from nw [cells]."""
         nx, ny = self.grid.nx, self.grid.ny
@@ -203,9 +210,26 @@ class BilinearSurface:
 
 def cell_means(nodes: Floats | Floats32) -> Floats:
     """Mean over each cell (ny, nx) of the surface that is bilinear between the nodes at cell centres."""
-    padded = np.pad(np.asarray(nodes, dtype=np.float64), 1, mode="reflect", reflect_type="odd")
-    rows = (padded[:-2] + 6 * padded[1:-1] + padded[2:]) / 8
-    return np.asarray((rows[:, :-2] + 6 * rows[:, 1:-1] + rows[:, 2:]) / 8)
+    return _mean_along(_mean_along(_with_border(nodes), 0), 1)
+
+
+def cell_gradients(nodes: Floats | Floats32, cell_m: float) -> tuple[Floats, Floats]:
+    """Mean eastward and northward gradient over each cell (ny, nx) [1] of the surface of `cell_means`."""
+    padded = _with_border(nodes)
+    rows, columns = _mean_along(padded, 0), _mean_along(padded, 1)
+    east, north = rows[:, 2:] - rows[:, :-2], columns[:-2] - columns[2:]
+    return east / (2 * cell_m), north / (2 * cell_m)
+
+
+def _with_border(nodes: Floats | Floats32) -> Floats:
+    """Return nodes with another row and column on each side, extrapolated."""
+    return np.pad(np.asarray(nodes, dtype=np.float64), 1, mode="reflect", reflect_type="odd")
+
+
+def _mean_along(nodes: Floats, axis: int) -> Floats:
+    """Return means over cells, along one axis, of values that are linear between nodes; two cells fewer."""
+    across = nodes.swapaxes(0, axis)
+    return np.asarray((across[:-2] + 6 * across[1:-1] + across[2:]) / 8).swapaxes(0, axis)
 
 
 def known_cell_means(nodes: Floats | Floats32, rows: slice, columns: slice) -> Floats:

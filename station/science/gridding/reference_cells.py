@@ -93,6 +93,7 @@ def cell_arrays(
     gradient = smooth_gradient(window_m, grid.cell_m, rows=inner)
     neighbours_known = ndimage.binary_erosion(np.isfinite(window_m), np.ones((3, 3), bool), border_value=1)
     east, north = (np.nan_to_num(raster[known].astype(np.float64)) for raster in gradient)
+    surface_east, surface_north = surface.cell_gradients(rows)  # what residuals change by
     x_m, y_m, height_m = grid.x_m[column], grid.y_m[rows][row], surface.cell_means(rows)[known]
     cell_class = np.where(stable[known], CellClass.STABLE, 0) | np.where(
         ground_classes.is_holdout(x_m, y_m), CellClass.HOLDOUT, 0
@@ -137,8 +138,8 @@ def cell_arrays(
         "cell": (rows.start + row) * grid.nx + column,
         "height_m": height_m - surface.datum_m,
         "mean_residual_m": reference.mean_residual_m[rows][known],
-        "east_gradient": east,
-        "north_gradient": north,
+        "east_gradient": surface_east[known],
+        "north_gradient": surface_north[known],
         "knot_position": knot_position,
         "shot_m2": shot_m2,
         "point_variance_m2": point_variance_m2,

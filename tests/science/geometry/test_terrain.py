@@ -1,10 +1,11 @@
 """Gradients, normals and smoothing of a surface, and its height between the cell centres."""
 
+import itertools
 import math
 
 import numpy as np
 import pytest
-from scipy import ndimage
+from scipy import interpolate, ndimage
 
 from station.quantities import Grid, Reference
 from station.science.geometry import beam, terrain
@@ -99,6 +100,37 @@ def test_cell_means_of_a_window_are_those_of_the_whole_surface_that_shots_see():
         across, down = (grid.ravel() for grid in np.meshgrid(column + offset, row + rows.start + offset))
         expected[row, column] = surface.height(across, down).mean()
     np.testing.assert_allclose(actual, expected, atol=2e-4)
+
+
+@pytest.mark.parametrize(("axis", "step_m"), [(0, (0.1, 0.0)), (1, (0.0, 0.1))])
+def test_residuals_of_displaced_points_change_by_the_gradients_of_cells(axis, step_m):
+    """Points all over cells of fractal relief with a gap, displaced by 0.1 m: by SciPy's interpolation.
+
+    A gradient smoothed over 1.5 cells is too small for that.
+    """
+    rng, grid = np.random.default_rng(7), Grid(0.0, 400.0, 4.0, 90, 100)
+    frequency = np.hypot(*np.meshgrid(np.fft.fftfreq(grid.nx), np.fft.fftfreq(grid.ny)))
+    spectrum = np.fft.fft2(rng.normal(size=grid.shape)) / np.maximum(frequency, 1 / 100) ** 1.8
+    nodes = np.fft.ifft2(spectrum).real
+    nodes *= 10.0 / nodes.std()
+    nodes[40:50, 20:30] = np.nan
+    surface = terrain.bilinear_surface(Reference.from_elevation(grid, "1", nodes))
+    parts = [surface.cell_gradients(rows)[axis] for rows in (slice(0, 37), slice(37, 100))]
+    extended = np.where(np.isfinite(nodes), nodes, surface.height_above_datum_m + surface.datum_m)
+    height_m = interpolate.RegularGridInterpolator((-grid.y_m, grid.x_m), extended, bounds_error=False)
+    x_m, y_m = np.meshgrid(grid.x_m, grid.y_m)
+    change_m, offset_m = np.zeros(grid.shape), 4.0 * (np.arange(16) + 0.5) / 16 - 2.0
+    for east_m, north_m in itertools.product(offset_m, offset_m):
+        ahead, behind = (
+            (-(y_m + north_m + side * step_m[1] / 2), x_m + east_m + side * step_m[0] / 2) for side in (1, -1)
+        )
+        change_m += height_m(ahead) - height_m(behind)
+    inside = np.isfinite(nodes)
+    inside[[0, -1]] = inside[:, [0, -1]] = False  # points of the others leave the grid
+    expected = change_m[inside] / len(offset_m) ** 2 / 0.1
+    np.testing.assert_allclose(np.concatenate(parts)[inside], expected, atol=0.01 * np.std(expected))
+    smooth = terrain.smooth_gradient(nodes, grid.cell_m)[axis][inside]
+    assert np.sum(smooth * expected) / np.sum(smooth**2) > 1.1
 
 
 def test_cell_means_of_a_curved_surface_and_nodes_from_them():
