@@ -107,7 +107,6 @@ def make_adjustment(estimate, covariance, log):
         log,
         predicted_rad,
         np.zeros(3),
-        np.zeros((2, len(estimate))),
     )
 
 
