@@ -156,8 +156,9 @@ def test_reference_from_scans_equals_the_truth_within_its_uncertainty():
             reference = centre_reference(reference, stack, position_m, components)
         else:
             reference = build_surface(
-                stack, reference, None, position_m, "1", ("a",), np.zeros(1), components
+                stack, reference, None, position_m, "1", ("a",), np.array([0.0, 7200.0]), components
             )
+    assert reference.time_s == 3600.0
     measured = [process_shots(shots, reference)[0] for shots in scans]
     mean_m = np.nanmean([scan.change_m for scan in measured], axis=0)
     sigma_m = np.nanmax([scan.random_uncertainty_m for scan in measured], axis=0)

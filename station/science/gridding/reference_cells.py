@@ -93,7 +93,7 @@ def cell_arrays(
     gradient = smooth_gradient(window_m, grid.cell_m, rows=inner)
     neighbours_known = ndimage.binary_erosion(np.isfinite(window_m), np.ones((3, 3), bool), border_value=1)
     east, north = (np.nan_to_num(raster[known].astype(np.float64)) for raster in gradient)
-    surface_east, surface_north = surface.cell_gradients(rows)  # what residuals change by
+    surface_east, surface_north = surface.cell_gradients(rows)  # of what residuals are relative to
     x_m, y_m, height_m = grid.x_m[column], grid.y_m[rows][row], surface.cell_means(rows)[known]
     cell_class = np.where(stable[known], CellClass.STABLE, 0) | np.where(
         ground_classes.is_holdout(x_m, y_m), CellClass.HOLDOUT, 0
