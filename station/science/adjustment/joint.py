@@ -191,7 +191,8 @@ def _estimate(
     """Return the estimate by iteration.
 
     Residual variances, rejection and the size of change depend on it, and the response of ground on how far
-    the beams have moved.
+    the beams have moved. At first a deposit is rejected by its height above the median change: the model
+    follows it in part, and takes the change of all other ground for as rough.
     """
     equations = NormalEquations(patches.jacobian, change.design, misclosure_m, prior, log)
     excess_m2 = np.full(len(patches), EXCESS_BOUNDS_M[0] ** 2)
@@ -213,10 +214,13 @@ def _estimate(
         residual_m = misclosure_m - equations.effect(
             solution.estimate, reduced.back_substitute(solution.estimate)
         )
-        excess_m2 = _residual_variance(patches, residual_m, change.kind)
+        excess_m2 = _residual_variance(patches, residual_m, change.kind, robust_weight)
         if iteration >= WARMUP_ITERATIONS:
-            ratio = residual_m / np.sqrt(patches.variance_m2 + excess_m2) / TUKEY
-            robust_weight = np.where(np.abs(ratio) < 1, (1 - ratio**2) ** 2, 0.0)
+            robust_weight = _tukey_weight(residual_m, patches.variance_m2 + excess_m2)
+            if iteration == WARMUP_ITERATIONS:
+                deviation_m = change.about_median_m(residual_m, solution.change_m)
+                spread_m2 = _residual_variance(patches, deviation_m, change.kind, robust_weight)
+                robust_weight[_tukey_weight(deviation_m, patches.variance_m2 + spread_m2) == 0.0] = 0.0
             update_m = np.linalg.norm(residual_m - previous_m)
             same_model = (
                 previous is not None
@@ -228,6 +232,12 @@ def _estimate(
     assert solution is not None  # noqa: S101 - the loop runs at least once
     mean_change_m = change.mean_m(solution.change_m)
     return _Estimation(equations, reduced, solution, weight, robust_weight, mean_change_m)
+
+
+def _tukey_weight(residual_m: Floats, variance_m2: Floats) -> Floats:
+    """Return the weights (n,) of residuals by Tukey's biweight, 0 to 1."""
+    ratio = residual_m / np.sqrt(variance_m2) / TUKEY
+    return np.where(np.abs(ratio) < 1, (1 - ratio**2) ** 2, 0.0)
 
 
 def _mean_sigma(patches: Patches, moving: Bools, posterior: Posterior) -> float:
@@ -253,21 +263,21 @@ def _state_and_log(
     return np.asarray(state), np.asarray(predicted_rad)
 
 
-def _residual_variance(patches: Patches, residual_m: Floats, kind: Ints) -> Floats:
+def _residual_variance(patches: Patches, residual_m: Floats, kind: Ints, robust_weight: Floats) -> Floats:
     """Return the residual variance (n,) of patches beyond their cells' random errors [m²], by kind of ground.
 
     Change that is not smooth shifts several patches together; they count as a single observation. It is that
-    of one kind: where ice melts, rock beside it does not show by how much ice differs from a trend.
+    of one kind: where ice melts, rock beside it does not show by how much ice differs from a trend. A deposit
+    shifts patches together too: those that are rejected do not show how alike the errors of others are.
     """
     excess_m2 = np.empty(len(patches))
     for index in range(STABLE + 1):
         selected, max_m = kind == index, EXCESS_BOUNDS_M[1] if index == STABLE else MAX_MOVING_EXCESS_M
         if selected.any():
             single_m2 = _excess_variance(residual_m[selected], patches.variance_m2[selected], max_m)
-            sigma_m = np.sqrt(patches.variance_m2[selected] + single_m2)
-            excess_m2[selected] = single_m2 * _effective_group_size(
-                patches.take(selected), residual_m[selected] / sigma_m
-            )
+            accepted = selected & (robust_weight > 0)
+            ratio = residual_m[accepted] / np.sqrt(patches.variance_m2[accepted] + single_m2)
+            excess_m2[selected] = single_m2 * _effective_group_size(patches.take(accepted), ratio)
     return excess_m2
 
 
@@ -293,6 +303,8 @@ def _effective_group_size(patches: Patches, ratio: Floats) -> float:
 
     It is the correlation length over line groups times that over range bins, at most `MAX_GROUP_SIZE`.
     """
+    if not len(patches):
+        return 1.0
     table = np.full((patches.jacobian.params.line_groups, int(patches.range_bin.max()) + 1), np.nan)
     table[patches.jacobian.line, patches.range_bin] = np.clip(ratio, -3, 3)
     return min(_correlation_length(table, 20) * _correlation_length(table.T, 3), MAX_GROUP_SIZE)
