@@ -214,13 +214,14 @@ def _estimate(
         residual_m = misclosure_m - equations.effect(
             solution.estimate, reduced.back_substitute(solution.estimate)
         )
-        excess_m2 = _residual_variance(patches, residual_m, change.kind, robust_weight)
+        excess_m2 = _residual_variance(patches, residual_m, change.kind)
         if iteration >= WARMUP_ITERATIONS:
-            robust_weight = _tukey_weight(residual_m, patches.variance_m2 + excess_m2)
+            robust_weight = _tukey_weight(residual_m / np.sqrt(patches.variance_m2 + excess_m2))
             if iteration == WARMUP_ITERATIONS:
                 deviation_m = change.about_median_m(residual_m, solution.change_m)
-                spread_m2 = _residual_variance(patches, deviation_m, change.kind, robust_weight)
-                robust_weight[_tukey_weight(deviation_m, patches.variance_m2 + spread_m2) == 0.0] = 0.0
+                spread_m2 = _residual_variance(patches, deviation_m, change.kind)
+                deviation = deviation_m / np.sqrt(patches.variance_m2 + spread_m2)
+                robust_weight[np.abs(deviation) >= TUKEY] = 0.0
             update_m = np.linalg.norm(residual_m - previous_m)
             same_model = (
                 previous is not None
@@ -234,10 +235,9 @@ def _estimate(
     return _Estimation(equations, reduced, solution, weight, robust_weight, mean_change_m)
 
 
-def _tukey_weight(residual_m: Floats, variance_m2: Floats) -> Floats:
-    """Return the weights (n,) of residuals by Tukey's biweight, 0 to 1."""
-    ratio = residual_m / np.sqrt(variance_m2) / TUKEY
-    return np.where(np.abs(ratio) < 1, (1 - ratio**2) ** 2, 0.0)
+def _tukey_weight(ratio: Floats) -> Floats:
+    """Return the weights (n,) of residuals over their sigma by Tukey's biweight, 0 to 1."""
+    return np.where(np.abs(ratio) < TUKEY, (1 - (ratio / TUKEY) ** 2) ** 2, 0.0)
 
 
 def _mean_sigma(patches: Patches, moving: Bools, posterior: Posterior) -> float:
@@ -263,21 +263,19 @@ def _state_and_log(
     return np.asarray(state), np.asarray(predicted_rad)
 
 
-def _residual_variance(patches: Patches, residual_m: Floats, kind: Ints, robust_weight: Floats) -> Floats:
+def _residual_variance(patches: Patches, residual_m: Floats, kind: Ints) -> Floats:
     """Return the residual variance (n,) of patches beyond their cells' random errors [m²], by kind of ground.
 
     Change that is not smooth shifts several patches together; they count as a single observation. It is that
-    of one kind: where ice melts, rock beside it does not show by how much ice differs from a trend. A deposit
-    shifts patches together too: those that are rejected do not show how alike the errors of others are.
+    of one kind: where ice melts, rock beside it does not show by how much ice differs from a trend.
     """
     excess_m2 = np.empty(len(patches))
     for index in range(STABLE + 1):
         selected, max_m = kind == index, EXCESS_BOUNDS_M[1] if index == STABLE else MAX_MOVING_EXCESS_M
         if selected.any():
             single_m2 = _excess_variance(residual_m[selected], patches.variance_m2[selected], max_m)
-            accepted = selected & (robust_weight > 0)
-            ratio = residual_m[accepted] / np.sqrt(patches.variance_m2[accepted] + single_m2)
-            excess_m2[selected] = single_m2 * _effective_group_size(patches.take(accepted), ratio)
+            ratio = residual_m[selected] / np.sqrt(patches.variance_m2[selected] + single_m2)
+            excess_m2[selected] = single_m2 * _effective_group_size(patches.take(selected), ratio)
     return excess_m2
 
 
@@ -301,12 +299,11 @@ def _excess_variance(residual_m: Floats, variance_m2: Floats, max_m: float) -> f
 def _effective_group_size(patches: Patches, ratio: Floats) -> float:
     """Return the number of patches that share one error.
 
-    It is the correlation length over line groups times that over range bins, at most `MAX_GROUP_SIZE`.
+    It is the correlation length over line groups times that over range bins, at most `MAX_GROUP_SIZE`; a
+    deposit, whose patches err alike, does not count.
     """
-    if not len(patches):
-        return 1.0
     table = np.full((patches.jacobian.params.line_groups, int(patches.range_bin.max()) + 1), np.nan)
-    table[patches.jacobian.line, patches.range_bin] = np.clip(ratio, -3, 3)
+    table[patches.jacobian.line, patches.range_bin] = ratio * _tukey_weight(ratio)
     return min(_correlation_length(table, 20) * _correlation_length(table.T, 3), MAX_GROUP_SIZE)
 
 
