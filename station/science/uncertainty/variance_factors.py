@@ -35,8 +35,8 @@ CORRELATED_BLOCKS = 9.0  # blocks that share their systematic error: it varies o
 PRIOR_BLOCKS = 3.0  # weight of the model, in independent blocks
 PRIOR_PAIRS = 10.0  # weight of independent cells against pairs of neighbouring blocks
 FACTOR_BOUNDS = (0.01, 100.0)  # random
-# Upper bound of the variance of means of cells on ground that may have changed, over what points within cells
-# show: on unchanged ground it is 1.3 at most (equations.md, 6.7); more is change, as by drifts of snow.
+# Variance of means of cells over what points within cells show: on unchanged ground it is 1.3 at most. More
+# than this is change, as by drifts of snow (equations.md, 6.7).
 MAX_SCATTER_RATIO = 3.0
 MAX_POINT_SCATTER = 25.0  # of the points of one cell over their modelled variance; more is an edge
 MAX_SYSTEMATIC_FACTOR = 100.0
@@ -160,30 +160,27 @@ def _factors_by_class(
     stable_count = np.bincount(at_any_count[stable], minlength=NOISE_CLASSES)[at_any_count]
     needs_moving = (stable_count < MIN_STABLE_CELLS)[residuals.noise_class]
     of_cells = classes[residuals.noise_class]
-    factors, upper_bounds = prior.copy(), _moving_upper_bounds(residuals, of_cells, NOISE_CLASSES)
+    factors, of_points = prior.copy(), _point_factors(residuals, of_cells, NOISE_CLASSES)
     order = np.argsort(of_cells, kind="stable")
     order = order[(usable & (residuals.stable | needs_moving))[order]]
     edges = np.searchsorted(of_cells[order], np.arange(NOISE_CLASSES + 1))
     for index in np.flatnonzero(np.diff(edges) >= MIN_CLASS_CELLS):
         members, same = order[edges[index] : edges[index + 1]], classes == index
-        upper_bound = FACTOR_BOUNDS[1]
-        if needs_moving[members[0]]:
-            upper_bound = max(upper_bounds[index], FACTOR_BOUNDS[0])
         reference_share = float(residuals.reference_m2[members].sum() / residuals.scan_m2[members].sum())
         variance = robust_scale(ratio[members]) ** 2
         variance += (variance - 1) * reference_share
         weighted = len(members) * variance + PRIOR_CELLS * prior[same]
-        factors[same] = np.clip(weighted / (len(members) + PRIOR_CELLS), FACTOR_BOUNDS[0], upper_bound)
+        factor = weighted / (len(members) + PRIOR_CELLS)
+        if needs_moving[members[0]]:
+            factor = np.where(factor > MAX_SCATTER_RATIO * of_points[index], of_points[index], factor)
+        factors[same] = np.clip(factor, *FACTOR_BOUNDS)
     return factors
 
 
-def _moving_upper_bounds(
-    residuals: Residuals, all_classes: NDArray[np.integer[Any]], class_count: int
-) -> Floats:
-    """Return the upper bound of the factor of moving ground by class (k,).
+def _point_factors(residuals: Residuals, all_classes: NDArray[np.integer[Any]], class_count: int) -> Floats:
+    """Return the factor (k,) of moving ground by class that the points within its cells show.
 
-    It comes from the scatter of points within cells; for classes with little of it, from that of all moving
-    ground.
+    Classes with little of it have that of all moving ground.
     """
     moving = ~residuals.stable & (residuals.freedom > 0)
     freedom, classes = residuals.freedom[moving].astype(np.float64), all_classes[moving]
@@ -191,10 +188,10 @@ def _moving_upper_bounds(
     scatter = np.minimum(ratio, MAX_POINT_SCATTER) * freedom
     total = freedom.sum()
     if total < MIN_CLASS_CELLS:
-        return np.full(class_count, FACTOR_BOUNDS[1])
+        return np.full(class_count, np.inf)
     of_class, weight = (np.bincount(classes, values, class_count) for values in (scatter, freedom))
     of_all = scatter.sum() / total
-    return np.asarray(MAX_SCATTER_RATIO * (of_class + MIN_CLASS_CELLS * of_all) / (weight + MIN_CLASS_CELLS))
+    return np.asarray((of_class + MIN_CLASS_CELLS * of_all) / (weight + MIN_CLASS_CELLS))
 
 
 def _systematic_factor(residuals: Residuals, random: Floats32) -> float:
