@@ -17,7 +17,12 @@ from station.quantities import (
 )
 from station.science.adjustment.line_tilt import LineTiltPrior
 from station.science.adjustment.normal_equations import LineInclination, StatePrior
-from station.science.geometry.cyclic_error import NO_CYCLIC_ERROR, CyclicError
+from station.science.geometry.cyclic_error import (
+    CYCLIC_CHANGE_RAD,
+    CYCLIC_CHANGE_SHARE,
+    NO_CYCLIC_ERROR,
+    CyclicError,
+)
 from station.science.geometry.inclination import SENSOR_STEP_RAD, TiltRecord
 from station.science.uncertainty.jacobian import sight_tilt_of
 from station.science.uncertainty.parameters import (
@@ -30,8 +35,6 @@ from station.science.uncertainty.propagation import condense_to_knots
 
 REFRACTION_CORRELATION_RAD = math.radians(15.0)
 RANGE_SCALE_UNKNOWN_PPM = 4.0  # no weather: 5 K and 5 hPa off, 0.737 ppm/K, 0.290 ppm/hPa, equations.md, 5.8
-CYCLIC_CHANGE_RAD = math.radians(0.002)
-CYCLIC_CHANGE_SHARE = 0.2  # of its amplitude, between scans: equations.md, 2.7
 MAX_CYCLIC_ERROR_RAD = math.radians(0.05)  # a larger wave is the mount's tilt, which does not change
 TILT_DRIFT_S = 300.0
 TILT_JITTER_S = 3.0

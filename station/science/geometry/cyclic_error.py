@@ -10,6 +10,8 @@ import numpy as np
 from station.quantities import AzimuthTrack, Floats, InclinationLog
 
 CYCLIC_ERROR_PRIOR_RAD = math.radians(0.05)  # largest cyclic error seen at Helheim, equations.md, 2.7
+CYCLIC_CHANGE_SHARE = 0.2  # of its amplitude, between scans: equations.md, 2.7
+CYCLIC_CHANGE_RAD = math.radians(0.002)  # of its shape, between scans; root two of it by cosine and by sine
 OFFSET_PRIOR_S = 2.5  # clocks differ by up to 5 s, taken as two sigma: Voordendag et al. (2023), section 3.1
 OFFSET_LARGEST_S = 600.0  # one sigma of a clock that is never set
 OFFSET_SIGMAS = 5.0  # deviation from the clock prior beyond which the log overrules it
@@ -69,9 +71,9 @@ def clock_offset(
     """Delay of the log's clock against the scan's, and its uncertainty [s].
 
     The known cyclic error is fitted to the log with free mean, amplitude and phase; phase over head speed is
-    time. Real motion of the mount looks like phase too, and is part of the uncertainty. The prior that clocks
-    agree to 5 s (two sigma) shrinks the delay where the wave is too small to determine it, unless the log
-    contradicts that prior.
+    time. Real motion of the mount looks like phase too, and so does a wave that has changed its shape: both
+    are part of the uncertainty. The prior that clocks agree to 5 s (two sigma) shrinks the delay where the
+    wave is too small to determine it, unless the log contradicts that prior.
     Source: equations.md, 2.10.
     """
     delay_s, sigma_s = 0.0, OFFSET_LARGEST_S
@@ -105,11 +107,11 @@ def _phase_delay(
     azimuth_rad = head_azimuth(track, time_s)
     speed_rad_s = np.gradient(azimuth_rad, time_s)
     cos, sin = np.cos(azimuth_rad), np.sin(azimuth_rad)
-    middle_s = np.bincount(bin_index, time_s) / count
+    middle_s, middle_rad = (np.bincount(bin_index, values) / count for values in (time_s, azimuth_rad))
     drift_rad2 = MOTION_RAD**2 * np.exp(-np.abs(np.subtract.outer(middle_s, middle_s)) / MOTION_S)
-    cholesky = np.linalg.cholesky(drift_rad2 + np.diag(sigma_rad**2 / count))
-    # Amplitude changes by ±20 % between scans, equations.md, 2.7.
-    normal = np.diag([1 / OFFSET_LARGEST_S**2, 1 / 0.2**2, 0.0, 0.0])
+    shape_rad2 = 2 * CYCLIC_CHANGE_RAD**2 * np.cos(np.subtract.outer(middle_rad, middle_rad))
+    cholesky = np.linalg.cholesky(drift_rad2 + shape_rad2 + np.diag(sigma_rad**2 / count))
+    normal = np.diag([1 / OFFSET_LARGEST_S**2, 1 / CYCLIC_CHANGE_SHARE**2, 0.0, 0.0])
     rhs = np.zeros(4)
     for axis, (tilt_rad, wave) in enumerate(((roll_rad, zero.roll_rad), (pitch_rad, zero.pitch_rad))):
         expected = wave[1] * cos + wave[2] * sin

@@ -239,6 +239,26 @@ def test_clock_offset_sigma_is_calibrated_while_the_mount_moves():
     assert 0.5 < np.sqrt(np.mean(np.square(z))) < 1.3
 
 
+def test_a_wave_that_changes_its_shape_is_not_taken_for_a_wrong_clock():
+    """Cosine and sine of each axis, of 0.01 to 0.035°, change by 0.003° (1 σ) in every scan."""
+    rng = np.random.default_rng(8)
+    wave_deg = np.array([[0.0, 0.030, 0.012], [0.0, -0.010, 0.035]])
+    time_s = np.arange(0.0, 920.0)
+    track = AzimuthTrack(time_s, 2 * np.pi * time_s / 920)
+    azimuth_rad = head_azimuth(track, time_s)
+    wrong = 0
+    for _ in range(200):
+        registered, present = (
+            CyclicError(*np.radians(wave_deg + rng.normal(0, 0.003, (2, 3)))) for _ in range(2)
+        )
+        roll, pitch = present.at(azimuth_rad)
+        noise = rng.normal(0, NOISE, (2, 920))
+        log = inclination_log(roll + noise[0], pitch + noise[1], time_s)
+        offset_s, sigma_s = clock_offset(log, track, registered, NOISE)
+        wrong += abs(offset_s) > max(4.0, 3 * sigma_s)
+    assert wrong <= 1
+
+
 def test_saturated_samples_are_removed_and_counted():
     roll = np.full(100, math.radians(3.0))
     roll[40:] = RANGE
