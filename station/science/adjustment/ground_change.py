@@ -234,16 +234,6 @@ class GroundChange:
         """Return the mean change of moving ground that an estimate (k,) shows [m]; 0 without any."""
         return float((self.design @ estimate_m)[self.moving].mean()) if self.moving.any() else 0.0
 
-    def about_median_m(self, residual_m: Floats, estimate_m: Floats) -> Floats:
-        """Return residuals (n,), in moving ground with its change (k,), about the median of each kind."""
-        deviation_m = residual_m.copy()
-        for kind in range(KINDS):
-            selected = self.kind == kind
-            if selected.any():
-                change_m = residual_m[selected] + (self.design @ estimate_m)[selected]
-                deviation_m[selected] = change_m - np.median(change_m)
-        return deviation_m
-
     def updated(self, estimate_m: Floats, heave_variance_m2: Floats) -> GroundChange:
         """Return this change with the size of heave that an estimate (k,) shows.
 

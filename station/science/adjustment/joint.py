@@ -191,8 +191,7 @@ def _estimate(
     """Return the estimate by iteration.
 
     Residual variances, rejection and the size of change depend on it, and the response of ground on how far
-    the beams have moved. At first a deposit is rejected by its height above the median change: the model
-    follows it in part, and takes the change of all other ground for as rough.
+    the beams have moved.
     """
     equations = NormalEquations(patches.jacobian, change.design, misclosure_m, prior, log)
     excess_m2 = np.full(len(patches), EXCESS_BOUNDS_M[0] ** 2)
@@ -217,11 +216,6 @@ def _estimate(
         excess_m2 = _residual_variance(patches, residual_m, change.kind)
         if iteration >= WARMUP_ITERATIONS:
             robust_weight = _tukey_weight(residual_m / np.sqrt(patches.variance_m2 + excess_m2))
-            if iteration == WARMUP_ITERATIONS:
-                deviation_m = change.about_median_m(residual_m, solution.change_m)
-                spread_m2 = _residual_variance(patches, deviation_m, change.kind)
-                deviation = deviation_m / np.sqrt(patches.variance_m2 + spread_m2)
-                robust_weight[np.abs(deviation) >= TUKEY] = 0.0
             update_m = np.linalg.norm(residual_m - previous_m)
             same_model = (
                 previous is not None
