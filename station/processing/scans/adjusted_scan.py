@@ -55,10 +55,11 @@ def grid_and_adjust(
 ) -> AdjustedScan:
     """Return a scan on the grid, adjusted to the reference as `viewing` shows it.
 
-    If the ground contradicts the inclination log, the scan is adjusted again without it.
+    If the ground contradicts the inclination log, the scan is gridded and adjusted again as if there were
+    none: its tilt, where the SOP contains that of the mount, is not applied.
     Raises ScanError if no point falls on the grid.
     """
-    scan = _adjusted_with_log(site, opened, inputs, viewing, progress)
+    scan = _adjusted(site, opened, inputs, viewing, progress)
     if scan.adjustment is None or scan.viewing is None or scan.inputs.is_given:
         return scan
     adjustment_inputs, adjustment = scan.adjustment
@@ -66,21 +67,21 @@ def grid_and_adjust(
         return scan
     check = check_log(adjustment_inputs.lines, adjustment, scan.viewing.reference)
     if check is not None and check.warnings:
-        without_log = replace(adjustment_inputs, log=None)
-        adjustment = adjust_to_reference(scan.gridder, scan.inputs.geometry, without_log, scan.viewing)
-        scan = replace(scan, adjustment=(without_log, adjustment))
+        del scan  # the memory of a worker does not hold two gridded scans
+        keep_tilt = site.inclination is not None and site.inclination.mode == "absolute"
+        scan = _adjusted(site, opened, inputs.without_log(keep_tilt=keep_tilt), viewing, progress)
     trim_heap()
     return replace(scan, log_check=check)
 
 
-def _adjusted_with_log(
+def _adjusted(
     site: Site, opened: OpenScan, inputs: ScanInputs, viewing: ViewingGeometry | None, progress: Progress
 ) -> AdjustedScan:
-    """Return a scan on the grid, adjusted to the reference with its inclination log.
+    """Return a scan on the grid, adjusted to the reference with the inclination log of its inputs, if any.
 
     If the scanner turned so far that its points lie beside the ground they hit, as after a season, they are
-    gridded a second time, at the estimated pose: ground does not respond to a
-    motion of the beams as the slope of the reference tells, so that the first estimate is off.
+    gridded a second time, at the estimated pose: ground does not respond to a motion of the beams as the
+    slope of the reference tells, so that the first estimate is off.
     """
 
     def gridded(inputs: ScanInputs) -> tuple[Gridder, int]:
@@ -100,7 +101,7 @@ def _adjusted_with_log(
     unapplied_rad = first[1].unapplied_rad
     if np.linalg.norm(unapplied_rad) <= MAX_UNAPPLIED_RAD:
         return AdjustedScan(inputs, viewing, gridder, count, first)
-    del gridder  # the memory of a worker does not hold two
+    del gridder  # as above
     rotated = inputs.rotated(unapplied_rad)
     gridder, count = gridded(rotated)
     second = adjust_scan(site, gridder, rotated, viewing)

@@ -93,6 +93,27 @@ class ScanInputs:
             adjustment_inputs=replace(self.adjustment_inputs, assumed_rad=assumed_rad),
         )
 
+    def without_log(self, *, keep_tilt: bool) -> ScanInputs:
+        """Return the inputs without an inclination log that is wrong, nor, but with `keep_tilt`, its tilt."""
+        assert self.adjustment_inputs is not None  # noqa: S101 - the scan was adjusted
+        adjustment_inputs = replace(self.adjustment_inputs, log=None)
+        if keep_tilt:
+            return replace(self, adjustment_inputs=adjustment_inputs)
+        params, lines = adjustment_inputs.params, adjustment_inputs.lines
+        return replace(
+            self,
+            pose=replace(self.pose, tilt=None),
+            log_only_covariance=partial(
+                prior.log_only_covariance,
+                params,
+                lines,
+                None,
+                NO_CYCLIC_ERROR,
+                weather_known=self.air is not None,
+            ),
+            adjustment_inputs=replace(adjustment_inputs, assumed_rad=np.zeros((3, params.line_groups))),
+        )
+
     def log_only_shared(self, components: VarianceComponents) -> SharedParameters | None:
         """Return the systematic errors of all points without an adjustment, from SOP and log."""
         return self.log_only_covariance(components) if self.log_only_covariance else None
