@@ -25,6 +25,9 @@ MIN_VISIBILITY = 0.75  # of the usual cells; less is not due to chance
 UNUSABLE_VISIBILITY = 0.02  # of the usual cells; less is unusable
 CLEAR_RANGE_SHARE = 0.9  # of the best range bin; there the air is clear enough to detect an empty sector
 EMPTY_SHARE = 0.05  # of the usual cells of a sector or range bin; less counts as empty
+# Of the usual cells of a mean sector. Neighbouring sectors that have fewer show near ground only, which a bank
+# of snow may hide.
+HIDDEN_SHARE = 0.25
 MIN_CELLS = 30  # usually visible; fewer are not tested
 MAX_HOLDOUT_Z_STD = 3.0  # of hold-out stable ground
 MAX_MISFIT_SIGMAS = 5.0  # of an unadjusted scan; beyond, its sigma does not cover the error
@@ -76,7 +79,8 @@ def visibility(count: Ints32, viewing: ViewingGeometry) -> Visibility:
 def obstructions(visible: Visibility) -> list[str]:
     """Return messages about the usual cells that are not visible: whole sectors, or a general loss.
 
-    A sector is missing if it is empty at ranges at which the other sectors are almost complete.
+    A sector is missing if it is empty at ranges at which the other sectors are almost complete. A few
+    near cells may be hidden, which does not count.
     """
     expected_by_sector = visible.expected.sum(axis=1)
     empty = visible.observed.sum(axis=1) < EMPTY_SHARE * expected_by_sector
@@ -85,6 +89,9 @@ def obstructions(visible: Visibility) -> list[str]:
     )
     clear = observed_share > CLEAR_RANGE_SHARE * max(observed_share.max(), MIN_VISIBILITY)
     missing = empty & (visible.expected @ clear >= MIN_CELLS)
+    hidden_cells = HIDDEN_SHARE * expected_by_sector.sum() / max(np.count_nonzero(expected_by_sector), 1)
+    for first, end in _runs(missing):
+        missing[first:end] = expected_by_sector[first:end].sum() > hidden_cells
     reasons = []
     if missing.any():
         sectors = _format_sectors(missing, visible.sector_edges_deg)
@@ -102,12 +109,17 @@ def obstructions(visible: Visibility) -> list[str]:
 
 def _format_sectors(chosen: Bools, edges_deg: Floats) -> str:
     """Format runs of sectors by their edges: `105-120, 200-240`."""
-    steps = np.diff(np.concatenate([[0], chosen.astype(np.int64), [0]]))
-    runs = list(zip(np.flatnonzero(steps > 0), np.flatnonzero(steps < 0), strict=True))
+    runs = _runs(chosen)
     full_circle = edges_deg[-1] - edges_deg[0] > 359 and not chosen.all()
     if full_circle and chosen[0] and chosen[-1]:
         runs = [*runs[1:-1], (runs[-1][0], runs[0][1])]
     return ", ".join(f"{edges_deg[a] % 360:.0f}-{edges_deg[b] % 360:.0f}" for a, b in runs)
+
+
+def _runs(chosen: Bools) -> list[tuple[int, int]]:
+    """Return the first and the end of each run of chosen elements (n,)."""
+    steps = np.diff(np.concatenate([[0], chosen.astype(np.int64), [0]]))
+    return list(zip(np.flatnonzero(steps > 0).tolist(), np.flatnonzero(steps < 0).tolist(), strict=True))
 
 
 def adjustment_warnings(adjustment: Adjustment, components: VarianceComponents) -> list[str]:

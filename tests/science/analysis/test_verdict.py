@@ -76,6 +76,13 @@ def test_sectors_without_near_cells_are_no_partial_sweep_in_fog():
     assert verdict.obstructions(clear) == ["partial sweep: no points at azimuth 20-40 degrees"]
 
 
+def test_near_ground_at_the_edge_of_the_view_may_be_hidden():
+    """Two sectors with some 2 % of the cells of another within 400 m, behind a bank of snow."""
+    edge = (AZIMUTH > 50) & (AZIMUTH < 60)
+    surface = replace(reference(), visibility=np.where(edge & (RANGE_M > 400), 0, 0.9).astype(np.float32))
+    assert verdict.obstructions(observe(random_cells(0.9) & ~edge, surface)) == []
+
+
 def test_fog_and_a_partial_sweep_are_both_reported():
     sweep, fog = obstruction_messages(random_cells(0.9) & (RANGE_M < 1400) & (AZIMUTH < 60))
     assert "partial sweep" in sweep
