@@ -14,13 +14,14 @@ from scipy import linalg, special
 from station.quantities import Bools, Floats, Reference, VarianceComponents
 from station.science.adjustment.joint import Adjustment
 from station.science.adjustment.prior import BIAS_MODES, LineTimes, tilt_covariance
+from station.science.geometry.cyclic_error import OFFSET_PRIOR_S
 
 FALSE_ALARM_PROBABILITY = 1e-5  # of a sensor error within its prior
 MIN_OBSERVABILITY = 1e-3  # of the eigenvalue of the best observed combination of errors
 MAX_OFFSET_S = 10.0  # clocks differ by up to 5 s (equations.md, 2.10): twice that is searched
 MIN_OFFSET_S = 3.5  # smaller offsets are not reported
 OFFSET_STEP_S = 0.5
-MIN_LOG_LIKELIHOOD_RATIO = 11.0  # exceeded by chance in less than 0.1 % of scans
+MIN_LOG_ODDS = 11.0  # of an offset, which is N(0, `OFFSET_PRIOR_S`) before, against none
 MAX_OFFSET_SIGMA_S = 2.5  # one sigma; beyond, several offsets are equally likely
 LONGEST_PERIOD_S = 30.0  # longer ones constrain a clock little, and the motion there is least known
 MIN_LINES, MIN_DURATION_S = 100, 60.0  # of a log for an estimate
@@ -38,12 +39,12 @@ class ClockOffset:
     log_likelihood_ratio: float
 
     def warnings(self) -> list[str]:
-        """Return a message if the offset is significant, large and well determined."""
-        if (
-            self.log_likelihood_ratio < MIN_LOG_LIKELIHOOD_RATIO
-            or abs(self.offset_s) < MIN_OFFSET_S
-            or self.sigma_s > MAX_OFFSET_SIGMA_S
-        ):
+        """Return a message if the offset is significant, large and well determined.
+
+        Another sway that happens to look alike is at any offset, a clock is seldom off by much.
+        """
+        log_odds = self.log_likelihood_ratio - (self.offset_s / OFFSET_PRIOR_S) ** 2 / 2
+        if log_odds < MIN_LOG_ODDS or abs(self.offset_s) < MIN_OFFSET_S or self.sigma_s > MAX_OFFSET_SIGMA_S:
             return []
         offset_text = f"{abs(self.offset_s):.1f} s {'late' if self.offset_s > 0 else 'early'}"
         return [f"inclination log {offset_text} (± {self.sigma_s:.1f} s) by the ground: it is not used"]

@@ -25,8 +25,8 @@ MIN_VISIBILITY = 0.75  # of the usual cells; less is not due to chance
 UNUSABLE_VISIBILITY = 0.02  # of the usual cells; less is unusable
 CLEAR_RANGE_SHARE = 0.9  # of the best range bin; there the air is clear enough to detect an empty sector
 EMPTY_SHARE = 0.05  # of the usual cells of a sector or range bin; less counts as empty
-# Of the usual cells of a mean sector. Neighbouring sectors that have fewer show near ground only, which a bank
-# of snow may hide.
+# Of the usual cells of a mean sector. Neighbouring sectors that have fewer show near ground only, which a
+# bank of snow may hide.
 HIDDEN_SHARE = 0.25
 MIN_CELLS = 30  # usually visible; fewer are not tested
 MAX_HOLDOUT_Z_STD = 3.0  # of hold-out stable ground

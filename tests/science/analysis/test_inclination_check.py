@@ -252,3 +252,11 @@ def test_a_short_log_gives_no_clock_offset():
         )
         is None
     )
+
+
+def test_a_clock_that_is_off_by_much_needs_more_evidence():
+    """Clocks differ by up to 5 s (two sigma), by 8.8 s with odds of e^-6.2."""
+    evidence = 12.4
+    assert inclination_check.ClockOffset(-8.8, 0.8, evidence).warnings() == []
+    assert inclination_check.ClockOffset(-8.8, 0.8, evidence + 6.2).warnings()
+    assert inclination_check.ClockOffset(-4.0, 0.8, evidence).warnings()
