@@ -17,6 +17,7 @@ from station.science.adjustment.prior import BIAS_MODES, LineTimes, tilt_covaria
 from station.science.geometry.cyclic_error import OFFSET_PRIOR_S
 
 FALSE_ALARM_PROBABILITY = 1e-5  # of a sensor error within its prior
+MIN_PRECISION = 1e-6  # of the difference between log and ground, over that of the best known combination
 MIN_OBSERVABILITY = 1e-3  # of the eigenvalue of the best observed combination of errors
 MAX_OFFSET_S = 10.0  # clocks differ by up to 5 s (equations.md, 2.10): twice that is searched
 MIN_OFFSET_S = 3.5  # smaller offsets are not reported
@@ -90,7 +91,8 @@ def leave_log_out(lines: LineTimes, adjustment: Adjustment) -> LogPrediction | N
 
     With m and K the adjusted tilt and its covariance, R the covariance of noise and sensor errors, and r the
     log minus m, the difference to the prediction without the log is R (R - K)⁻¹ r: the leave-one-out
-    residual, for all lines at once.
+    residual, for all lines at once. Models of the ground's change that disagree may make K larger than R; of
+    what they disagree about, the ground predicts nothing.
     """
     if (log := adjustment.log) is None or not log.weight.any():
         return None
@@ -108,12 +110,19 @@ def leave_log_out(lines: LineTimes, adjustment: Adjustment) -> LogPrediction | N
 
     precision = apply_noise_precision(np.eye(len(order)) - apply_noise_precision(predicted_covariance).T)
     weighted_residual = apply_noise_precision(residual_rad)
-    factor = linalg.cho_factor(precision, lower=True)
+    try:
+        difference_rad = linalg.cho_solve(linalg.cho_factor(precision, lower=True), weighted_residual)
+    except linalg.LinAlgError:
+        values, vectors = linalg.eigh(precision)
+        known = values > MIN_PRECISION * values[-1]
+        values, vectors = values[known], vectors[:, known]
+        precision = (vectors * values) @ vectors.T
+        difference_rad = vectors @ (vectors.T @ weighted_residual / values)
     return LogPrediction(
         LineTimes(lines.azimuth_rad[order], lines.time_s[order]),
         log.sight_tilt_rad[order],
         error_modes,
-        log.sight_tilt_rad[order] - linalg.cho_solve(factor, weighted_residual),
+        log.sight_tilt_rad[order] - difference_rad,
         precision,
         weighted_residual,
     )

@@ -145,6 +145,24 @@ def test_line_groups_without_log_samples_are_ignored():
     )
 
 
+def test_a_combination_that_the_ground_knows_less_than_the_log_is_left_out():
+    """Of it the prediction is the log; of all others it is that without the disagreement of models."""
+    scan, pattern = Scan(1), np.sin(np.linspace(0, 20, PARAMS.line_groups))
+    log = scan.log()
+    adjustment = scan.adjust(log)
+    covariance = LINE_DESIGN @ adjustment.covariance @ LINE_DESIGN.T + 0.01 * np.outer(pattern, pattern)
+    disagreeing = replace(adjustment, posterior=SimpleNamespace(sight_tilt_covariance=lambda _: covariance))
+    prediction = inclination_check.leave_log_out(LINES, disagreeing)
+    usual = inclination_check.leave_log_out(LINES, adjustment)
+    combination = np.linalg.solve(NOISE_RAD**2 * np.eye(len(pattern)) + ERROR_MODES @ ERROR_MODES.T, pattern)
+    combination = combination[::-1] / np.linalg.norm(combination)
+    assert combination @ (prediction.predicted_rad - prediction.log_rad) == pytest.approx(0.0, abs=1e-9)
+    assert abs(combination @ (usual.predicted_rad - usual.log_rad)) > 1e-4
+    others = np.eye(len(pattern)) - np.outer(combination, combination)
+    assert others @ (prediction.predicted_rad - usual.predicted_rad) == pytest.approx(0.0, abs=1e-5)
+    assert np.linalg.eigvalsh(prediction.precision)[0] > -1e-6
+
+
 def test_a_log_of_another_time_is_not_checked():
     scan = Scan(2)
     log = replace(scan.log(), weight=np.zeros(PARAMS.line_groups))
