@@ -56,7 +56,7 @@ def main() -> None:
     if options.json:
         options.json.write_text(json.dumps({"title": title, "rows": figures}, indent=1))
     if options.markdown:
-        write_markdown(options.markdown, rows, figures, title)
+        write_markdown(options.markdown, rows, figures, title, small=options.small)
 
 
 def measure(rows: list[Row], seed: int, options: argparse.Namespace) -> dict[str, Measures]:

@@ -106,10 +106,12 @@ def print_tables(rows: dict[str, Row], figures: dict[str, Figures], title: str) 
         console.print(table)
 
 
-def write_markdown(page: Path, rows: dict[str, Row], figures: dict[str, Figures], title: str) -> None:
-    """Write both tables into a page."""
+def write_markdown(
+    page: Path, rows: dict[str, Row], figures: dict[str, Figures], title: str, *, small: bool
+) -> None:
+    """Write both tables into a page, in which small stations have tables of their own."""
     tables = (HEADS, main_table(rows, figures)), band_table(figures)
-    write_tables(page, "accuracy", title, tables)
+    write_tables(page, "accuracy --small" if small else "accuracy", title, tables)
 
 
 def _limits(row: Row) -> str:

@@ -193,13 +193,14 @@ def test_change_that_is_taken_for_motion_misses_the_limits_unless_sigma_covers_i
     assert "retained" not in missed(ROWS["settling"], figures)
 
 
-def test_accuracy_tables_replace_those_of_a_page(tmp_path):
+@pytest.mark.parametrize("small", [False, True])
+def test_accuracy_tables_replace_those_of_a_page(tmp_path, small):
     page = tmp_path / "accuracy.md"
-    begin, end = marks("accuracy")
+    begin, end = marks("accuracy --small" if small else "accuracy")
     page.write_text(f"before\n\n{begin}\n\nold\n\n{end}\n\nafter\n")
     figures = {"rough": figures_of_row(records_of(1.0, 0.0))}
     for _ in range(2):  # the second time replaces the tables of the first
-        write_markdown(page, ROWS, figures, "28 scans")
+        write_markdown(page, ROWS, figures, "28 scans", small=small)
     text = page.read_text()
     assert text.startswith(f"before\n\n{begin}\n\n28 scans:\n\n| case |")
     assert text.endswith(f"|\n\n{end}\n\nafter\n")
