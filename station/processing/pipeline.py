@@ -178,7 +178,7 @@ def adjust_to_reference(
 
     thin_snow = ThinSnow(
         None if inputs.air is None else inputs.air.temperature_c,
-        ground_classes.unseen_snow_m(scan_geometry.scanner.wavelength_um),
+        *ground_classes.unseen_snow(scan_geometry.scanner.wavelength_um),
     )
     return adjust_scan(
         patches, inputs.assumed_rad, *prior_and_log(components), thin_snow, reference_state, wider

@@ -20,7 +20,7 @@ import numpy as np
 from scipy import sparse
 
 from station.quantities import Bools, Floats, Ints, Reals
-from station.science.adjustment.ground_classes import UNSEEN_SNOW_M
+from station.science.adjustment.ground_classes import UNSEEN_SNOW_M, UNSEEN_SNOW_SHARE
 from station.science.adjustment.normal_equations import ScaledCholesky, cholesky_inplace
 from station.science.adjustment.patches import Patches
 from station.science.geometry.air import LAPSE_K_PER_M
@@ -62,7 +62,8 @@ NO_CHANGE_M = 1e-6
 # Of the air over thin snow. At most of the warmest places half of what falls at 2.4 °C is snow (Jennings et
 # al., 2018), and a thermometer in the sun shows up to 5 K too much.
 MAX_SNOW_C = 8.0
-SNOW_SLOPES = tuple(np.tan(np.radians((40.0, 45.0, 50.0))))  # upper bounds (tan): all, most, some snow
+# Upper bounds (tan): all, most, some, little snow.
+SNOW_SLOPES = tuple(np.tan(np.radians((40.0, 45.0, 50.0, 60.0))))
 HEAVE_M = 0.002  # start value of sigma: frost and heat move rock by millimetres
 HEAVE_BLOCK_M = 500.0
 PRIOR_HEAVE_BLOCKS = 4.0  # weight of the start value, in blocks
@@ -130,11 +131,12 @@ class ThinSnow(NamedTuple):
     """Snow that stable ground may be under without showing it.
 
     `temperature_c` is that of the air at the scanner, None if it was not measured, `max_depth_m` the largest
-    depth that the brightness of a cell does not show.
+    depth that the brightness of a cell does not show, or `max_share` of the mean depth on moving ground.
     """
 
     temperature_c: float | None = None
     max_depth_m: float = UNSEEN_SNOW_M
+    max_share: float = UNSEEN_SNOW_SHARE
 
     def is_possible(self, patches: Patches) -> Bools:
         """Return True for patches (n,) where it is cold enough; everywhere if no temperature is known.
@@ -153,8 +155,8 @@ THIN_SNOW = ThinSnow()
 class GroundChange:
     """Unknown change of patches (n,): trends, knots, depths of thin snow, heave, in this order.
 
-    A patch of moving ground is of the kind that has most of it. `thin_snow_m` is the largest depth of
-    thin snow on stable ground.
+    A patch of moving ground is of the kind that has most of it. `mean_change_m` is the mean change of moving
+    ground that the last estimate showed.
     """
 
     design: sparse.csr_array  # (n, k)
@@ -165,7 +167,8 @@ class GroundChange:
     bare_columns: int  # the last of these, trends of bare ground beside ice and snow
     snow_columns: int
     heave_columns: int
-    thin_snow_m: float
+    thin_snow: ThinSnow
+    mean_change_m: float
     heave_m: float
 
     @property
@@ -188,9 +191,10 @@ class GroundChange:
         """Return mean and sigma of the independent unknowns of a model [m]: trends, depths of snow, heave."""
         trends_m = np.full(TRENDS, TREND_SIZES_M[model.trend])
         trends_m[0] *= MEAN_RATIO
-        depth_m = min(self.thin_snow_m, math.hypot(model.step_m, trends_m[0]))
+        largest_m = max(self.thin_snow.max_depth_m, self.thin_snow.max_share * self.mean_change_m)
+        depth_m = min(largest_m, math.hypot(model.step_m, trends_m[0]))
         if model.mean:
-            depth_m, trends_m[0] = self.thin_snow_m, FREE_MEAN_SIGMA_M
+            depth_m, trends_m[0] = largest_m, FREE_MEAN_SIGMA_M
         if model.mean > 1:
             trends_m[SLOPES] = np.maximum(trends_m[SLOPES], FREE_SLOPE_SIGMA_M)
         first_bare, first_snow = self.trend_columns - self.bare_columns, self.trend_columns
@@ -235,17 +239,17 @@ class GroundChange:
         return float((self.design @ estimate_m)[self.moving].mean()) if self.moving.any() else 0.0
 
     def updated(self, estimate_m: Floats, heave_variance_m2: Floats) -> GroundChange:
-        """Return this change with the size of heave that an estimate (k,) shows.
+        """Return this change with its mean and the size of heave that an estimate (k,) shows.
 
-        Its variance is the mean of estimate squared plus posterior variance (heave_columns,), shrunk towards
-        the start value (expectation-maximisation).
+        The variance of heave is the mean of estimate squared plus posterior variance (heave_columns,), shrunk
+        towards the start value (expectation-maximisation).
         """
         heave_m = HEAVE_M
         if self.heave_columns:
             second_moment_m2 = float(np.sum(estimate_m[-self.heave_columns :] ** 2 + heave_variance_m2))
             second_moment_m2 += PRIOR_HEAVE_BLOCKS * HEAVE_M**2
             heave_m = max(np.sqrt(second_moment_m2 / (PRIOR_HEAVE_BLOCKS + self.heave_columns)), MIN_HEAVE_M)
-        return replace(self, heave_m=heave_m)
+        return replace(self, mean_change_m=self.mean_m(estimate_m), heave_m=heave_m)
 
     def polar_mean(self, patches: Patches, estimate_m: Floats) -> Floats:
         """Return the mean estimated change of moving ground by azimuth sector and range ring."""
@@ -274,7 +278,8 @@ def ground_change(patches: Patches, moving: Bools, thin_snow: ThinSnow = THIN_SN
         trends[1].shape[1] if trends[0].shape[1] else 0,
         snow_design.shape[1],
         heave_design.shape[1],
-        thin_snow.max_depth_m,
+        thin_snow,
+        0.0,
         HEAVE_M,
     )
 
@@ -348,7 +353,7 @@ def _trends(patches: Patches, share: Floats) -> sparse.csr_array:
 
 
 def _thin_snow(patches: Patches, chosen: Bools) -> sparse.csr_array:
-    """Return the design matrix (n, 3) of thin snow on chosen patches, by how much of it their slope holds."""
+    """Return the design matrix (n, 4) of thin snow on chosen patches, by how much of it their slope holds."""
     snow_class = np.digitize(patches.jacobian.tan_slope, SNOW_SLOPES)
     classes = [(snow_class == index) & chosen for index in range(len(SNOW_SLOPES))]
     return sparse.csr_array(np.stack(classes, axis=1) * 1.0)

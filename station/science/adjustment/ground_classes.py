@@ -25,6 +25,8 @@ DARK_SNOW_RATIOS = (0.55, 1 / 0.55)
 # Largest depth of patchy snow that stays within these limits. An estimate: some 3 cm cover rock, and bright
 # snow shows when it covers a fifth of a cell, dark snow when it covers two thirds.
 UNSEEN_SNOW_M, UNSEEN_DARK_SNOW_M = 0.01, 0.02
+# The same of deep snow, over its depth on other ground: cover times a tenth, which steep rock holds (ibid.).
+UNSEEN_SNOW_SHARE, UNSEEN_DARK_SNOW_SHARE = 0.02, 0.067
 MAX_GAIN_CHANGE = 0.15  # of the receiver, usually 5 % from scan to scan; beyond, the ground has changed
 MIN_GAIN_CELLS = 50
 MAX_GROUND_INTENSITY = 0.5  # of the scale; snow of twice that would not be on it
@@ -116,9 +118,14 @@ def snow_test(
     return SnowTest(gain if abs(gain - 1) <= MAX_GAIN_CHANGE else 1.0, ratios)
 
 
-def unseen_snow_m(wavelength_um: float) -> float:
-    """Return the largest depth of snow on stable ground that its brightness does not show [m]."""
-    return UNSEEN_SNOW_M if wavelength_um < DARK_SNOW_UM else UNSEEN_DARK_SNOW_M
+def unseen_snow(wavelength_um: float) -> tuple[float, float]:
+    """Return the largest depth of snow on stable ground that its brightness does not show [m].
+
+    The second value is the largest one of deep snow, over its depth on other ground.
+    """
+    if wavelength_um < DARK_SNOW_UM:
+        return UNSEEN_SNOW_M, UNSEEN_SNOW_SHARE
+    return UNSEEN_DARK_SNOW_M, UNSEEN_DARK_SNOW_SHARE
 
 
 @dataclass(frozen=True)

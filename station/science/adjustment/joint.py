@@ -225,8 +225,7 @@ def _estimate(
             if same_model and update_m <= CONVERGED_M * np.sqrt(len(residual_m)):
                 break
     assert solution is not None  # noqa: S101 - the loop runs at least once
-    mean_change_m = change.mean_m(solution.change_m)
-    return _Estimation(equations, reduced, solution, weight, robust_weight, mean_change_m)
+    return _Estimation(equations, reduced, solution, weight, robust_weight, change.mean_change_m)
 
 
 def _tukey_weight(ratio: Floats) -> Floats:

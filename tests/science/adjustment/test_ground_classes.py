@@ -106,7 +106,7 @@ def test_snow_shows_at_the_depth_up_to_which_it_may_be_unseen(wavelength_um, roc
     depths_m = np.linspace(0.0, 0.03, 301)
     shows = [changed(wavelength_um, rock + (snow - rock) * depth / 0.03, rock) for depth in depths_m]
     seen_m = depths_m[np.argmax(shows)]
-    assert 0.95 * seen_m < ground_classes.unseen_snow_m(wavelength_um) < 2 * seen_m
+    assert 0.95 * seen_m < ground_classes.unseen_snow(wavelength_um)[0] < 2 * seen_m
 
 
 @pytest.mark.parametrize("wavelength_um", [NEAR_INFRARED_UM, SHORT_WAVE_UM])

@@ -88,7 +88,7 @@ def test_thin_snow_lies_where_the_air_is_colder_than_8_degrees():
 @pytest.mark.parametrize(
     ("model", "depth_m"),
     [
-        (ChangeModel(0, 9, 5, snow=1, mean=1), ground_classes.unseen_snow_m(1.064)),
+        (ChangeModel(0, 9, 5, snow=1, mean=1), ground_classes.unseen_snow(1.064)[0]),
         # No deeper than the change of other ground.
         (ChangeModel(0, 0, 0, snow=1), np.hypot(0.00024, 0.0005)),
         (ChangeModel(0, 9, 5, snow=0, mean=1), 0.0),
@@ -101,8 +101,20 @@ def test_thin_snow_is_none_or_of_any_depth_that_brightness_does_not_show(moderat
     mean_m, sigma_m = (values[thin_snow] for values in change.prior_m(model))
     rng = np.random.default_rng(1)
     draws_m = np.where(rng.uniform(size=100_000) < 0.5, 0.0, rng.uniform(0, depth_m, 100_000))
-    assert mean_m == pytest.approx(np.full(3, draws_m.mean()), rel=0.03)
-    assert sigma_m == pytest.approx(np.full(3, draws_m.std()), rel=0.03, abs=1e-5)
+    assert mean_m == pytest.approx(np.full(4, draws_m.mean()), rel=0.03)
+    assert sigma_m == pytest.approx(np.full(4, draws_m.std()), rel=0.03, abs=1e-5)
+
+
+@pytest.mark.parametrize(("wavelength_um", "largest_m"), [(1.064, 0.04), (1.55, 0.134)])
+def test_under_two_metres_of_snow_a_fiftieth_may_be_unseen(moderate, wavelength_um, largest_m):
+    """At 1550 nm a fifteenth: snow shows when it covers two thirds of a cell instead of a fifth."""
+    _, change, _, solved = moderate
+    deep = replace(change, thin_snow=ground_change.ThinSnow(None, *ground_classes.unseen_snow(wavelength_um)))
+    heave_m2 = np.zeros(deep.heave_columns)
+    deep = deep.updated(solved.change_m * 2.0 / change.mean_m(solved.change_m), heave_m2)
+    mean_m, _ = deep.prior_m(ChangeModel(0, 9, 5, snow=1, mean=1))
+    assert deep.mean_change_m == pytest.approx(2.0)
+    assert mean_m[change.trend_columns] == pytest.approx(largest_m / 4)
 
 
 @pytest.fixture(scope="module")
