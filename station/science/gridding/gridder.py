@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from station.science.geometry.terrain import row_blocks
-from station.science.gridding.echo_layers import EchoLayers, LayerSums, supported
+from station.science.gridding.echo_layers import MIN_SURFACE_POINTS, EchoLayers, LayerSums, supported
 
 if TYPE_CHECKING:
     from station.quantities import Floats, Floats32, Grid, Ints, Ints32
@@ -19,6 +19,8 @@ if TYPE_CHECKING:
 UNITS_PER_M = 2.0**20
 MAX_INTENSITY = 65535.0  # intensity has 16 bits
 MAX_INTENSITY_POINTS = 65537  # points per cell whose intensity 32 bits can sum
+COMMON_SHARE = 0.98  # of the cells with several points, whose change one with fewer may have too
+MAX_COMMON_CELLS = 100_000  # of more cells a sample tells the range
 NO_THICKNESS = np.empty(0, np.uint8)
 
 
@@ -204,12 +206,24 @@ class Gridder:
         if not len(doubtful):
             return
         residual_m = self.take(doubtful.astype(np.int32)).mean_residual()
-        neighbours_m = self._neighbours(doubtful)
-        alone = clouds | ~supported(residual_m, neighbours_m, layers.thickness_m(doubtful))
+        neighbours_m, thickness_m = self._neighbours(doubtful), layers.thickness_m(doubtful)
+        lowest_m, highest_m = self._common_change()
+        is_common = (residual_m > lowest_m - thickness_m) & (residual_m < highest_m + thickness_m)
+        alone = clouds | ~(is_common | supported(residual_m, neighbours_m, thickness_m))
         self.rejected += int(self._count[doubtful[alone]].sum())
         self._below += int(self._count[doubtful[alone & (residual_m < 0)]].sum())
         for sums in (self._count, self._moments, self._intensity_sum):
             sums[doubtful[alone]] = 0
+
+    def _common_change(self) -> tuple[float, float]:
+        """Return the range of change [m] of nearly all reference cells with several points."""
+        several = np.flatnonzero(self._count[: self.reference_cells] >= MIN_SURFACE_POINTS)
+        if not len(several):
+            return 0.0, 0.0
+        sample = several[:: 1 + len(several) // MAX_COMMON_CELLS].astype(np.int32)
+        rest = (1 - COMMON_SHARE) / 2
+        lowest_m, highest_m = np.quantile(self.take(sample).mean_residual(), [rest, 1 - rest])
+        return float(lowest_m), float(highest_m)
 
     def _neighbours(self, cell_index: Ints) -> Floats32:
         """Return the mean residuals of the eight cells around reference cells (n,) [m], NaN if unknown."""

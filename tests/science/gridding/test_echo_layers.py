@@ -135,6 +135,23 @@ def test_lone_echo_far_from_the_reference_empties_its_cell_but_real_change_stays
     assert gridder.rejected == 0
 
 
+def test_lone_echo_of_a_change_that_other_cells_share_stays():
+    """Snow of 2 to 4 m: a cell with one echo and empty cells around it is as deep as others."""
+    cell, depth_m = np.arange(CELLS), np.linspace(2.0, 4.0, CELLS)
+    row, column = np.divmod(cell, GRID.nx)
+    lone = (row == 1) & (column == 1)
+    around = (abs(row - 1) <= 1) & (abs(column - 1) <= 1) & ~lone
+    cells = np.concatenate([cell[lone], np.repeat(cell[~lone & ~around], 3)])
+    lone_m = 3.5
+    residual_m = np.concatenate([[lone_m], np.repeat(depth_m[~lone & ~around], 3)])
+    sums, gridder = gridded(cells, residual_m)
+    assert sums.mean_residual().reshape(-1)[lone] == pytest.approx(lone_m, abs=1e-6)
+    assert gridder.rejected == 0
+    residual_m[0] = 25.0
+    sums, gridder = gridded(cells, residual_m)
+    assert gridder.rejected == 1
+
+
 @pytest.mark.parametrize("surface", [FLAT, None])
 @pytest.mark.parametrize(("above", "below"), [(400, 0), (400, 100), (120, 100)])
 def test_echoes_of_the_air_are_above_the_surface_beyond_as_many_below_and_chance(surface, above, below):
