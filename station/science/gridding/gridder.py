@@ -217,10 +217,10 @@ class Gridder:
 
     def _common_change(self) -> tuple[float, float]:
         """Return the range of change [m] of nearly all reference cells with several points."""
-        several = np.flatnonzero(self._count[: self.reference_cells] >= MIN_SURFACE_POINTS)
-        if not len(several):
+        sample = np.arange(0, self.reference_cells, 1 + self.reference_cells // MAX_COMMON_CELLS)
+        sample = sample[self._count[sample] >= MIN_SURFACE_POINTS].astype(np.int32)
+        if not len(sample):
             return 0.0, 0.0
-        sample = several[:: 1 + len(several) // MAX_COMMON_CELLS].astype(np.int32)
         rest = (1 - COMMON_SHARE) / 2
         lowest_m, highest_m = np.quantile(self.take(sample).mean_residual(), [rest, 1 - rest])
         return float(lowest_m), float(highest_m)
