@@ -33,7 +33,7 @@ MAX_HOLDOUT_Z_STD = 3.0  # of hold-out stable ground
 MAX_MISFIT_SIGMAS = 5.0  # of an unadjusted scan; beyond, its sigma does not cover the error
 MIN_STABLE_CELLS = 20
 MAX_MISFIT_CELLS = 100_000  # larger sets are thinned for the misfit
-MAX_AIRBORNE_ECHO_SHARE = 0.00125  # of the points on the grid; more are not from a few particles in clear air
+MAX_AIRBORNE_ECHO_SHARE = 0.001  # of the points on the grid; more are not from a few particles in clear air
 NO_BRIGHTNESS = "no brightness: snow on stable ground cannot be recognised"
 BRIGHT_GROUND = (
     "no brightness: stable ground is too bright for a linear scale; if it is in decibels, set scans.intensity"
