@@ -223,7 +223,7 @@ def test_the_map_is_named_for_screen_readers_and_speaks_german(tab, addresses):
     named = {}
     for node in tree:
         if not node.get("ignored") and "name" in node:
-            named.setdefault(node["role"]["value"], []).append(node["name"]["value"])
+            named.setdefault(node["role"]["value"], []).append(node["name"]["value"].strip())
     assert any(name.startswith("Karte der Höhenänderung") for name in named["application"])
     assert {"Zeit", "Seit"} <= set(named["slider"])
     assert any(name.startswith("Grenze zwischen den beiden Scans") for name in named["slider"])
