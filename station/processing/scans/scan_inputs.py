@@ -94,7 +94,7 @@ class ScanInputs:
         )
 
     def without_log(self, *, keep_tilt: bool) -> ScanInputs:
-        """Return the inputs without an inclination log that is wrong, nor, but with `keep_tilt`, its tilt."""
+        """Return the inputs without a wrong inclination log, and without its tilt unless `keep_tilt`."""
         assert self.adjustment_inputs is not None  # noqa: S101 - the scan was adjusted
         adjustment_inputs = replace(self.adjustment_inputs, log=None)
         if keep_tilt:
