@@ -42,7 +42,7 @@ class ClockOffset:
     def warnings(self) -> list[str]:
         """Return a message if the offset is significant, large and well determined.
 
-        Another sway that happens to look alike is at any offset, a clock is seldom off by much.
+        Sway may look alike by chance at any offset, but a clock is seldom off by much.
         """
         log_odds = self.log_likelihood_ratio - (self.offset_s / OFFSET_PRIOR_S) ** 2 / 2
         if log_odds < MIN_LOG_ODDS or abs(self.offset_s) < MIN_OFFSET_S or self.sigma_s > MAX_OFFSET_SIGMA_S:
