@@ -217,8 +217,9 @@ class Gridder:
 
     def _common_change(self) -> tuple[float, float]:
         """Return the range of change [m] of nearly all reference cells with several points."""
-        sample = np.arange(0, self.reference_cells, 1 + self.reference_cells // MAX_COMMON_CELLS)
-        sample = sample[self._count[sample] >= MIN_SURFACE_POINTS].astype(np.int32)
+        step = 1 + self.reference_cells // MAX_COMMON_CELLS
+        sample = np.arange(0, self.reference_cells, step, dtype=np.int32)
+        sample = sample[self._count[sample] >= MIN_SURFACE_POINTS]
         if not len(sample):
             return 0.0, 0.0
         rest = (1 - COMMON_SHARE) / 2
