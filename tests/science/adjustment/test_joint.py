@@ -813,10 +813,10 @@ def test_a_deposit_with_thin_edges_on_bare_ground_is_rejected_within_eight_itera
     assert 0.6 < np.sqrt(np.mean((error_m / height_sigma(adjustment, cells)) ** 2)) < 1.6  # of one scan
 
 
-def simulate_thin_snow(seed, change_m):
-    """Standardised errors and errors, where glacier and all but steep rock changed by `change_m`.
+def simulate_snow_on_rock(seed, change_m, rock_m):
+    """Standardised errors and errors, where the glacier changed by `change_m`, rock by its slope.
 
-    Frost has moved all rock by a millimetre, up or down.
+    `rock_m(slope_deg, rng)` is the snow on rock. Frost has moved all rock by a millimetre, up or down.
     """
     rng = np.random.default_rng(seed)
     _, root = dense_prior(PARAMS)
@@ -826,8 +826,8 @@ def simulate_thin_snow(seed, change_m):
         replace(random_sites(seed + 95, 1500, steep=0.3), stable=False),
         random_sites(99, 200),
     )
-    snow_covered = np.hypot(stable.east, stable.north) < np.tan(np.radians(40)) if change_m > 0 else 0.0
-    stable_m = stable.matrix() @ state + rng.normal(0, 0.003, 1500) + change_m * snow_covered
+    slope_deg = np.degrees(np.arctan(np.hypot(stable.east, stable.north)))
+    stable_m = stable.matrix() @ state + rng.normal(0, 0.003, 1500) + rock_m(slope_deg, rng)
     patches = concatenate(
         stable.patches(stable_m + rng.choice([-0.001, 0.001]), 0.003),
         glacier.patches(
@@ -840,12 +840,23 @@ def simulate_thin_snow(seed, change_m):
 
 
 def test_thin_snow_on_rock_is_not_mistaken_for_a_shift_of_the_scanner():
-    z, error_m = (
-        np.array(values)
-        for values in zip(*(simulate_thin_snow(seed, 0.006) for seed in range(6)), strict=True)
-    )
+    def below_40_deg_m(slope_deg, _):
+        return 0.006 * (slope_deg < 40)
+
+    scans = [simulate_snow_on_rock(seed, 0.006, below_40_deg_m) for seed in range(6)]
+    z, error_m = np.swapaxes(scans, 0, 1)
     assert np.abs(error_m.mean(axis=1)).max() < 0.003  # without the snow depths: 6 mm
     assert 0.7 < np.sqrt(np.mean(z**2)) < 1.25  # of six scans, whose cells share most of their error
+
+
+def test_sigma_covers_what_steep_rock_keeps_of_two_metres_of_snow():
+    """Rock of less than 60° keeps 0 to 5 cm, the steeper the less: so little does not show in a cell."""
+
+    def kept_m(slope_deg, rng):
+        return rng.uniform(0, 0.05) * np.clip((60 - slope_deg) / 15, 0, 1)
+
+    z = [simulate_snow_on_rock(seed, 2.0, kept_m)[0] for seed in range(12)]
+    assert 0.7 < np.sqrt(np.mean(np.square(z))) < 1.25  # with slopes up to 50° only: 1.5
 
 
 def test_the_uncertainty_of_the_reference_is_added_to_the_prior():
