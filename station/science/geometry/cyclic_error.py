@@ -11,7 +11,8 @@ from station.quantities import AzimuthTrack, Floats, InclinationLog
 
 CYCLIC_ERROR_PRIOR_RAD = math.radians(0.05)  # largest cyclic error seen at Helheim, equations.md, 2.7
 CYCLIC_CHANGE_SHARE = 0.2  # of its amplitude, between scans: equations.md, 2.7
-# Of its change of shape between scans, along a line of sight; root two times that in each cosine and sine.
+# Of its change of shape between scans, along the line of sight. An adjustment and the clock allow root two
+# times as much; without an adjustment sigma of heights on the map would then be too large.
 CYCLIC_CHANGE_RAD = math.radians(0.002)
 OFFSET_PRIOR_S = 2.5  # clocks differ by up to 5 s, taken as two sigma: Voordendag et al. (2023), section 3.1
 OFFSET_LARGEST_S = 600.0  # one sigma of a clock that is never set
