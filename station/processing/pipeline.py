@@ -14,6 +14,7 @@ from station.quantities import (
     Bools,
     Floats,
     Floats32,
+    Ints,
     Measurement,
     Quality,
     Reals,
@@ -159,7 +160,8 @@ def adjust_to_reference(
     If it has moved farther than expected, it is estimated again with a prior as wide as the motion.
     """
     components, reference_state = usual_motion(viewing.reference, inputs.time_s), viewing.reference.shared
-    cells = _cells(gridder, viewing, snow_test(gridder, scan_geometry, viewing))
+    test = snow_test(gridder, scan_geometry, viewing)
+    cells = _cells(gridder, viewing, test)
     extent_m = line_length(scan_geometry.grid, scan_geometry.scanner.range_max_m)
     patches = aggregate_patches(inputs.params, cells, *extent_m)
 
@@ -179,6 +181,7 @@ def adjust_to_reference(
     thin_snow = ThinSnow(
         None if inputs.air is None else inputs.air.temperature_c,
         *ground_classes.unseen_snow(scan_geometry.scanner.wavelength_um),
+        shows=bool(np.isfinite(test.gain)) and _snow_shows(gridder, scan_geometry, viewing),
     )
     return adjust_scan(
         patches, inputs.assumed_rad, *prior_and_log(components), thin_snow, reference_state, wider
@@ -197,6 +200,21 @@ def snow_test(gridder: Gridder, scan_geometry: ScanGeometry, viewing: ViewingGeo
     _, stable_reference = _stable_intensity(gridder, viewing)
     wavelength_um = scan_geometry.scanner.wavelength_um
     return ground_classes.snow_test(intensity, reference, stable_reference, wavelength_um)
+
+
+def _snow_shows(gridder: Gridder, scan_geometry: ScanGeometry, viewing: ViewingGeometry) -> bool:
+    """Return True if stable ground looks like under snow, beside rock that is too steep to hold it."""
+    steep_rock = _observed(gridder, viewing, CellClass.BARE, CellClass.STEEP)
+    cell_index = np.concatenate([_observed(gridder, viewing, CellClass.STABLE), steep_rock])
+    cell, height_m, cell_class = (
+        viewing.cells[name][:].take(cell_index) for name in ("cell", "height_m", "cell_class")
+    )
+    return ground_classes.snow_shows(
+        *_intensity(gridder, viewing, cell_index),
+        viewing.grid.plane.horizontal_m(viewing.offset_m(cell, height_m)),
+        (cell_class & np.uint8(CellClass.STEEP)) > 0,
+        scan_geometry.scanner.wavelength_um,
+    )
 
 
 def no_brightness(gridder: Gridder, scan_geometry: ScanGeometry, viewing: ViewingGeometry | None) -> str:
@@ -219,13 +237,19 @@ def no_brightness(gridder: Gridder, scan_geometry: ScanGeometry, viewing: Viewin
 def _stable_intensity(
     gridder: Gridder, viewing: ViewingGeometry, *classes: CellClass
 ) -> tuple[Floats32, Floats32]:
-    """Return the intensity (m,) of stable cells of the given classes in a scan and in its reference.
+    """Return the intensity (m,) of stable cells of the given classes in a scan and in its reference."""
+    return _intensity(gridder, viewing, _observed(gridder, viewing, CellClass.STABLE, *classes))
 
-    Only cells that the scan observed; of very many a sample.
-    """
-    cell_index = viewing.select(CellClass.STABLE, *classes)
+
+def _observed(gridder: Gridder, viewing: ViewingGeometry, *classes: CellClass) -> Ints:
+    """Return the indices (m,) of cells of all the given classes that a scan observed; of many a sample."""
+    cell_index = viewing.select(*classes)
     cell_index = cell_index[:: 1 + len(cell_index) // MAX_BRIGHTNESS_CELLS]
-    cell_index = cell_index[gridder.count[cell_index] > 0]
+    return cell_index[gridder.count[cell_index] > 0]
+
+
+def _intensity(gridder: Gridder, viewing: ViewingGeometry, cell_index: Ints) -> tuple[Floats32, Floats32]:
+    """Return the intensity of cells (m,) in a scan and in its reference."""
     return gridder.intensity(cell_index), viewing.cells["intensity"][:].take(cell_index)
 
 

@@ -53,6 +53,7 @@ MEAN_LOG_PRIORS = (0.0, 3.0, 4.5)
 UNLIKELY_LOG_PRIOR = 12.0
 SNOW_LOG_PRIORS = (0.0, 3.0, UNLIKELY_LOG_PRIOR)
 SNOWFALL = 1  # index of the second
+SHOWN_SNOW_LOG_ODDS = 6.0  # by which snow is likelier where rock looks like it: in nineteen scans of twenty
 SMALL_TREND_LOG_PRIOR = 2.0  # against each factor e by which trends are smaller than the change between knots
 CORRELATION_AZIMUTH_KNOTS, CORRELATION_RANGE_KNOTS = 4.0, 2.5  # correlation lengths, in knots
 # Mean and sigma of thin snow over its largest depth: stable ground is bare as likely as under any depth that
@@ -132,11 +133,13 @@ class ThinSnow(NamedTuple):
 
     `temperature_c` is that of the air at the scanner, None if it was not measured, `max_depth_m` the largest
     depth that the brightness of a cell does not show, or `max_share` of the mean depth on moving ground.
+    `shows` if the brightness of many cells together tells that there is snow.
     """
 
     temperature_c: float | None = None
     max_depth_m: float = UNSEEN_SNOW_M
     max_share: float = UNSEEN_SNOW_SHARE
+    shows: bool = False
 
     def is_possible(self, patches: Patches) -> Bools:
         """Return True for patches (n,) where it is cold enough; everywhere if no temperature is known.
@@ -187,14 +190,21 @@ class GroundChange:
         """Columns of the other unknowns, which are independent of each other."""
         return np.delete(np.arange(self.design.shape[1]), self.knots)
 
+    def log_prior(self, model: ChangeModel) -> float:
+        """Return the logarithm of the prior odds of a model, after what brightness tells of snow."""
+        shown = model.snow == SNOWFALL and self.thin_snow.shows
+        return model.log_prior + SHOWN_SNOW_LOG_ODDS * shown
+
     def prior_m(self, model: ChangeModel) -> tuple[Floats, Floats]:
         """Return mean and sigma of the independent unknowns of a model [m]: trends, depths of snow, heave."""
         trends_m = np.full(TRENDS, TREND_SIZES_M[model.trend])
         trends_m[0] *= MEAN_RATIO
+        if model.snow == SNOWFALL and self.thin_snow.shows:
+            trends_m[0] = max(trends_m[0], self.thin_snow.max_depth_m)
+        if model.mean:
+            trends_m[0] = FREE_MEAN_SIGMA_M
         largest_m = max(self.thin_snow.max_depth_m, self.thin_snow.max_share * self.mean_change_m)
         depth_m = min(largest_m, math.hypot(model.step_m, trends_m[0]))
-        if model.mean:
-            depth_m, trends_m[0] = largest_m, FREE_MEAN_SIGMA_M
         if model.mean > 1:
             trends_m[SLOPES] = np.maximum(trends_m[SLOPES], FREE_SLOPE_SIGMA_M)
         first_bare, first_snow = self.trend_columns - self.bare_columns, self.trend_columns
@@ -266,8 +276,9 @@ def ground_change(patches: Patches, moving: Bools, thin_snow: ThinSnow = THIN_SN
     trends = [_trends(patches, share) for share in shares]
     trend_design = sparse.hstack(trends, format="csr")
     snow_design = sparse.csr_array((len(moving), 0))
+    snowy = ~moving & thin_snow.is_possible(patches)
     if moving.any():
-        snow_design = _thin_snow(patches, ~moving & thin_snow.is_possible(patches))
+        snow_design = _thin_snow(patches, snowy)
     heave_design = _heave(patches, ~moving)
     return GroundChange(
         sparse.hstack([trend_design, knot_design, snow_design, heave_design], format="csr"),
@@ -278,7 +289,7 @@ def ground_change(patches: Patches, moving: Bools, thin_snow: ThinSnow = THIN_SN
         trends[1].shape[1] if trends[0].shape[1] else 0,
         snow_design.shape[1],
         heave_design.shape[1],
-        thin_snow,
+        thin_snow._replace(shows=thin_snow.shows and bool(snowy.any())),
         0.0,
         HEAVE_M,
     )

@@ -83,7 +83,7 @@ class Solution:
         """Return the logarithm of a model's posterior odds, up to a constant."""
         if model not in self._log_odds:
             if not len(self._rhs):
-                return model.log_prior
+                return self._change.log_prior(model)
             rest = self._eliminate_knots(model.ratio, model.step)
             mean_m, sigma_m = self._change.prior_m(model)
             cholesky = cholesky_inplace(rest.normal + np.diag(1 / sigma_m**2))
@@ -92,7 +92,7 @@ class Solution:
             half, first = solve_lower(cholesky, columns).T
             half_log_determinant = log_determinant(cholesky) / 2 + np.log(sigma_m).sum()
             squares = half @ half - np.sum((mean_m / sigma_m) ** 2)
-            log_odds = rest.log_odds + model.log_prior + squares / 2 - half_log_determinant
+            log_odds = rest.log_odds + self._change.log_prior(model) + squares / 2 - half_log_determinant
             if model.mean_sign and self._change.trend_columns:  # the first unknown is the mean
                 z = model.mean_sign * first @ half / np.linalg.norm(first)
                 log_odds += np.log(2) + max(special.log_ndtr(z), -UNLIKELY_LOG_PRIOR)

@@ -109,6 +109,57 @@ def test_snow_shows_at_the_depth_up_to_which_it_may_be_unseen(wavelength_um, roc
     assert 0.95 * seen_m < ground_classes.unseen_snow(wavelength_um)[0] < 2 * seen_m
 
 
+ROCK_AND_SNOW = {NEAR_INFRARED_UM: (0.25, 0.6), SHORT_WAVE_UM: (0.3, 0.1)}
+
+
+def shown(
+    wavelength_um, *, cover=0.0, gain=1.0, extinction_per_m=(0.0, 0.0), wetness=1.0, steep_cells=400, seed=0
+):
+    """Return whether snow shows on 5000 cells of rock, steeper the farther away they are.
+
+    Snow covers a share of all but the steep ones, in drifts. The air absorbs light on the way, there and
+    back, by the first of two coefficients in the reference, by the second in the scan (Beer and Lambert).
+    """
+    rng = np.random.default_rng(seed)
+    rock, snow = ROCK_AND_SNOW[wavelength_um]
+    range_m = rng.uniform(300, 3000, 5000)
+    steep = np.zeros(5000, bool)
+    steep[rng.choice(5000, steep_cells, replace=False, p=range_m / range_m.sum())] = True
+    drifts = cover * rng.exponential(1.0, 5000) * ~steep
+    then = rng.uniform(0.7, 1.3, 5000) * rock
+    now = gain * then * (wetness + drifts.clip(0, 1) * (snow / rock - wetness))
+    then, now = (
+        (values * np.exp(-2 * coefficient * range_m) * rng.normal(1, 0.05, 5000)).astype(np.float32)
+        for values, coefficient in zip((then, now), extinction_per_m, strict=True)
+    )
+    return ground_classes.snow_shows(now, then, range_m, steep, wavelength_um)
+
+
+@pytest.mark.parametrize("wavelength_um", [NEAR_INFRARED_UM, SHORT_WAVE_UM])
+@pytest.mark.parametrize("seed", range(5))
+def test_snow_that_no_cell_shows_is_seen_on_all_of_them(wavelength_um, seed):
+    rock, snow = ROCK_AND_SNOW[wavelength_um]
+    assert not changed(wavelength_um, rock + 0.06 * (snow - rock), rock)
+    haze = (0.5e-4, 2e-4)  # visibility of 80 and 20 km
+    assert shown(wavelength_um, cover=0.06, gain=0.9, extinction_per_m=haze, seed=seed)
+
+
+@pytest.mark.parametrize("wavelength_um", [NEAR_INFRARED_UM, SHORT_WAVE_UM])
+@pytest.mark.parametrize(
+    "condition",
+    [
+        {},
+        {"gain": 1.14},
+        {"extinction_per_m": (0.5e-4, 4e-4)},
+        {"extinction_per_m": (4e-4, 0.5e-4)},
+        {"wetness": 0.7},  # rock, steep or not
+        {"cover": 0.06, "steep_cells": 30},  # too few to compare with
+    ],
+)
+def test_neither_gain_nor_haze_nor_rain_looks_like_snow(wavelength_um, condition):
+    assert not any(shown(wavelength_um, seed=seed, **condition) for seed in range(20))
+
+
 @pytest.mark.parametrize("wavelength_um", [NEAR_INFRARED_UM, SHORT_WAVE_UM])
 @pytest.mark.parametrize("pair", [(np.nan, 0.3), (0.3, np.nan), (np.nan, np.nan), (0.3, 0.0)])
 def test_without_brightness_only_steep_ground_is_known_to_be_unchanged(wavelength_um, pair):
