@@ -181,7 +181,7 @@ def adjust_to_reference(
     thin_snow = ThinSnow(
         None if inputs.air is None else inputs.air.temperature_c,
         *ground_classes.unseen_snow(scan_geometry.scanner.wavelength_um),
-        shows=bool(np.isfinite(test.gain)) and _snow_shows(gridder, scan_geometry, viewing),
+        shows=_snow_shows(gridder, scan_geometry, viewing) if np.isfinite(test.gain) else None,
     )
     return adjust_scan(
         patches, inputs.assumed_rad, *prior_and_log(components), thin_snow, reference_state, wider
@@ -202,8 +202,8 @@ def snow_test(gridder: Gridder, scan_geometry: ScanGeometry, viewing: ViewingGeo
     return ground_classes.snow_test(intensity, reference, stable_reference, wavelength_um)
 
 
-def _snow_shows(gridder: Gridder, scan_geometry: ScanGeometry, viewing: ViewingGeometry) -> bool:
-    """Return True if stable ground looks like under snow, beside rock that is too steep to hold it."""
+def _snow_shows(gridder: Gridder, scan_geometry: ScanGeometry, viewing: ViewingGeometry) -> bool | None:
+    """Return True if stable ground looks like under snow, beside rock too steep for it; None if unknown."""
     steep_rock = _observed(gridder, viewing, CellClass.BARE, CellClass.STEEP)
     cell_index = np.concatenate([_observed(gridder, viewing, CellClass.STABLE), steep_rock])
     cell, height_m, cell_class = (

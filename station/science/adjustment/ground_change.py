@@ -53,7 +53,9 @@ MEAN_LOG_PRIORS = (0.0, 3.0, 4.5)
 UNLIKELY_LOG_PRIOR = 12.0
 SNOW_LOG_PRIORS = (0.0, 3.0, UNLIKELY_LOG_PRIOR)
 SNOWFALL = 1  # index of the second
-SHOWN_SNOW_LOG_ODDS = 6.0  # by which snow is likelier where rock looks like it: in nineteen scans of twenty
+# By which snow is likelier: it has fallen in nineteen scans of twenty in which rock looks like it, and in one
+# of two in which brightness cannot tell.
+SHOWN_SNOW_LOG_ODDS = {False: 0.0, None: 3.0, True: 6.0}
 SMALL_TREND_LOG_PRIOR = 2.0  # against each factor e by which trends are smaller than the change between knots
 CORRELATION_AZIMUTH_KNOTS, CORRELATION_RANGE_KNOTS = 4.0, 2.5  # correlation lengths, in knots
 # Mean and sigma of thin snow over its largest depth: stable ground is bare as likely as under any depth that
@@ -133,13 +135,13 @@ class ThinSnow(NamedTuple):
 
     `temperature_c` is that of the air at the scanner, None if it was not measured, `max_depth_m` the largest
     depth that the brightness of a cell does not show, or `max_share` of the mean depth on moving ground.
-    `shows` if the brightness of many cells together tells that there is snow.
+    `shows` is True if the brightness of many cells together tells of snow, None if it cannot tell.
     """
 
     temperature_c: float | None = None
     max_depth_m: float = UNSEEN_SNOW_M
     max_share: float = UNSEEN_SNOW_SHARE
-    shows: bool = False
+    shows: bool | None = False
 
     def is_possible(self, patches: Patches) -> Bools:
         """Return True for patches (n,) where it is cold enough; everywhere if no temperature is known.
@@ -192,14 +194,15 @@ class GroundChange:
 
     def log_prior(self, model: ChangeModel) -> float:
         """Return the logarithm of the prior odds of a model, after what brightness tells of snow."""
-        shown = model.snow == SNOWFALL and self.thin_snow.shows
-        return model.log_prior + SHOWN_SNOW_LOG_ODDS * shown
+        if model.snow != SNOWFALL:
+            return model.log_prior
+        return model.log_prior + SHOWN_SNOW_LOG_ODDS[self.thin_snow.shows]
 
     def prior_m(self, model: ChangeModel) -> tuple[Floats, Floats]:
         """Return mean and sigma of the independent unknowns of a model [m]: trends, depths of snow, heave."""
         trends_m = np.full(TRENDS, TREND_SIZES_M[model.trend])
         trends_m[0] *= MEAN_RATIO
-        if model.snow == SNOWFALL and self.thin_snow.shows:
+        if model.snow == SNOWFALL and self.thin_snow.shows is not False:
             trends_m[0] = max(trends_m[0], self.thin_snow.max_depth_m)
         if model.mean:
             trends_m[0] = FREE_MEAN_SIGMA_M
@@ -289,7 +292,7 @@ def ground_change(patches: Patches, moving: Bools, thin_snow: ThinSnow = THIN_SN
         trends[1].shape[1] if trends[0].shape[1] else 0,
         snow_design.shape[1],
         heave_design.shape[1],
-        thin_snow._replace(shows=thin_snow.shows and bool(snowy.any())),
+        thin_snow._replace(shows=thin_snow.shows if snowy.any() else False),
         0.0,
         HEAVE_M,
     )

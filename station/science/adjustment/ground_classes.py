@@ -124,13 +124,14 @@ def snow_test(
 
 def snow_shows(
     intensity: Floats32, reference: Floats32, range_m: Reals, steep: Bools, wavelength_um: float
-) -> bool:
+) -> bool | None:
     """Return True if rock has become brighter, at 1550 nm darker, than rock too `steep` to hold snow.
+
+    None if there are too few cells of either kind, or without intensity.
 
     Snow that begins to cover the ground changes no cell (n,) by as much as `SnowTest` requires, but the mean
     of all. Cells are compared within rings, and with the range: haze darkens what is far away, exponentially.
-    Where there are few of either kind nothing shows. False alarms, such as rock that has dried, widen sigma.
-    Source: equations.md, 6.9.
+    False alarms, such as rock that has dried, widen sigma. Source: equations.md, 6.10.
     """
     ratio = _ratio(intensity, reference)
     known = ratio > 0
@@ -141,7 +142,7 @@ def snow_shows(
     log_ratio, design = columns[0], columns[1:]
     normal = design @ design.T
     if normal[0, 0] < MIN_GAIN_CELLS:
-        return False
+        return None
     inverse = np.linalg.pinv(normal)
     estimate = inverse @ design @ log_ratio
     sigma = np.sqrt(inverse[0, 0] * np.mean((log_ratio - estimate @ design) ** 2))

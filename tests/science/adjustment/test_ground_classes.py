@@ -153,11 +153,17 @@ def test_snow_that_no_cell_shows_is_seen_on_all_of_them(wavelength_um, seed):
         {"extinction_per_m": (0.5e-4, 4e-4)},
         {"extinction_per_m": (4e-4, 0.5e-4)},
         {"wetness": 0.7},  # rock, steep or not
-        {"cover": 0.06, "steep_cells": 30},  # too few to compare with
     ],
 )
 def test_neither_gain_nor_haze_nor_rain_looks_like_snow(wavelength_um, condition):
-    assert not any(shown(wavelength_um, seed=seed, **condition) for seed in range(20))
+    assert {shown(wavelength_um, seed=seed, **condition) for seed in range(20)} == {False}
+
+
+def test_brightness_cannot_tell_snow_with_little_steep_rock_or_none():
+    assert shown(NEAR_INFRARED_UM, cover=0.5, steep_cells=30) is None
+    dark = np.zeros(1000, np.float32)
+    steep = np.arange(1000) % 2 == 0
+    assert ground_classes.snow_shows(dark, dark, np.full(1000, 500.0), steep, NEAR_INFRARED_UM) is None
 
 
 @pytest.mark.parametrize("wavelength_um", [NEAR_INFRARED_UM, SHORT_WAVE_UM])

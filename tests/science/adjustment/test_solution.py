@@ -114,11 +114,11 @@ def test_thin_snow_is_none_or_of_any_depth_that_brightness_does_not_show(moderat
     assert sigma_m == pytest.approx(np.full(4, draws_m.std()), rel=0.03, abs=1e-5)
 
 
-def test_sigma_covers_thin_snow_that_brightness_shows():
+def test_sigma_covers_thin_snow_unless_brightness_shows_none():
     """Under 0 to 10 mm of snow on all ground, the scanner seems to have sunk by as much."""
     depths_m = np.random.default_rng(5).uniform(0, 0.01, 24)
     rms = {}
-    for shows in (False, True):
+    for shows in (False, None, True):
         z = []
         for seed, depth_m in enumerate(depths_m):
             _, change, size, solved = solve(
@@ -129,7 +129,7 @@ def test_sigma_covers_thin_snow_that_brightness_shows():
             z.append((mixture.estimate[size] - depth_m) / sigma_of(mixture, size + 1)[size])
         rms[shows] = np.sqrt(np.mean(np.square(z)))
     assert rms[False] > 1.6
-    assert 0.5 < rms[True] < 1.2
+    assert 0.5 < rms[True] < rms[None] < 1.25
 
 
 def test_rock_that_is_brighter_in_warm_air_is_not_under_snow():
