@@ -222,6 +222,19 @@ def test_snow_on_stable_ground_is_not_adjusted_as_tilt(snowfall):
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("brightness", ["linear", "none"])
+def test_the_first_snow_is_within_sigma(tmp_path, brightness):
+    """6 mm on all ground below 40 to 50 degrees, which look like a scanner that has sunk."""
+    z = []
+    for seed in SEEDS:
+        folder = tmp_path / f"station-{seed}"
+        scenario = replace(CALM, seed=seed, brightness=brightness, snowfall_m=0.4, snow_hours=(4.985, 5.985))
+        simulate(folder, scenario)
+        z.append(ProcessedStation(folder).area_z()[-1])
+    assert 0.3 < rms(z) < 1.5
+
+
+@pytest.mark.slow
 def test_snow_on_stable_ground_without_brightness_is_within_sigma(snowfall, tmp_path):
     """The same snowfall in scans whose intensity is zero: only steep rock is stable."""
     copy_of_inputs(snowfall, tmp_path / "station")

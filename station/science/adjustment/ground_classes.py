@@ -131,7 +131,7 @@ def snow_shows(
 
     Snow that begins to cover the ground changes no cell (n,) by as much as `SnowTest` requires, but the mean
     of all. Cells are compared within rings, and with the range: haze darkens what is far away, exponentially.
-    False alarms, such as rock that has dried, widen sigma. Source: equations.md, 6.10.
+    False alarms, such as rock that has dried, widen sigma. Source: equations.md, 6.22.
     """
     ratio = _ratio(intensity, reference)
     known = ratio > 0
