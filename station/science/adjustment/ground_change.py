@@ -279,9 +279,8 @@ def ground_change(patches: Patches, moving: Bools, thin_snow: ThinSnow = THIN_SN
     trends = [_trends(patches, share) for share in shares]
     trend_design = sparse.hstack(trends, format="csr")
     snow_design = sparse.csr_array((len(moving), 0))
-    snowy = ~moving & thin_snow.is_possible(patches)
     if moving.any():
-        snow_design = _thin_snow(patches, snowy)
+        snow_design = _thin_snow(patches, ~moving & thin_snow.is_possible(patches))
     heave_design = _heave(patches, ~moving)
     return GroundChange(
         sparse.hstack([trend_design, knot_design, snow_design, heave_design], format="csr"),
@@ -292,7 +291,7 @@ def ground_change(patches: Patches, moving: Bools, thin_snow: ThinSnow = THIN_SN
         trends[1].shape[1] if trends[0].shape[1] else 0,
         snow_design.shape[1],
         heave_design.shape[1],
-        thin_snow._replace(shows=thin_snow.shows if snowy.any() else False),
+        thin_snow._replace(shows=thin_snow.shows if snow_design.nnz else False),
         0.0,
         HEAVE_M,
     )
