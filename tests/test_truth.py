@@ -225,12 +225,11 @@ def test_snow_on_stable_ground_is_not_adjusted_as_tilt(snowfall):
 @pytest.mark.parametrize("brightness", ["linear", "none"])
 def test_the_first_snow_is_within_sigma(tmp_path, brightness):
     """6 mm on all ground below 40 to 50 degrees, which look like a scanner that has sunk."""
+    snowy = replace(CALM, hours=4, brightness=brightness, snowfall_m=0.4, snow_hours=(2.985, 3.985))
     z = []
-    for seed in SEEDS:
-        folder = tmp_path / f"station-{seed}"
-        scenario = replace(CALM, seed=seed, brightness=brightness, snowfall_m=0.4, snow_hours=(4.985, 5.985))
-        simulate(folder, scenario)
-        z.append(ProcessedStation(folder).area_z()[-1])
+    for seed in SEEDS[:4]:
+        simulate(tmp_path / f"station-{seed}", replace(snowy, seed=seed))
+        z += ProcessedStation(tmp_path / f"station-{seed}", first=REFERENCE).area_z().tolist()
     assert 0.3 < rms(z) < 1.5
 
 
