@@ -222,15 +222,18 @@ def test_snow_on_stable_ground_is_not_adjusted_as_tilt(snowfall):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("brightness", ["linear", "none"])
-def test_the_first_snow_is_within_sigma(tmp_path, brightness):
-    """6 mm on all ground below 40 to 50 degrees, which look like a scanner that has sunk."""
-    snowy = replace(CALM, hours=4, brightness=brightness, snowfall_m=0.4, snow_hours=(2.985, 3.985))
+@pytest.mark.parametrize(("brightness", "largest"), [("linear", 1.25), ("none", 2.0)])
+def test_the_first_snow_is_within_sigma(tmp_path, brightness, largest):
+    """6 mm on all ground below 40 to 50 degrees, which look like a scanner that has sunk: else z is 4 to 5.
+
+    Without brightness snow is no likelier than none, and σ covers not all of it.
+    """
     z = []
-    for seed in SEEDS[:4]:
-        simulate(tmp_path / f"station-{seed}", replace(snowy, seed=seed))
-        z += ProcessedStation(tmp_path / f"station-{seed}", first=REFERENCE).area_z().tolist()
-    assert 0.3 < rms(z) < 1.5
+    for seed in SEEDS[:3]:
+        snowy = replace(named("snowfall", 7, seed), brightness=brightness, snow_hours=(6.0, 14.0))
+        simulate(tmp_path / f"station-{seed}", snowy)
+        z += ProcessedStation(tmp_path / f"station-{seed}", reference=5, first=6).area_z().tolist()
+    assert 0.5 < rms(z) < largest
 
 
 @pytest.mark.slow

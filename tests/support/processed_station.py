@@ -18,9 +18,10 @@ BOX = 10  # cells of 10 m
 
 
 class ProcessedStation:
-    """A simulated station, processed, optionally with changes of its site file."""
+    """A simulated station, processed from a scan on, optionally with changes of its site file."""
 
-    def __init__(self, folder, *changes, first=REFERENCE):
+    def __init__(self, folder, *changes, first=None, reference=REFERENCE):
+        first = reference if first is None else first
         self.folder, name = folder, "site"
         if changes:
             name = f"other-{len(list(folder.glob('*.toml')))}"
@@ -36,13 +37,13 @@ class ProcessedStation:
             log = log if self.site.inclination and log.is_file() else None
             status = path.stat()
             scans.append(ScanFile(path.name, path, log, status.st_size, status.st_mtime_ns))
-        reference_tasks.build_reference_version(self.site, scans[:REFERENCE], "1", lambda: None)
+        reference_tasks.build_reference_version(self.site, scans[:reference], "1", lambda: None)
         self.results = [scan_tasks.process(self.site, scan, lambda: None) for scan in scans[first:]]
         store_tasks.update_series(self.site, lambda: None)
         with open_with_processing(self.site.station.data) as series:
             self.series = series.load()
         truth = xr.open_dataset(folder / "truth.nc").load()
-        before = truth.change[:REFERENCE].mean("time")
+        before = truth.change[:reference].mean("time")
         self.true_change = (truth.change[first:] - before).values
         self.true_elevation = truth.elevation[first:].values
         self.stable = truth.stable_polygons.values.astype(bool)

@@ -53,9 +53,9 @@ MEAN_LOG_PRIORS = (0.0, 3.0, 4.5)
 UNLIKELY_LOG_PRIOR = 12.0
 SNOW_LOG_PRIORS = (0.0, 3.0, UNLIKELY_LOG_PRIOR)
 SNOWFALL = 1  # index of the second
-# By which snow is likelier: it has fallen in nineteen scans of twenty in which rock looks like it, and in one
-# of two in which brightness cannot tell.
-SHOWN_SNOW_LOG_ODDS = {False: 0.0, None: 3.0, True: 6.0}
+# By which snow is likelier: where brightness cannot tell, it has fallen in one scan of two. Where rock looks
+# like it there is hardly a doubt; at odds of only e^3 a scanner that sank was likelier than 6 mm of snow.
+SHOWN_SNOW_LOG_ODDS = {False: 0.0, None: 3.0, True: 9.0}
 SMALL_TREND_LOG_PRIOR = 2.0  # against each factor e by which trends are smaller than the change between knots
 CORRELATION_AZIMUTH_KNOTS, CORRELATION_RANGE_KNOTS = 4.0, 2.5  # correlation lengths, in knots
 # Mean and sigma of thin snow over its largest depth: stable ground is bare as likely as under any depth that
