@@ -224,9 +224,9 @@ def test_snow_on_stable_ground_is_not_adjusted_as_tilt(snowfall):
 @pytest.mark.slow
 @pytest.mark.parametrize(("brightness", "largest"), [("linear", 1.25), ("none", 2.0)])
 def test_the_first_snow_is_within_sigma(tmp_path, brightness, largest):
-    """6 mm on all ground below 40 to 50 degrees, which look like a scanner that has sunk: else z is 4 to 5.
+    """6 mm on all ground below 40 to 50 degrees, which look like a scanner that sank: z was 4 to 6.
 
-    Without brightness snow is no likelier than none, and σ covers not all of it.
+    Without brightness snow is no likelier than none, which does not cover all of the error.
     """
     z = []
     for seed in SEEDS[:3]:

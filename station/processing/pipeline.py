@@ -203,7 +203,7 @@ def snow_test(gridder: Gridder, scan_geometry: ScanGeometry, viewing: ViewingGeo
 
 
 def _snow_shows(gridder: Gridder, scan_geometry: ScanGeometry, viewing: ViewingGeometry) -> bool | None:
-    """Return True if stable ground looks like under snow, beside rock too steep for it; None if unknown."""
+    """Return True if brightness shows snow on stable ground, False if none, None if it cannot tell."""
     steep_rock = _observed(gridder, viewing, CellClass.BARE, CellClass.STEEP)
     cell_index = np.concatenate([_observed(gridder, viewing, CellClass.STABLE), steep_rock])
     cell, height_m, cell_class = (

@@ -27,9 +27,9 @@ DARK_SNOW_RATIOS = (0.55, 1 / 0.55)
 UNSEEN_SNOW_M, UNSEEN_DARK_SNOW_M = 0.01, 0.02
 # The same of deep snow, over its depth on other ground: cover times a tenth, which steep rock holds (ibid.).
 UNSEEN_SNOW_SHARE, UNSEEN_DARK_SNOW_SHARE = 0.02, 0.067
-# Logarithm of the change in brightness from which rock looks snowy, on the mean of many cells, beside steep
-# rock. Without snow it is within 0.01 on simulated stations, and 0.03 to 0.07 under 6 mm that begin to cover
-# rock at 5 mm.
+# Logarithm of the change in brightness from which rock shows snow, on the mean of many cells and against
+# steep rock, and the same in sigmas. On simulated stations it is within 0.008 of zero without snow, and 0.03
+# to 0.09 under 6 mm, which begins to cover rock where it is deepest (equations.md, 6.22).
 SNOWY_LOG_RATIO, SNOWY_SIGMAS = 0.02, 3.0
 MAX_GAIN_CHANGE = 0.15  # of the receiver, usually 5 % from scan to scan; beyond, the ground has changed
 MIN_GAIN_CELLS = 50
@@ -125,9 +125,9 @@ def snow_test(
 def snow_shows(
     intensity: Floats32, reference: Floats32, range_m: Reals, steep: Bools, wavelength_um: float
 ) -> bool | None:
-    """Return True if rock has become brighter, at 1550 nm darker, than rock too `steep` to hold snow.
+    """Return True if rock has become brighter, at 1550 nm darker, against rock too `steep` to hold snow.
 
-    None if there are too few cells of either kind, or without intensity.
+    False if it has not, None if there are too few cells of either kind, or without intensity.
 
     Snow that begins to cover the ground changes no cell (n,) by as much as `SnowTest` requires, but the mean
     of all. Cells are compared within rings, and with the range: haze darkens what is far away, exponentially.
