@@ -25,6 +25,7 @@ RANGE_CLASS_M = 500.0
 RATIO_EDGES = (0.025, 0.05, 0.1, 0.2, 0.4, 0.8)  # between classes of the sampling ratio
 RATIO_CLASSES = len(RATIO_EDGES) + 1
 MIN_GROUP_CELLS = 3  # of cells whose mean is taken off
+WEIGHT_PASSES = 2  # the second weights the cells of a group by the factors that the first found
 MIN_CLASS_CELLS = 30  # in a class: fewer do not show a variance
 PRIOR_CELLS = 30.0  # weight of the model against the cells of a class
 # Stable cells of a class, at any number of points, from which moving ground is not used: it may have changed.
@@ -128,23 +129,33 @@ def _random_factors(residuals: Residuals) -> Floats32:
     A class is drawn to the common factor of its roughness, scatter and number of points at all ranges, that
     to the one of any number of points, and that to the model.
     """
-    weight = 1 / (residuals.scan_m2 + residuals.reference_m2).astype(np.float64)
-    groups = int(residuals.group.max(initial=0)) + 1
-    count = np.bincount(residuals.group, minlength=groups)
-    weight_sum = np.bincount(residuals.group, weight, groups)
-    sum_m = np.bincount(residuals.group, weight * residuals.residual_m, groups)
-    mean_m = sum_m / np.maximum(weight_sum, np.finfo(float).tiny)
-    own_share = weight / weight_sum[residuals.group]
-    ratio = (residuals.residual_m - mean_m[residuals.group]) * np.sqrt(
-        weight / np.maximum(1 - own_share, 1 / MIN_GROUP_CELLS)
-    )
-    usable = count[residuals.group] >= MIN_GROUP_CELLS
     in_scan, of_cells = np.divmod(np.arange(NOISE_CLASSES), CELL_CLASSES)
     roughness = _ratio_class(of_cells) + RATIO_CLASSES * in_scan
     factors = np.ones(NOISE_CLASSES, np.float32)
-    for classes in (roughness % (2 * RATIO_CLASSES), roughness, np.arange(NOISE_CLASSES)):
-        factors = _factors_by_class(residuals, ratio, usable, classes, factors)
+    for _ in range(WEIGHT_PASSES):
+        ratio, usable = _local_deviations(residuals, factors)
+        factors = np.ones(NOISE_CLASSES, np.float32)
+        for classes in (roughness % (2 * RATIO_CLASSES), roughness, np.arange(NOISE_CLASSES)):
+            factors = _factors_by_class(residuals, ratio, usable, classes, factors)
     return factors
+
+
+def _local_deviations(residuals: Residuals, factors: Floats32) -> tuple[Floats, Bools]:
+    """Return deviations (n,) from the means of groups over their modelled sigma, and which of them to use.
+
+    Means are weighted as the factors (2048,) of the random variance make the cells.
+    """
+    model_m2 = (residuals.scan_m2 + residuals.reference_m2).astype(np.float64)
+    weight = 1 / (residuals.scan_m2 * factors[residuals.noise_class] + residuals.reference_m2)
+    groups = int(residuals.group.max(initial=0)) + 1
+    count, weight_sum, sum_m = (
+        np.bincount(residuals.group, values, groups)
+        for values in (None, weight, weight * residuals.residual_m)
+    )
+    mean_m = sum_m / np.maximum(weight_sum, np.finfo(float).tiny)
+    others_share = np.maximum(1 - weight / weight_sum[residuals.group], 1 / MIN_GROUP_CELLS)
+    deviation_m = residuals.residual_m - mean_m[residuals.group]
+    return deviation_m / np.sqrt(model_m2 * others_share), count[residuals.group] >= MIN_GROUP_CELLS
 
 
 def _factors_by_class(

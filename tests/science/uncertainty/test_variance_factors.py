@@ -104,6 +104,14 @@ def test_cells_with_a_shot_too_many_have_a_factor_of_their_own():
     assert found.median_random == pytest.approx(0.25, rel=0.05)
 
 
+def test_cells_that_err_far_more_than_modelled_do_not_blur_the_means_around_the_others():
+    """Weighted as modelled, the mean of a group of 100 cells has a variance of 0.4: ten times a cell's."""
+    observed, wild = with_a_shot_too_many(residuals(7, (0.04, 0.04), reference_share=0.01), 0.1)
+    residual_m = np.where(wild, 100, 1) * observed.residual_m
+    found = estimate_variance_factors(Residuals(**{**vars(observed), "residual_m": residual_m})).random
+    assert found[np.unique(observed.noise_class[~wild])] == pytest.approx(np.full(2, 0.04), rel=0.05)
+
+
 def test_few_cells_with_a_shot_too_many_have_the_factor_of_the_others():
     observed, more = with_a_shot_too_many(residuals(7, (0.25, 0.25)), 5e-5)
     found = estimate_variance_factors(observed).random[np.unique(observed.noise_class[more])]
