@@ -1,8 +1,8 @@
 """Variance factors of one scan: how much more or less its residuals scatter than modelled.
 
-Small residuals, of cells against the cells around them, show the random variance by range and roughness. Mean
-residuals of blocks of stable ground show the systematic variance. Both are compared with the model and drawn
-towards it where there are few; the factors are applied and stored.
+Residuals of cells against a plane through the cells around show the random variance by range and roughness.
+Mean residuals of blocks of stable ground show the systematic variance. Both are compared with the model and
+drawn towards it where there are few; the factors are applied and stored.
 Source: equations.md, 6.7.
 """
 
@@ -24,8 +24,8 @@ NOISE_CLASSES = CELL_CLASSES * 2 * (len(COUNT_EDGES) + 1)
 RANGE_CLASS_M = 500.0
 RATIO_EDGES = (0.025, 0.05, 0.1, 0.2, 0.4, 0.8)  # between classes of the sampling ratio
 RATIO_CLASSES = len(RATIO_EDGES) + 1
-MIN_GROUP_CELLS = 3  # of cells whose mean is taken off
-WEIGHT_PASSES = 2  # the second weights the cells of a group by the factors that the first found
+MIN_GROUP_CELLS = 6  # of cells through which a plane is laid
+WEIGHT_PASSES = 3  # each weights the cells of a group by the factors that the one before found
 MIN_CLASS_CELLS = 30  # in a class: fewer do not show a variance
 PRIOR_CELLS = 30.0  # weight of the model against the cells of a class
 # Stable cells of a class, at any number of points, from which moving ground is not used: it may have changed.
@@ -124,7 +124,7 @@ def estimate_variance_factors(residuals: Residuals) -> VarianceFactors:
 
 
 def _random_factors(residuals: Residuals) -> Floats32:
-    """Return the factor of the random variance by noise class (2048,), from deviations from means of groups.
+    """Return the factor of the random variance by noise class (2048,), from deviations within groups.
 
     A class is drawn to the common factor of its roughness, scatter and number of points at all ranges, that
     to the one of any number of points, and that to the model.
@@ -141,21 +141,34 @@ def _random_factors(residuals: Residuals) -> Floats32:
 
 
 def _local_deviations(residuals: Residuals, factors: Floats32) -> tuple[Floats, Bools]:
-    """Return deviations (n,) from the means of groups over their modelled sigma, and which of them to use.
+    """Return deviations (n,) from planes through groups over their modelled sigma, and which of them to use.
 
-    Means are weighted as the factors (2048,) of the random variance make the cells.
+    Change slopes, as drifts of snow do, and ends at stable ground, which has planes of its own. Cells are
+    weighted as the factors (2048,) of the random variance say.
     """
     model_m2 = (residuals.scan_m2 + residuals.reference_m2).astype(np.float64)
     weight = 1 / (residuals.scan_m2 * factors[residuals.noise_class] + residuals.reference_m2)
-    groups = int(residuals.group.max(initial=0)) + 1
-    count, weight_sum, sum_m = (
-        np.bincount(residuals.group, values, groups)
-        for values in (None, weight, weight * residuals.residual_m)
+    group = 2 * residuals.group + residuals.stable
+    groups, count = int(group.max(initial=0)) + 1, np.bincount(group)
+    tiny = np.finfo(float).tiny
+
+    def total(values: Reals) -> Floats:
+        return np.asarray(np.bincount(group, weight * values, groups), np.float64)
+
+    weight_sum = np.maximum(np.bincount(group, weight, groups), tiny)
+    x_m, y_m, deviation_m = (
+        values - (total(values) / weight_sum)[group]
+        for values in (residuals.x_m, residuals.y_m, residuals.residual_m)
     )
-    mean_m = sum_m / np.maximum(weight_sum, np.finfo(float).tiny)
-    others_share = np.maximum(1 - weight / weight_sum[residuals.group], 1 / MIN_GROUP_CELLS)
-    deviation_m = residuals.residual_m - mean_m[residuals.group]
-    return deviation_m / np.sqrt(model_m2 * others_share), count[residuals.group] >= MIN_GROUP_CELLS
+    xx, yy, xy = total(x_m**2) + weight_sum, total(y_m**2) + weight_sum, total(x_m * y_m)
+    xd, yd = total(x_m * deviation_m), total(y_m * deviation_m)
+    determinant = np.maximum(xx * yy - xy**2, tiny)
+    x_slope, y_slope = (yy * xd - xy * yd) / determinant, (xx * yd - xy * xd) / determinant
+    deviation_m = deviation_m - x_slope[group] * x_m - y_slope[group] * y_m
+    squared = yy[group] * x_m**2 - 2 * xy[group] * x_m * y_m + xx[group] * y_m**2
+    leverage = weight * (1 / weight_sum[group] + squared / determinant[group])
+    others_share = np.maximum(1 - leverage, 1 / MIN_GROUP_CELLS)
+    return deviation_m / np.sqrt(model_m2 * others_share), count[group] >= MIN_GROUP_CELLS
 
 
 def _factors_by_class(

@@ -154,6 +154,14 @@ def test_change_of_moving_ground_does_not_widen_the_noise_of_stable_ground():
     assert estimate_variance_factors(changed).random[:2] == pytest.approx([1, 1], rel=0.03)
 
 
+def test_change_that_slopes_is_not_noise():
+    """Melt that grows by 3 mm every 2 m differs by 22 mm (sigma) within a group: as much as the noise."""
+    quiet = residuals(3, (1.0, 4.0), stable_share=0.0)
+    melt_m = -0.0015 * quiet.x_m
+    changed = Residuals(**{**vars(quiet), "residual_m": quiet.residual_m + melt_m})
+    assert estimate_variance_factors(changed).random[:2] == pytest.approx([1, 4], rel=0.03)
+
+
 @pytest.mark.parametrize("drift_m", [0.3, 1.0])
 def test_drifts_on_ground_without_any_stable_ground_do_not_count_as_noise(drift_m):
     quiet = residuals(3, (1.0, 4.0), stable_share=0.0)
