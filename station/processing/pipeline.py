@@ -160,8 +160,8 @@ def adjust_to_reference(
     If it has moved farther than expected, it is estimated again with a prior as wide as the motion.
     """
     components, reference_state = usual_motion(viewing.reference, inputs.time_s), viewing.reference.shared
-    test = snow_test(gridder, scan_geometry, viewing)
-    cells = _cells(gridder, viewing, test)
+    test = _snow_test(gridder, scan_geometry, viewing)
+    cells = _cells(gridder, viewing, under_snow(gridder, scan_geometry, viewing))
     extent_m = line_length(scan_geometry.grid, scan_geometry.scanner.range_max_m)
     patches = aggregate_patches(inputs.params, cells, *extent_m)
 
@@ -194,7 +194,21 @@ def usual_motion(reference: Reference, time_s: float) -> VarianceComponents:
     return variance_components.after(reference.components, elapsed_s if np.isfinite(elapsed_s) else 0.0)
 
 
-def snow_test(gridder: Gridder, scan_geometry: ScanGeometry, viewing: ViewingGeometry) -> SnowTest:
+def under_snow(gridder: Gridder, scan_geometry: ScanGeometry, viewing: ViewingGeometry) -> Bools:
+    """Return True for cells (n,) of a reference: of stable ground whose snow has changed or may have."""
+    stable = viewing.select(CellClass.STABLE)
+    stable = stable[gridder.count[stable] > 0]
+    brightness = _intensity(gridder, viewing, stable)
+    cell, cell_class = (viewing.cells[name][:].take(stable) for name in ("cell", "cell_class"))
+    test = _snow_test(gridder, scan_geometry, viewing)
+    changed = test.changed(*brightness, (cell_class & np.uint8(CellClass.STEEP)) > 0)
+    changed |= ground_classes.beside_snow(cell, test.shows(*brightness), viewing.grid)
+    snow = np.zeros(gridder.reference_cells, bool)
+    snow[stable] = changed
+    return snow
+
+
+def _snow_test(gridder: Gridder, scan_geometry: ScanGeometry, viewing: ViewingGeometry) -> SnowTest:
     """Return the test of a gridded scan for snow on stable ground."""
     intensity, reference = _stable_intensity(gridder, viewing, CellClass.STEEP)
     _, stable_reference = _stable_intensity(gridder, viewing)
@@ -229,7 +243,7 @@ def no_brightness(gridder: Gridder, scan_geometry: ScanGeometry, viewing: Viewin
         known = np.isfinite(intensity) & np.isfinite(reference)
     if not (known.mean() > MIN_BRIGHTNESS_SHARE if len(known) else gridder.has_intensity):
         return verdict.NO_BRIGHTNESS
-    if viewing is None or np.isfinite(snow_test(gridder, scan_geometry, viewing).gain):
+    if viewing is None or np.isfinite(_snow_test(gridder, scan_geometry, viewing).gain):
         return ""
     return verdict.BRIGHT_GROUND
 
@@ -253,7 +267,7 @@ def _intensity(gridder: Gridder, viewing: ViewingGeometry, cell_index: Ints) -> 
     return gridder.intensity(cell_index), viewing.cells["intensity"][:].take(cell_index)
 
 
-def _cells(gridder: Gridder, viewing: ViewingGeometry, test: SnowTest) -> Iterator[CellObservations]:
+def _cells(gridder: Gridder, viewing: ViewingGeometry, snow: Bools) -> Iterator[CellObservations]:
     """Yield the cells that an adjustment uses, in the order of the head's azimuth."""
     for first, all_cells in viewing.sectors(sampled=True):
         sums = gridder.sums(first, first + len(all_cells))
@@ -271,9 +285,7 @@ def _cells(gridder: Gridder, viewing: ViewingGeometry, test: SnowTest) -> Iterat
                 sector.in_class(CellClass.STABLE),
                 sector.in_class(CellClass.HOLDOUT),
                 sector.in_class(CellClass.SMOOTH),
-                test.changed(
-                    sums.intensity(), viewing.intensity(first + observed), sector.in_class(CellClass.STEEP)
-                ),
+                snow[first + observed],
             ),
             sums.mean_residual() - sector.mean_residual_m,
             sector.point_variance_m2 / sums.count + sector.reference_variance_m2,
@@ -343,9 +355,9 @@ def measure(
     if adjustment is None and posterior is not None and viewing is not None:
         posterior = propagation.difference_to_reference(posterior, viewing.reference.shared)
     correction = None if adjustment is None else partial(height_correction, adjustment)
-    test = None if adjustment is None or viewing is None else snow_test(gridder, scan_geometry, viewing)
+    snow = None if adjustment is None or viewing is None else under_snow(gridder, scan_geometry, viewing)
     estimator = CellEstimator(
-        scan_geometry, posterior, independent, correction, test, factors.random, position_errors
+        scan_geometry, posterior, independent, correction, snow, factors.random, position_errors
     )
     return estimate_cells(gridder, viewing, estimator)
 

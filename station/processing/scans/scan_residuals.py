@@ -8,7 +8,7 @@ from functools import cached_property
 
 import numpy as np
 
-from station.processing.pipeline import AdjustmentInputs, height_correction, snow_test
+from station.processing.pipeline import AdjustmentInputs, height_correction, under_snow
 from station.quantities import Ints, Reals, ScanGeometry, SharedParameters
 from station.science.adjustment.joint import Adjustment
 from station.science.gridding.gridder import CellSums, Gridder
@@ -26,7 +26,7 @@ from station.science.uncertainty.variance_factors import (
 )
 
 MAX_RESIDUALS = 100_000  # of more cells a sample tells the variance factors
-GROUP_M = 40.0  # range extent of cells whose mean is subtracted; in azimuth one knot of the tilt
+GROUP_M = 40.0  # range extent of cells through which a plane is laid; in azimuth one knot of the tilt
 MAX_GROUPS = 1000  # by range
 
 
@@ -126,11 +126,9 @@ def variance_factors(
     positions: PositionErrors | None = None,
 ) -> VarianceFactors:
     """Return the variance factors of an adjusted scan."""
-    test, parts = snow_test(gridder, scan_geometry, viewing), []
+    snow, parts = under_snow(gridder, scan_geometry, viewing), []
     for cells in sampled_cells(gridder, viewing, adjustment):
         sector, sums, jacobian = cells.sector, cells.sums, cells.jacobian
-        intensity, steep = viewing.intensity(cells.cell_index), sector.in_class(CellClass.STEEP)
-        snow = test.changed(gridder.intensity(cells.cell_index), intensity, steep)
         scan_m2, systematic_m2 = cells.point_m2 / sums.count, jacobian.variance(posterior)
         if positions is not None:
             own_m2 = positions.height_variances(cells.cell_index, sector.cell, jacobian, cells.offset_m)
@@ -145,7 +143,7 @@ def variance_factors(
                     sums.count.astype(np.float32),
                     sector.point_count,
                 ),
-                sector.in_class(CellClass.STABLE) & ~snow,
+                sector.in_class(CellClass.STABLE) & ~snow[cells.cell_index],
                 cells.residual_m.astype(np.float32),
                 scan_m2,
                 sector.reference_variance_m2,

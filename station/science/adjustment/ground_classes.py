@@ -22,6 +22,7 @@ DARK_SNOW_UM = 1.4  # wavelength from which snow is darker than rock: water and 
 # to 20 % and rock 20 to 50 %. Rock that is wet now, 0.6 times as bright at worst, stays within.
 BRIGHT_SNOW_RATIOS = (0.5, 1.25)
 DARK_SNOW_RATIOS = (0.55, 1 / 0.55)
+MIN_SNOWY_NEIGHBOURS = 3  # of a cell that has a little snow too
 # Largest depth of patchy snow that stays within these limits. An estimate: some 3 cm cover rock, and bright
 # snow shows when it covers a fifth of a cell, dark snow when it covers two thirds.
 UNSEEN_SNOW_M, UNSEEN_DARK_SNOW_M = 0.01, 0.02
@@ -87,12 +88,35 @@ class SnowTest:
     def changed(self, intensity: Floats32, reference: Floats32, steep: Bools) -> Bools:
         """Return True for cells (n,) where snow came or went, or, unless they are `steep`, may have.
 
-        Snow at 1064 nm makes a cell brighter, at 1550 nm darker. Where either intensity is NaN, or the gain,
-        only the slope tells.
+        Where either intensity is NaN, or the gain, only the slope tells.
         """
-        ratio = _ratio(intensity, reference) / np.float32(self.gain)
+        ratio = self._ratio(intensity, reference)
+        return self.shows(intensity, reference) | (np.isnan(ratio) & ~steep)
+
+    def shows(self, intensity: Floats32, reference: Floats32) -> Bools:
+        """Return True for cells (n,) where snow came or went: brighter or, at 1550 nm, darker by it."""
+        ratio = self._ratio(intensity, reference)
         lowest, highest = self.ratios
-        return np.where(np.isfinite(ratio), (ratio < lowest) | (ratio > highest), ~steep)
+        return np.asarray((ratio < lowest) | (ratio > highest))
+
+    def _ratio(self, intensity: Floats32, reference: Floats32) -> Floats32:
+        return _ratio(intensity, reference) / np.float32(self.gain)
+
+
+def beside_snow(cell: Ints, shows: Bools, grid: Grid) -> Bools:
+    """Return True for cells (n,) of a grid of whose eight neighbours at least three show snow.
+
+    A little snow lies on them too, which raises them by centimetres and their brightness by less than the
+    limits.
+    """
+    width = grid.nx + 2  # with a margin around the grid
+    row, column = grid.row_and_column(cell)
+    padded = (row + 1) * width + column + 1
+    snowy = padded[shows]
+    neighbours = np.zeros((grid.ny + 2) * width, np.uint8)
+    for step in (-width - 1, -width, -width + 1, -1, 1, width - 1, width, width + 1):
+        neighbours[snowy + step] += 1
+    return np.asarray(neighbours[padded] >= MIN_SNOWY_NEIGHBOURS)
 
 
 def snow_test(

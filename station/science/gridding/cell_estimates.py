@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from station.quantities import (
     CELL_DTYPE,
+    Bools,
     Floats,
     Floats32,
     Ints,
@@ -21,7 +22,6 @@ from station.quantities import (
     SharedParameters,
     Viewpoint,
 )
-from station.science.adjustment.ground_classes import SnowTest
 from station.science.geometry.observation import Observation
 from station.science.gridding import significance
 from station.science.gridding.cells_outside import CellsOutside, iter_cells_outside
@@ -142,16 +142,17 @@ class CellEstimator:
     """Corrects the cells of a scan for the adjustment and estimates their uncertainty.
 
     `posterior` are the shared parameters of the difference from the reference, `independent` those of the
-    scan alone, None if unknown. `correction` returns what to subtract from heights [m], and `snow_test` tells
-    which stable ground is under snow; both are None without an adjustment. `variance_factors` (2048,) are
-    those of the random variance by noise class, `position_errors` those of several scan positions.
+    scan alone, None if unknown. `correction` returns what to subtract from heights [m], and `under_snow` (m,)
+    is True for those cells of the reference that are stable ground whose snow may have changed; both are
+    None without an adjustment. `variance_factors` (2048,) are those of the random variance by noise class,
+    `position_errors` those of several scan positions.
     """
 
     scan_geometry: ScanGeometry
     posterior: SharedParameters | None
     independent: SharedParameters | None
     correction: Callable[[HeightJacobian], Reals] | None
-    snow_test: SnowTest | None
+    under_snow: Bools | None
     variance_factors: Floats32
     position_errors: PositionErrors | None = None
 
@@ -191,11 +192,9 @@ class CellEstimator:
         flags |= Quality.HIGH_INCIDENCE * sector.in_class(CellClass.GRAZING).view(np.uint8)
         flags |= Quality.CHANGE_SIGNIFICANT * significance.significant(change_m, sigma_m).view(np.uint8)
         flags |= Quality.BARE_GROUND * sector.in_class(CellClass.BARE).view(np.uint8)
-        if self.snow_test is not None:
-            changed = self.snow_test.changed(
-                sums.intensity(), viewing.intensity(cell_index), sector.in_class(CellClass.STEEP)
-            )
-            flags |= Quality.STABLE_GROUND * (sector.in_class(CellClass.STABLE) & ~changed).view(np.uint8)
+        if self.under_snow is not None:
+            stable = sector.in_class(CellClass.STABLE) & ~self.under_snow[cell_index]
+            flags |= Quality.STABLE_GROUND * stable.view(np.uint8)
         height_m = sector.height_m.astype(np.float64) + sector.mean_residual_m
         elevation_m = viewing.datum_m + (height_m + change_m)
         return _CellEstimates(elevation_m, change_m, sigma_m, np.sqrt(random_m2), flags, terms)

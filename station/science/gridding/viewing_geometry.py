@@ -141,11 +141,6 @@ class ViewingGeometry:
                 columns = {field.name: self.cells[field.name][first:end] for field in fields(AzimuthSector)}
                 yield first, AzimuthSector(**columns)
 
-    def intensity(self, cell_index: Ints) -> Floats32:
-        """Intensity of the reference, 0-1, in cells (n,) of a sector, by ascending index."""
-        first, last = cell_index[0], cell_index[-1]
-        return np.asarray(self.cells["intensity"][first : last + 1].take(cell_index - first))
-
     def select(self, *classes: CellClass) -> Ints:
         """Return the indices (m,) of the cells that belong to all the given classes."""
         mask = np.uint8(sum(classes))

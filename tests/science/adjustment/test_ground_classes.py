@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from scipy import ndimage
 
 from station.quantities import Grid
 from station.science.adjustment import ground_classes
@@ -190,6 +191,20 @@ def test_gain_is_the_common_factor_of_the_receiver_but_not_of_snow(snow_share, c
 def test_a_few_cells_tell_no_gain():
     few = np.full(49, 0.3, np.float32)
     assert ground_classes.snow_test(few * np.float32(1.1), few, few, NEAR_INFRARED_UM).gain == 1.0
+
+
+def test_a_cell_beside_three_snowy_ones_has_a_little_snow_too():
+    """Compared with a convolution, at the edges of the grid and beside cells that are not stable as well."""
+    rng = np.random.default_rng(6)
+    grid = Grid(0.0, 300.0, 5.0, 80, 60)
+    stable, snowy = rng.random((2, *grid.shape)) < np.array([0.8, 0.3])[:, None, None]
+    around = ndimage.convolve((stable & snowy).astype(int), np.ones((3, 3), int), mode="constant")
+    expected = around - (stable & snowy) >= 3
+    cell = np.flatnonzero(stable)
+    actual = ground_classes.beside_snow(cell, snowy.flat[cell], grid)
+    assert np.array_equal(actual, expected.flat[cell])
+    assert 0.1 < actual.mean() < 0.5
+    assert not ground_classes.beside_snow(cell, np.zeros(len(cell), bool), grid).any()
 
 
 def decibel_field(reflectance):
