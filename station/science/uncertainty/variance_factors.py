@@ -24,7 +24,8 @@ NOISE_CLASSES = CELL_CLASSES * 2 * (len(COUNT_EDGES) + 1)
 RANGE_CLASS_M = 500.0
 RATIO_EDGES = (0.025, 0.05, 0.1, 0.2, 0.4, 0.8)  # between classes of the sampling ratio
 RATIO_CLASSES = len(RATIO_EDGES) + 1
-MIN_GROUP_CELLS = 6  # of cells through which a plane is laid
+MIN_GROUP_CELLS = 3  # of cells whose mean is taken off
+MIN_PLANE_CELLS = 12  # of cells through which a plane is laid
 WEIGHT_PASSES = 3  # each weights the cells of a group by the factors that the one before found
 MIN_CLASS_CELLS = 30  # in a class: fewer do not show a variance
 PRIOR_CELLS = 30.0  # weight of the model against the cells of a class
@@ -162,7 +163,8 @@ def _local_deviations(residuals: Residuals, factors: Floats32) -> tuple[Floats, 
     )
     xx, yy, xy = total(x_m**2) + weight_sum, total(y_m**2) + weight_sum, total(x_m * y_m)
     xd, yd = total(x_m * deviation_m), total(y_m * deviation_m)
-    determinant = np.maximum(xx * yy - xy**2, tiny)
+    # Fewer cells have the mean alone: a determinant without bound makes slopes and their leverage 0.
+    determinant = np.where(count >= MIN_PLANE_CELLS, np.maximum(xx * yy - xy**2, tiny), np.inf)
     x_slope, y_slope = (yy * xd - xy * yd) / determinant, (xx * yd - xy * xd) / determinant
     deviation_m = deviation_m - x_slope[group] * x_m - y_slope[group] * y_m
     squared = yy[group] * x_m**2 - 2 * xy[group] * x_m * y_m + xx[group] * y_m**2
