@@ -55,9 +55,14 @@ def exclusion_reason(site: Site, start_utc_s: float, end_utc_s: float) -> str:
     return roundtrip_text(reason, "sentence")
 
 
+def site_file_sha256(file: Path) -> str:
+    """Return the SHA-256 of a file that the site file names; links are followed, unlike those in an inbox."""
+    return sha256_file(file.resolve())
+
+
 def file_version(file: Path) -> str:
     """Return the version name of a reference surface given as a file."""
-    return f"{file.stem}-{sha256_file(file)[:8]}"
+    return f"{file.stem}-{site_file_sha256(file)[:8]}"
 
 
 def load_area_polygons(site: Site) -> dict[str, shapely.Geometry]:
@@ -101,7 +106,7 @@ def _load_product(site: Site, section: ProductSection, areas: dict[str, Bools]) 
     """Return a product; raise ConfigError if a raster, an area or a place of it cannot be used."""
     grid = site.grid_cells
     rasters = {key: read_geotiff(path, grid, site.grid_crs) for key, path in section.rasters.items()}
-    files = tuple(sha256_file(path) for path in section.rasters.values())
+    files = tuple(site_file_sha256(path) for path in section.rasters.values())
     if section.line is not None:
         lines = {name: sample_line(points, grid) for name, points in section.lines.items()}
         return Product(section, {name: line.cells for name, line in lines.items()}, lines, rasters, files)

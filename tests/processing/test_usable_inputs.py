@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import os
 
@@ -12,6 +13,7 @@ from station.errors import ConfigError, NotReadyError, StoreError
 from station.monitoring.alarm_rules import evaluate_rules
 from station.monitoring.status import format_status, status
 from station.processing import usable_inputs
+from station.processing.site_files import polygon_cells, site_file_sha256
 from station.processing.usable_inputs import usable_site
 from station.readers.inclination import read_inclination
 from station.readers.regular_file import open_regular
@@ -59,6 +61,19 @@ def used_files(site):
         "flags": site.flags and site.flags.file,
         "stable": site.adjustment.stable,
     }
+
+
+def test_files_that_the_site_file_names_may_be_links(site, tmp_path):
+    """As configuration management makes them; links in an inbox are rejected."""
+    stable, target = tmp_path / "stable.geojson", tmp_path / "rock.geojson"
+    cells = polygon_cells(stable, site)
+    stable.rename(target)
+    stable.symlink_to(target)
+    assert site_file_sha256(stable) == hashlib.sha256(target.read_bytes()).hexdigest()
+    assert polygon_cells(usable_site(site, save=True).adjustment.stable, site).tolist() == cells.tolist()
+    target.unlink()
+    with pytest.raises(NotReadyError, match=r"rock\.geojson cannot be read: No such file"):
+        site_file_sha256(stable)
 
 
 def as_garbage(path):

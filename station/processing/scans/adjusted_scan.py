@@ -10,7 +10,6 @@ import numpy as np
 from station.archive.geometry_cache import cached_viewing_geometry
 from station.config import Site
 from station.errors import ScanError
-from station.inbox.file_hash import sha256_file
 from station.processing.pipeline import (
     AdjustmentInputs,
     adjust_to_reference,
@@ -20,7 +19,7 @@ from station.processing.pipeline import (
 )
 from station.processing.scans.open_scans import OpenScan
 from station.processing.scans.scan_inputs import ScanInputs
-from station.processing.site_files import polygon_cells, series_for
+from station.processing.site_files import polygon_cells, series_for, site_file_sha256
 from station.processing.workers.worker_process import Progress, trim_heap
 from station.quantities import Bools, Reference, ScanGeometry
 from station.science.adjustment.joint import Adjustment
@@ -140,7 +139,7 @@ def adjust_scan(
 def load_viewing_geometry(site: Site, geometry: ScanGeometry, reference: Reference) -> ViewingGeometry:
     """Return the viewing geometry of a stored reference version, cached for one scan geometry."""
     setting = site.adjustment.stable
-    polygon_hash = sha256_file(setting) if isinstance(setting, Path) and setting.is_file() else ""
+    polygon_hash = site_file_sha256(setting) if isinstance(setting, Path) and setting.is_file() else ""
     return cached_viewing_geometry(
         series_for(site),
         reference,
