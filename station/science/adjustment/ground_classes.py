@@ -107,7 +107,7 @@ def beside_snow(cell: Ints, shows: Bools, grid: Grid) -> Bools:
     """Return True for cells (n,) of a grid of whose eight neighbours at least three show snow.
 
     A little snow lies on them too, which raises them by centimetres and their brightness by less than the
-    limits.
+    limits. Source: adjustment.md, 4.
     """
     width = grid.nx + 2  # with a margin around the grid
     row, column = grid.row_and_column(cell)

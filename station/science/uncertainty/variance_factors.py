@@ -161,9 +161,10 @@ def _local_deviations(residuals: Residuals, factors: Floats32) -> tuple[Floats, 
         values - (total(values) / weight_sum)[group]
         for values in (residuals.x_m, residuals.y_m, residuals.residual_m)
     )
+    # One square metre is added to the moments, so that cells in a line have no slope across it.
     xx, yy, xy = total(x_m**2) + weight_sum, total(y_m**2) + weight_sum, total(x_m * y_m)
     xd, yd = total(x_m * deviation_m), total(y_m * deviation_m)
-    # Fewer cells have the mean alone: a determinant without bound makes slopes and their leverage 0.
+    # Fewer cells have the mean alone: an infinite determinant makes the slopes zero.
     determinant = np.where(count >= MIN_PLANE_CELLS, np.maximum(xx * yy - xy**2, tiny), np.inf)
     x_slope, y_slope = (yy * xd - xy * yd) / determinant, (xx * yd - xy * xd) / determinant
     deviation_m = deviation_m - x_slope[group] * x_m - y_slope[group] * y_m

@@ -154,6 +154,15 @@ def test_change_of_moving_ground_does_not_widen_the_noise_of_stable_ground():
     assert estimate_variance_factors(changed).random[:2] == pytest.approx([1, 1], rel=0.03)
 
 
+def test_rock_among_deep_snow_has_deviations_of_its_own():
+    """A third of each group of 100 cells is bare rock, the rest under 2 m of snow."""
+    quiet, rng = residuals(3, (1.0, 4.0)), np.random.default_rng(5)
+    rock = rng.random(len(quiet.x_m)) < 1 / 3
+    residual_m = quiet.residual_m + np.where(rock, 0.0, 2.0)
+    found = estimate_variance_factors(Residuals(**{**vars(quiet), "residual_m": residual_m, "stable": rock}))
+    assert found.random[:2] == pytest.approx([1, 4], rel=0.03)
+
+
 def test_change_that_slopes_is_not_noise():
     """Melt that grows by 3 mm every 2 m differs by 22 mm (sigma) within a group: as much as the noise."""
     quiet = residuals(3, (1.0, 4.0), stable_share=0.0)
