@@ -127,8 +127,12 @@ def variance_factors(
 ) -> VarianceFactors:
     """Return the variance factors of an adjusted scan."""
     snow, parts = under_snow(gridder, scan_geometry, viewing), []
+    response = adjustment[1].stable_response
     for cells in sampled_cells(gridder, viewing, adjustment):
         sector, sums, jacobian = cells.sector, cells.sums, cells.jacobian
+        residual_m, stable = cells.residual_m, sector.in_class(CellClass.STABLE)
+        if response is not None:  # that rock responds otherwise than modelled is no error of the state
+            residual_m = residual_m - stable * response.effect(jacobian)
         scan_m2, systematic_m2 = cells.point_m2 / sums.count, jacobian.variance(posterior)
         if positions is not None:
             own_m2 = positions.height_variances(cells.cell_index, sector.cell, jacobian, cells.offset_m)
@@ -143,8 +147,8 @@ def variance_factors(
                     sums.count.astype(np.float32),
                     sector.point_count,
                 ),
-                sector.in_class(CellClass.STABLE) & ~snow[cells.cell_index],
-                cells.residual_m.astype(np.float32),
+                stable & ~snow[cells.cell_index],
+                residual_m.astype(np.float32),
                 scan_m2,
                 sector.reference_variance_m2,
                 systematic_m2,

@@ -21,7 +21,12 @@ from station.science.adjustment.ground_change import (
     ThinSnow,
     ground_change,
 )
-from station.science.adjustment.ground_response import beam_motion, response_design
+from station.science.adjustment.ground_response import (
+    ResponseDesign,
+    StableResponse,
+    beam_motion,
+    response_design,
+)
 from station.science.adjustment.leverage import fit_leverage
 from station.science.adjustment.normal_equations import (
     LineInclination,
@@ -61,7 +66,7 @@ class Adjustment:
     prior's, 1 if the observations alone determine it. `log` is the inclination log that was used, and
     `predicted_log_rad` (lines,) is what the adjustment predicts for it, without the errors of the sensor.
     `unapplied_rad` (3,) is the estimated rotation about east, north and up that the points lack, as a mean
-    over the lines.
+    over the lines. `stable_response` is by how much stable ground rose otherwise than modelled.
     """
 
     params: ParameterLayout
@@ -76,6 +81,7 @@ class Adjustment:
     log: LineInclination | None
     predicted_log_rad: Floats
     unapplied_rad: Floats
+    stable_response: StableResponse | None = None
 
     def effect(self, jacobian: HeightJacobian) -> Reals:
         """Return the effect of the estimated state on heights (n,) [m], to be subtracted from them."""
@@ -165,6 +171,7 @@ def adjust_scan(
         log,
         predicted_log_rad,
         state[:3] * HEADING_CLOCKWISE - applied_rad.mean(axis=1),
+        estimation.stable_response(params, mixture.estimate),
     )
 
 
@@ -175,9 +182,18 @@ class _Estimation:
     equations: NormalEquations
     reduced: ReducedNormals
     solution: Solution
+    responses: ResponseDesign | None
     weight: Floats  # [1 / m²]
     robust_weight: Floats  # 0 to 1
     mean_change_m: float  # of moving ground
+
+    def stable_response(self, params: ParameterLayout, estimate: Floats) -> StableResponse | None:
+        """Return the response of stable ground that belongs to the unknowns (m,); None if not estimated."""
+        if self.responses is None:
+            return None
+        last = self.equations.size
+        first = last - self.responses.effect_m.shape[1]
+        return self.responses.stable_response(params, estimate[first:last])
 
 
 def _estimate(
@@ -198,12 +214,13 @@ def _estimate(
     robust_weight = np.ones(len(patches))
     residual_m = misclosure_m
     solution: Solution | None = None
+    responses: ResponseDesign | None = None
     for iteration in range(MAX_ITERATIONS):
         if iteration == WARMUP_ITERATIONS and solution is not None:
             motion = beam_motion(patches.jacobian.params, solution.estimate, reference)
-            responses_m = response_design(patches, equations.state_effect(motion))
+            responses = response_design(patches, motion, equations.state_effect(motion))
             equations = NormalEquations(
-                patches.jacobian, change.design, misclosure_m, prior, log, responses_m
+                patches.jacobian, change.design, misclosure_m, prior, log, responses.effect_m
             )
         previous, previous_m = solution, residual_m
         weight = robust_weight / (patches.variance_m2 + excess_m2)
@@ -225,7 +242,7 @@ def _estimate(
             if same_model and update_m <= CONVERGED_M * np.sqrt(len(residual_m)):
                 break
     assert solution is not None  # noqa: S101 - the loop runs at least once
-    return _Estimation(equations, reduced, solution, weight, robust_weight, change.mean_change_m)
+    return _Estimation(equations, reduced, solution, responses, weight, robust_weight, change.mean_change_m)
 
 
 def _tukey_weight(ratio: Floats) -> Floats:

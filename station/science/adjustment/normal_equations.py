@@ -134,7 +134,7 @@ class NormalEquations:
     """Normal equations of m unknowns: state by knots, errors of the log, responses, change of moving ground.
 
     The line tilts are unknowns too, but `reduce` eliminates them. `response_design_m` (n, k) is the effect of
-    one sigma of each response on the patches (`ground_response.response_design`); None for none. The first
+    one sigma of each response on the patches (`ground_response.ResponseDesign`); None for none. The first
     `size` unknowns are not change.
     """
 

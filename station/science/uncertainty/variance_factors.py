@@ -255,7 +255,9 @@ def _systematic_factor(residuals: Residuals, random: Floats32) -> float:
             low = middle
         else:
             high = middle
-    independent = blocks / CORRELATED_BLOCKS
+    # A block with far more random error tells little: its information goes with the square of this share.
+    share = np.exp(low) * systematic_m2 / (mean_m2 + np.exp(low) * systematic_m2)
+    independent = float(np.sum(share**2)) / CORRELATED_BLOCKS
     return float(np.exp(low * independent / (independent + PRIOR_BLOCKS)))
 
 

@@ -461,20 +461,23 @@ def test_sigma_has_the_errors_that_responses_of_sectors_cause():
 def adjusted_rock_and_ice(seed):
     """Adjustment of far rock whose sectors respond by some 2 % more or less, and of near smooth ice at rest.
 
-    Also the true state (p,), drawn from the prior.
+    Also the true state (p,), drawn from the prior, and the true response of the rock by sector (4,).
     """
     rng = np.random.default_rng(seed)
     ground, covariance = random_sites(3, 900, steep=0.3), knot_prior(PARAMS).knot_covariance
     root = np.linalg.cholesky(covariance + 1e-24 * np.eye(len(covariance)))
     state = root @ rng.normal(size=len(root))
     rock, sector = ground.range_bin > 20, (ground.line * 0.2 // 12).astype(int)
-    response = 0.65 * rng.normal() + math.sqrt(1 - 0.65**2) * rng.normal(size=4)[sector]
+    response = 0.65 * rng.normal() + math.sqrt(1 - 0.65**2) * rng.normal(size=4)
     design = ground.jacobian().to_sparse()
-    residual_m = design @ state - np.where(rock, 0.02 * response, 0) * (design @ (PARAMS.moves_beam * state))
+    residual_m = design @ state - np.where(rock, 0.02 * response[sector], 0) * (
+        design @ (PARAMS.moves_beam * state)
+    )
     residual_m += rng.normal(0, 0.002, len(rock))
     ground_class = np.where(rock, GroundClass.STABLE, GroundClass.MOVING)
     patches = ground.patches(residual_m, 0.002, ground_class, sampling_ratio=np.where(rock, 0.1, 0.0))
-    return adjust_scan(patches, NO_TILT, knot_prior(PARAMS), None, reference=reference_of(1e-9)), state
+    adjustment = adjust_scan(patches, NO_TILT, knot_prior(PARAMS), None, reference=reference_of(1e-9))
+    return adjustment, state, -0.02 * response
 
 
 def rms(values):
@@ -488,8 +491,8 @@ def test_responses_are_estimated_where_smooth_ground_shows_them(monkeypatch):
 
     def errors_and_sigma():
         adjusted = [adjusted_rock_and_ice(seed) for seed in range(40)]
-        errors_m = [adjustment.effect(cells) - cells.effect(state) for adjustment, state in adjusted]
-        variance_m2 = [cells.variance(adjustment.to_shared_parameters()) for adjustment, _ in adjusted]
+        errors_m = [adjustment.effect(cells) - cells.effect(state) for adjustment, state, _ in adjusted]
+        variance_m2 = [cells.variance(adjustment.to_shared_parameters()) for adjustment, *_ in adjusted]
         return np.array(errors_m), np.sqrt(variance_m2)
 
     error_m, sigma_m = errors_and_sigma()
@@ -498,6 +501,18 @@ def test_responses_are_estimated_where_smooth_ground_shows_them(monkeypatch):
     assert rms(error_m) < 0.8 * rms(without_m)
     assert rms(without_m / too_small_m) > 1.25
     assert 0.5 < rms(error_m / sigma_m) < 1.25  # sigma allows for change of the ice too
+
+
+def test_the_response_of_rock_is_known_where_smooth_ice_shows_the_motion():
+    """Errors of 2 % of what the beams moved: most of them is found, by sector."""
+    sector = (np.arange(PARAMS.line_groups) * 0.2 // 12).astype(int)
+    errors, responses = [], []
+    for seed in range(20):
+        adjustment, _, response = adjusted_rock_and_ice(seed)
+        errors.append(adjustment.stable_response.share - response[sector])
+        responses.append(response)
+    assert rms(responses) == pytest.approx(0.02, rel=0.2)
+    assert rms(errors) < 0.7 * rms(responses)
 
 
 def reference_of(sigma_rad):

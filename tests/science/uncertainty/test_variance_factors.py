@@ -77,6 +77,17 @@ def test_errors_that_cells_of_a_block_share_are_not_errors_of_the_state():
     assert 1 <= found.systematic < 1.5
 
 
+def test_blocks_with_far_more_random_error_hardly_change_the_systematic_variance():
+    """Blocks of ten cells have random errors of 6 mm, on which systematic ones of 1 mm do not show."""
+    factors = []
+    for seed in range(6):
+        observed = residuals(seed, (1.0, 1.0), 0.001)
+        few = np.random.default_rng(seed).random(len(observed.x_m)) < 1 / 40
+        sampled = Residuals(**{name: values[few] for name, values in vars(observed).items()})
+        factors.append(estimate_variance_factors(sampled).systematic)
+    assert max(factors) < 1.3
+
+
 def test_without_stable_ground_the_systematic_variance_stays_as_modelled():
     assert estimate_variance_factors(residuals(1, (1.0, 1.0), 0.01, stable_share=0.0)).systematic == 1.0
 
