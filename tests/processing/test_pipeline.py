@@ -18,6 +18,7 @@ from station.processing.pipeline import (
     stacking_inputs,
     to_map,
 )
+from station.processing.scans import scan_residuals
 from station.quantities import (
     Air,
     Grid,
@@ -30,6 +31,7 @@ from station.quantities import (
     VarianceComponents,
 )
 from station.science.adjustment.ground_classes import SnowTest
+from station.science.adjustment.ground_response import StableResponse
 from station.science.adjustment.prior import line_times, log_only_covariance
 from station.science.geometry.air import air_correction
 from station.science.geometry.cyclic_error import NO_CYCLIC_ERROR
@@ -287,20 +289,20 @@ def test_change_is_measured_and_flagged_as_significant():
     assert flagged[:60][np.isfinite(measured.change_m[:60])].mean() == pytest.approx(0.05, abs=0.02)
 
 
+def adjustment_inputs():
+    """Return the inputs of an adjustment without tilt and log."""
+    params = parameter_layout(GRID, POSITION_M)
+    lines, no_tilt_rad = line_times(params, np.eye(3), None), np.zeros((3, params.line_groups))
+    return AdjustmentInputs(params, lines, no_tilt_rad, None, 0.0, Air(2.0, 700.0, 50.0))
+
+
 @pytest.mark.integration
 def test_adjustment_to_a_sample_of_stable_ground_agrees_with_all_of_it(monkeypatch):
     """Shots 30 mm too high, adjusted to every, every second, third and thirteenth row of stable ground."""
     shots = shots_at(*random_positions(150_000, 7))
     raised_shots = raised(shots, 0.030)
-    params = parameter_layout(GRID, POSITION_M)
-    inputs = AdjustmentInputs(
-        params,
-        line_times(params, np.eye(3), None),
-        np.zeros((3, params.line_groups)),
-        None,
-        0.0,
-        Air(2.0, 700.0, 50.0),
-    )
+    inputs = adjustment_inputs()
+    params = inputs.params
     reference = replace(truth(), components=VarianceComponents(translation_m=0.1))
     stable = np.ones(GRID.shape, bool)
     # Without brightness most of it would count as moving, whose mean change is free.
@@ -322,6 +324,33 @@ def test_adjustment_to_a_sample_of_stable_ground_agrees_with_all_of_it(monkeypat
     ]
     assert sigma == sorted(sigma)
     assert sigma[-1] < 2 * sigma[0]
+
+
+def test_how_rock_responds_to_a_motion_is_no_residual_of_the_state(monkeypatch):
+    """Rock that rises by 2 % less than a tilt of 0.01° makes of it, some 7 mm; moving ground as modelled."""
+    stable = np.zeros(GRID.shape, bool)
+    stable[:150] = True
+    monkeypatch.setattr(SnowTest, "changed", lambda _, intensity, *__: np.zeros(len(intensity), bool))
+    shots = shots_at(*random_positions(60_000, 7))
+    _, gridder, scan_geometry, viewing = process_shots(shots, truth(), stable=stable)
+    inputs = adjustment_inputs()
+    params = inputs.params
+    adjustment = adjust_to_reference(gridder, scan_geometry, inputs, viewing)
+    motion = np.zeros(len(params.names))
+    motion[1] = math.radians(0.01)  # about north: ground in the east rises
+    response = StableResponse(np.full(params.line_groups, -0.02), motion)
+    residuals = []
+    monkeypatch.setattr(scan_residuals, "estimate_variance_factors", residuals.append)
+    for stable_response in (None, response):
+        adjusted = inputs, replace(adjustment, stable_response=stable_response)
+        shared = adjustment.to_shared_parameters()
+        scan_residuals.variance_factors(gridder, scan_geometry, viewing, adjusted, shared)
+    added_m = residuals[1].residual_m - residuals[0].residual_m
+    rock, east_m = residuals[0].stable, residuals[0].x_m
+    assert 0.3 < rock.mean() < 0.7
+    assert not added_m[~rock].any()
+    # The slope of a quarter and 600 m of depth add up to a tenth.
+    assert added_m[rock] == pytest.approx(0.02 * math.radians(0.01) * east_m[rock], rel=0.2)
 
 
 def test_a_rotated_pose_turns_points_about_east_north_and_up():
