@@ -130,7 +130,7 @@ def variance_factors(
     response = adjustment[1].stable_response
     for cells in sampled_cells(gridder, viewing, adjustment):
         sector, sums, jacobian = cells.sector, cells.sums, cells.jacobian
-        residual_m, stable = cells.residual_m, sector.in_class(CellClass.STABLE)
+        residual_m, stable = cells.residual_m, sector.in_class(CellClass.STABLE) & ~snow[cells.cell_index]
         if response is not None:  # that rock responds otherwise than modelled is no error of the state
             residual_m = residual_m - stable * response.effect(jacobian)
         scan_m2, systematic_m2 = cells.point_m2 / sums.count, jacobian.variance(posterior)
@@ -147,7 +147,7 @@ def variance_factors(
                     sums.count.astype(np.float32),
                     sector.point_count,
                 ),
-                stable & ~snow[cells.cell_index],
+                stable,
                 residual_m.astype(np.float32),
                 scan_m2,
                 sector.reference_variance_m2,

@@ -21,7 +21,6 @@ from station.science.uncertainty.parameters import ParameterLayout, interpolate_
 RESPONSE_ERROR = 0.2  # of the response of a patch, over its sampling ratio
 MAX_RESPONSE_ERROR = 0.05
 COMMON_RESPONSE_ERROR = 0.65  # share of it that all ground of a kind has in common; the rest is by sector
-STABLE = 1  # index of the response that all stable ground has in common
 RESPONSE_SECTOR_RAD = math.radians(12.0)
 MAX_RESPONSE_TILT_RAD = math.radians(0.01)  # beyond, shots are taken to jump as often as they slide
 
@@ -42,7 +41,10 @@ def beam_motion(params: ParameterLayout, estimate: Floats, reference: SharedPara
 
 @dataclass(frozen=True)
 class StableResponse:
-    """Estimated response of stable ground: what it rises more than its mean surface would, as a share."""
+    """Estimated response of stable ground to a motion of the beams.
+
+    It rises by what the motion does to its mean surface, and by a share of that more.
+    """
 
     share: Floats  # (lines,) by line group
     motion: Floats  # (p,) state by knots by which the beams moved
@@ -69,8 +71,8 @@ class ResponseDesign:
         sector = _sector(params)
         of_sector = np.zeros(int(sector.max()) + 1)
         of_sector[self.stable_sectors] = estimate[len(estimate) - len(self.stable_sectors) :]
-        common, own = _parts()
-        response = common * estimate[STABLE] + own * of_sector[sector]
+        common, own = _error_parts()
+        response = common * estimate[GroundClass.STABLE] + own * of_sector[sector]
         return StableResponse(self.stable_share * response, self.motion)
 
 
@@ -85,11 +87,12 @@ def response_design(patches: Patches, motion: Floats, motion_m: Floats) -> Respo
     if not moving.all():
         stable_share = float(np.average(share[~moving], weights=1 / patches.variance_m2[~moving]))
         share[~moving] = stable_share
-    sectors, kind = _sector(patches.jacobian.params), np.where(moving, 0, STABLE)
+    kind = np.where(moving, GroundClass.MOVING, GroundClass.STABLE)
+    sectors = _sector(patches.jacobian.params)
     sector_count = int(sectors.max()) + 1
     code, of_sector = np.unique(kind * sector_count + sectors[patches.jacobian.line], return_inverse=True)
     effect_m = share * motion_m
-    values_m = np.concatenate([part * effect_m for part in _parts()])
+    values_m = np.concatenate([part * effect_m for part in _error_parts()])
     columns = np.concatenate([kind, 2 + of_sector])
     shape = len(patches), 2 + len(code)
     return ResponseDesign(
@@ -100,8 +103,8 @@ def response_design(patches: Patches, motion: Floats, motion_m: Floats) -> Respo
     )
 
 
-def _parts() -> tuple[float, float]:
-    """Return the shares of the response error that all ground of a kind has in common, and a sector."""
+def _error_parts() -> tuple[float, float]:
+    """Return the parts of the response error, in its sigmas, that all ground of a kind and a sector share."""
     return COMMON_RESPONSE_ERROR, math.sqrt(1 - COMMON_RESPONSE_ERROR**2)
 
 
