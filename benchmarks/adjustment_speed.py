@@ -64,9 +64,9 @@ def adjustment_seconds(
     inputs = _inputs(random, grid, position_m)
     adjustment = adjust_to_reference(gridder, geometry, inputs, viewing)
     estimate_s = _best(lambda copy: adjust_to_reference(copy, geometry, inputs, viewing), gridder)
-    posterior = adjustment.to_shared_parameters()
+    posterior = adjustment.state.shared
     without_s = _best(lambda copy: measure(copy, geometry, posterior, viewing), gridder)
-    with_s = _best(lambda copy: measure(copy, geometry, posterior, viewing, (inputs, adjustment)), gridder)
+    with_s = _best(lambda copy: measure(copy, geometry, posterior, viewing, adjustment), gridder)
     total_s = estimate_s + max(with_s - without_s, 0.0)
     return {
         "valid_share": float(observed.mean()),

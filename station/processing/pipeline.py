@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property, partial
+from functools import cached_property
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -152,16 +152,33 @@ class AdjustmentInputs:
     air: Air | None
 
 
+@dataclass(frozen=True)
+class ScanAdjustment:
+    """The adjustment of a scan to a reference: its inputs, the estimated state, and where snow lay.
+
+    `under_snow` (n,) is True for cells of the reference: of stable ground whose snow has changed or may have.
+    """
+
+    inputs: AdjustmentInputs
+    state: Adjustment
+    under_snow: Bools
+
+    def correction(self, jacobian: HeightJacobian) -> Reals:
+        """Return what to subtract from heights (n,) [m]: the effect of the estimated minus assumed state."""
+        return np.asarray(self.state.effect(jacobian) - tilt_effect(jacobian, self.inputs.assumed_rad))
+
+
 def adjust_to_reference(
     gridder: Gridder, scan_geometry: ScanGeometry, inputs: AdjustmentInputs, viewing: ViewingGeometry
-) -> Adjustment:
-    """Return the scanner state estimated from a gridded scan: tilt, heading, position, range, refraction.
+) -> ScanAdjustment:
+    """Return a gridded scan's adjustment: its tilt, heading, position, range and refraction.
 
     If it has moved farther than expected, it is estimated again with a prior as wide as the motion.
     """
     components, reference_state = usual_motion(viewing.reference, inputs.time_s), viewing.reference.shared
     test = _snow_test(gridder, scan_geometry, viewing)
-    cells = _cells(gridder, viewing, under_snow(gridder, scan_geometry, viewing))
+    under_snow = _under_snow(gridder, viewing, test)
+    cells = _cells(gridder, viewing, under_snow)
     extent_m = line_length(scan_geometry.grid, scan_geometry.scanner.range_max_m)
     patches = aggregate_patches(inputs.params, cells, *extent_m)
 
@@ -183,9 +200,10 @@ def adjust_to_reference(
         *ground_classes.unseen_snow(scan_geometry.scanner.wavelength_um),
         shows=_snow_shows(gridder, scan_geometry, viewing) if np.isfinite(test.gain) else None,
     )
-    return adjust_scan(
+    state = adjust_scan(
         patches, inputs.assumed_rad, *prior_and_log(components), thin_snow, reference_state, wider
     )
+    return ScanAdjustment(inputs, state, under_snow)
 
 
 def usual_motion(reference: Reference, time_s: float) -> VarianceComponents:
@@ -194,13 +212,12 @@ def usual_motion(reference: Reference, time_s: float) -> VarianceComponents:
     return variance_components.after(reference.components, elapsed_s if np.isfinite(elapsed_s) else 0.0)
 
 
-def under_snow(gridder: Gridder, scan_geometry: ScanGeometry, viewing: ViewingGeometry) -> Bools:
+def _under_snow(gridder: Gridder, viewing: ViewingGeometry, test: SnowTest) -> Bools:
     """Return True for cells (n,) of a reference: of stable ground whose snow has changed or may have."""
     stable = viewing.select(CellClass.STABLE)
     stable = stable[gridder.count[stable] > 0]
     brightness = _intensity(gridder, viewing, stable)
     cell, cell_class = (viewing.cells[name][:].take(stable) for name in ("cell", "cell_class"))
-    test = _snow_test(gridder, scan_geometry, viewing)
     changed = test.changed(*brightness, (cell_class & np.uint8(CellClass.STEEP)) > 0)
     changed |= ground_classes.beside_snow(cell, test.shows(*brightness), viewing.grid)
     snow = np.zeros(gridder.reference_cells, bool)
@@ -295,7 +312,7 @@ def _cells(gridder: Gridder, viewing: ViewingGeometry, snow: Bools) -> Iterator[
 
 
 def stacking_inputs(
-    gridder: Gridder, viewing: ViewingGeometry, adjustment: tuple[AdjustmentInputs, Adjustment] | None
+    gridder: Gridder, viewing: ViewingGeometry, adjustment: ScanAdjustment | None
 ) -> tuple[Floats32, Floats32]:
     """Random variance of a shot [m²] and height correction of the estimated state [m], both (ny, nx).
 
@@ -306,34 +323,29 @@ def stacking_inputs(
     variance_m2.reshape(-1)[cell] = viewing.cells["shot_m2"][:] * (gridder.sums(0, len(cell)).count > 0)
     if adjustment is not None:
         for _, sector in viewing.sectors():
-            correction_m.reshape(-1)[sector.cell] = height_correction(adjustment, viewing.jacobian(sector))
+            correction_m.reshape(-1)[sector.cell] = adjustment.correction(viewing.jacobian(sector))
     return variance_m2, correction_m
 
 
-def mean_correction(
-    viewing: ViewingGeometry, adjustments: Sequence[tuple[AdjustmentInputs, Adjustment]]
-) -> Floats32:
+def mean_correction(viewing: ViewingGeometry, adjustments: Sequence[ScanAdjustment]) -> Floats32:
     """Return the mean height correction of several scans [m] in all cells of a reference (ny, nx).
 
     Zero without adjustments, and for scans whose parameters differ, as after a relocation of the scanner.
     """
     correction_m = np.zeros(viewing.grid.shape, np.float32)
-    if not adjustments or len({inputs.params.names for inputs, _ in adjustments}) > 1:
+    if not adjustments or len({adjustment.inputs.params.names for adjustment in adjustments}) > 1:
         return correction_m
-    inputs, adjustment = adjustments[0]
-    mean = (
-        replace(inputs, assumed_rad=np.mean([inputs.assumed_rad for inputs, _ in adjustments], axis=0)),
-        replace(adjustment, estimate=np.mean([adjustment.estimate for _, adjustment in adjustments], axis=0)),
+    assumed_rad = np.mean([adjustment.inputs.assumed_rad for adjustment in adjustments], axis=0)
+    estimate = np.mean([adjustment.state.estimate for adjustment in adjustments], axis=0)
+    first = adjustments[0]
+    mean = replace(
+        first,
+        inputs=replace(first.inputs, assumed_rad=assumed_rad),
+        state=replace(first.state, estimate=estimate),
     )
     for _, sector in viewing.sectors():
-        correction_m.reshape(-1)[sector.cell] = height_correction(mean, viewing.jacobian(sector))
+        correction_m.reshape(-1)[sector.cell] = mean.correction(viewing.jacobian(sector))
     return correction_m
-
-
-def height_correction(adjustment: tuple[AdjustmentInputs, Adjustment], jacobian: HeightJacobian) -> Reals:
-    """Return the correction to subtract from heights (n,) [m]: effect of estimated minus assumed state."""
-    inputs, estimated = adjustment
-    return np.asarray(estimated.effect(jacobian) - tilt_effect(jacobian, inputs.assumed_rad))
 
 
 def measure(
@@ -341,7 +353,7 @@ def measure(
     scan_geometry: ScanGeometry,
     posterior: SharedParameters | None,
     viewing: ViewingGeometry | None,
-    adjustment: tuple[AdjustmentInputs, Adjustment] | None = None,
+    adjustment: ScanAdjustment | None = None,
     factors: VarianceFactors = UNIT_FACTORS,
     position_errors: PositionErrors | None = None,
 ) -> Measurement:
@@ -354,10 +366,9 @@ def measure(
     independent = posterior
     if adjustment is None and posterior is not None and viewing is not None:
         posterior = propagation.difference_to_reference(posterior, viewing.reference.shared)
-    correction = None if adjustment is None else partial(height_correction, adjustment)
-    snow = None if adjustment is None or viewing is None else under_snow(gridder, scan_geometry, viewing)
+    correction, under_snow = (adjustment.correction, adjustment.under_snow) if adjustment else (None, None)
     estimator = CellEstimator(
-        scan_geometry, posterior, independent, correction, snow, factors.random, position_errors
+        scan_geometry, posterior, independent, correction, under_snow, factors.random, position_errors
     )
     return estimate_cells(gridder, viewing, estimator)
 

@@ -23,7 +23,7 @@ from station.inbox.file_hash import sha256_files
 from station.inbox.listing import ScanFile
 from station.processing.epoch_scalars import air_key, air_scalars
 from station.processing.pipeline import (
-    AdjustmentInputs,
+    ScanAdjustment,
     add_blocks,
     grid_scan,
     mean_correction,
@@ -40,7 +40,6 @@ from station.processing.site_files import exclusion_reason, series_for, sha256_l
 from station.processing.workers.worker_process import Progress
 from station.quantities import Floats, Reference, ScanGeometry, SharedParameters, VarianceComponents
 from station.scan_names import scan_id, scan_stem
-from station.science.adjustment.joint import Adjustment
 from station.science.adjustment.variance_components import estimate_variance_components
 from station.science.gridding.gridder import Gridder
 from station.science.gridding.reference_surface import (
@@ -185,7 +184,7 @@ class _StackedScan:
     """Inputs, adjustment and provenance of a scan that was added to a stack."""
 
     inputs: ScanInputs
-    adjusted: tuple[AdjustmentInputs, Adjustment] | None
+    adjustment: ScanAdjustment | None
     provenance: ScanProvenance
 
 
@@ -205,7 +204,7 @@ def _stack_scans(
         stack.add(gridder)
     viewing = geometry_cache(stacked[-1].inputs.geometry)
     if centred and viewing is not None:
-        stack.shift(mean_correction(viewing, [scan.adjusted for scan in stacked if scan.adjusted]))
+        stack.shift(mean_correction(viewing, [scan.adjustment for scan in stacked if scan.adjustment]))
     return stack, stacked
 
 
@@ -232,7 +231,7 @@ def _with_mean_state(reference: Reference, stacked: list[_StackedScan]) -> Refer
 
     The same reference without adjustments, and if the scanner was relocated between the scans.
     """
-    shared, adjustments = reference.shared, [scan.adjusted[1] for scan in stacked if scan.adjusted]
+    shared, adjustments = reference.shared, [scan.adjustment.state for scan in stacked if scan.adjustment]
     if shared is None or not adjustments or any(a.params.names != shared.names for a in adjustments):
         return reference
     estimate = np.mean([adjustment.estimate for adjustment in adjustments], axis=0)
@@ -253,8 +252,9 @@ def _sop_scan_count(site: Site, scans: list[ScanFile]) -> int | None:
 def _estimate_components(components: VarianceComponents, stacked: list[_StackedScan]) -> VarianceComponents:
     """Return the variance components estimated from the adjusted scans."""
     adjusted = (
-        (inputs.lines, adjustment.estimate, adjustment.covariance)
-        for inputs, adjustment in (scan.adjusted for scan in stacked if scan.adjusted)
+        (adjustment.inputs.lines, adjustment.state.estimate, adjustment.state.covariance)
+        for adjustment in (scan.adjustment for scan in stacked)
+        if adjustment is not None
     )
     adjustment_inputs = stacked[0].inputs.adjustment_inputs
     return (

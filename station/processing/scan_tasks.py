@@ -217,9 +217,9 @@ def _compute_epoch(
         point_counts, adjustment = (opened.point_count, scan_on_grid.point_count), scan_on_grid.adjustment
     brightness_fault = no_brightness(gridder, inputs.geometry, viewing) if site.adjusts else ""
     flag = exclusion_reason(site, start.timestamp(), end.timestamp())
-    attempt = adjustment[1] if adjustment else None
+    attempt = adjustment.state if adjustment else None
     registration, registration_warnings = registration_difference(site, scan, attempt)
-    if adjustment is not None and (inputs.is_given or not is_usable(adjustment[1])):
+    if adjustment is not None and (inputs.is_given or not is_usable(adjustment)):
         adjustment = None
     components = usual_motion(reference, start.timestamp()) if reference else VarianceComponents()
     errors = scan_errors(inputs, gridder, viewing, adjustment, components)
@@ -233,12 +233,12 @@ def _compute_epoch(
     scalars["rejected_echo_share"] = gridder.rejected_echo_share
     scalars["airborne_echo_share"] = gridder.airborne_echo_share
     if adjustment is not None and viewing is not None:
-        scalars |= holdout_statistics(measurement, viewing) | {"change_step": adjustment[1].change_size_m}
+        scalars |= holdout_statistics(measurement, viewing) | {"change_step": adjustment.state.change_size_m}
         scalars |= {
             "random_variance_factor": errors.factors.median_random,
             "systematic_variance_factor": errors.factors.systematic,
         }
-        scalars |= dict(zip(LEVERAGE_VARIABLES, adjustment[1].leverage_m2, strict=True))
+        scalars |= dict(zip(LEVERAGE_VARIABLES, adjustment.state.leverage_m2, strict=True))
     if log_check is not None and log_check.clock_offset is not None:
         scalars["log_clock_offset"] = log_check.clock_offset.offset_s
         scalars["log_clock_offset_uncertainty"] = log_check.clock_offset.sigma_s
@@ -262,7 +262,7 @@ def _compute_epoch(
         scan_id=scan_id(scan.name),
         measurement=measurement,
         shared=stored_parameters,
-        redundancy=adjustment[1].redundancy if adjustment else None,
+        redundancy=adjustment.state.redundancy if adjustment else None,
         verdict=verdict_name,
         verdict_reason=reason,
         scalars=scalars | registration,

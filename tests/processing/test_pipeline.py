@@ -313,13 +313,13 @@ def test_adjustment_to_a_sample_of_stable_ground_agrees_with_all_of_it(monkeypat
         _, gridder, scan_geometry, viewing = process_shots(raised_shots, reference, stable=stable)
         observed = gridder.rasters().count > 0
         adjustments[step] = adjust_to_reference(gridder, scan_geometry, inputs, viewing)
-        _, correction_m = stacking_inputs(gridder, viewing, (inputs, adjustments[step]))
+        _, correction_m = stacking_inputs(gridder, viewing, adjustments[step])
         assert np.median(correction_m[observed]) == pytest.approx(0.030, abs=0.003)
-        sigma_m = np.sqrt(np.diag(adjustments[step].covariance))
-        difference = np.abs(adjustments[step].estimate - adjustments[1].estimate) / sigma_m
+        sigma_m = np.sqrt(np.diag(adjustments[step].state.covariance))
+        difference = np.abs(adjustments[step].state.estimate - adjustments[1].state.estimate) / sigma_m
         assert np.sqrt(np.mean(difference**2)) < 1.0
     sigma = [
-        np.sqrt(np.median(np.diag(adjustments[step].covariance)[10 : 10 + params.line_groups]))
+        np.sqrt(np.median(np.diag(adjustments[step].state.covariance)[10 : 10 + params.line_groups]))
         for step in adjustments
     ]
     assert sigma == sorted(sigma)
@@ -342,9 +342,8 @@ def test_how_rock_responds_to_a_motion_is_no_residual_of_the_state(monkeypatch):
     residuals = []
     monkeypatch.setattr(scan_residuals, "estimate_variance_factors", residuals.append)
     for stable_response in (None, response):
-        adjusted = inputs, replace(adjustment, stable_response=stable_response)
-        shared = adjustment.to_shared_parameters()
-        scan_residuals.variance_factors(gridder, scan_geometry, viewing, adjusted, shared)
+        adjusted = replace(adjustment, state=replace(adjustment.state, stable_response=stable_response))
+        scan_residuals.variance_factors(gridder, viewing, adjusted, adjusted.state.shared)
     added_m = residuals[1].residual_m - residuals[0].residual_m
     rock, east_m = residuals[0].stable, residuals[0].x_m
     assert 0.3 < rock.mean() < 0.7

@@ -468,7 +468,7 @@ def sample_jacobians(size_m, count=40):
 def rms_sigmas(scene, size_m):
     """Return the root mean square sigma of means, from the stored and from the full covariance by line."""
     adjustment = adjusted(scene)
-    shared = adjustment.to_shared_parameters()
+    shared = adjustment.shared
     stored_m2, full_m2 = [], []
     for height_jacobian in sample_jacobians(size_m):
         count = len(height_jacobian)

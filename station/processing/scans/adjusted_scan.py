@@ -11,7 +11,7 @@ from station.archive.geometry_cache import cached_viewing_geometry
 from station.config import Site
 from station.errors import ScanError
 from station.processing.pipeline import (
-    AdjustmentInputs,
+    ScanAdjustment,
     adjust_to_reference,
     grid_scan,
     new_gridder,
@@ -22,7 +22,6 @@ from station.processing.scans.scan_inputs import ScanInputs
 from station.processing.site_files import polygon_cells, series_for, site_file_sha256
 from station.processing.workers.worker_process import Progress, trim_heap
 from station.quantities import Bools, Reference, ScanGeometry
-from station.science.adjustment.joint import Adjustment
 from station.science.analysis.inclination_check import LogCheck, check_log
 from station.science.gridding.gridder import Gridder
 from station.science.gridding.viewing_geometry import ViewingGeometry
@@ -45,7 +44,7 @@ class AdjustedScan:
     viewing: ViewingGeometry | None
     gridder: Gridder
     point_count: int
-    adjustment: tuple[AdjustmentInputs, Adjustment] | None
+    adjustment: ScanAdjustment | None
     log_check: LogCheck | None = None
 
 
@@ -61,10 +60,9 @@ def grid_and_adjust(
     scan = _adjusted(site, opened, inputs, viewing, progress)
     if scan.adjustment is None or scan.viewing is None or scan.inputs.is_given:
         return scan
-    adjustment_inputs, adjustment = scan.adjustment
-    if not is_usable(adjustment):
+    if not is_usable(scan.adjustment):
         return scan
-    check = check_log(adjustment_inputs.lines, adjustment, scan.viewing.reference)
+    check = check_log(scan.adjustment.inputs.lines, scan.adjustment.state, scan.viewing.reference)
     if check is not None and check.warnings:
         del scan  # the memory of a worker does not hold two gridded scans
         keep_tilt = site.inclination is not None and site.inclination.mode == "absolute"
@@ -95,24 +93,24 @@ def _adjusted(
     if viewing is not None:
         viewing = seen_from_viewpoints(viewing, gridder, inputs.geometry)
     first = adjust_scan(site, gridder, inputs, viewing, even_if_given=True)
-    if first is None or not inputs.can_rotate or not is_usable(first[1]):
+    if first is None or not inputs.can_rotate or not is_usable(first):
         return AdjustedScan(inputs, viewing, gridder, count, first)
-    unapplied_rad = first[1].unapplied_rad
+    unapplied_rad = first.state.unapplied_rad
     if np.linalg.norm(unapplied_rad) <= MAX_UNAPPLIED_RAD:
         return AdjustedScan(inputs, viewing, gridder, count, first)
     del gridder  # as above
     rotated = inputs.rotated(unapplied_rad)
     gridder, count = gridded(rotated)
     second = adjust_scan(site, gridder, rotated, viewing)
-    if second is not None and is_usable(second[1]):
+    if second is not None and is_usable(second):
         return AdjustedScan(rotated, viewing, gridder, count, second)
     del gridder
     return AdjustedScan(inputs, viewing, *gridded(inputs), first)
 
 
-def is_usable(adjustment: Adjustment) -> bool:
+def is_usable(adjustment: ScanAdjustment) -> bool:
     """Return True unless so much stable ground was rejected that the filtered log alone is safer."""
-    return adjustment.rejected_share <= UNUSABLE_REJECTED_SHARE
+    return adjustment.state.rejected_share <= UNUSABLE_REJECTED_SHARE
 
 
 def adjust_scan(
@@ -122,7 +120,7 @@ def adjust_scan(
     viewing: ViewingGeometry | None,
     *,
     even_if_given: bool = False,
-) -> tuple[AdjustmentInputs, Adjustment] | None:
+) -> ScanAdjustment | None:
     """Return the adjustment of a scan to the reference; None if it is disabled or there is no reference.
 
     Also None if its registration is given, unless `even_if_given`.
@@ -133,7 +131,7 @@ def adjust_scan(
         return None
     adjustment = adjust_to_reference(gridder, inputs.geometry, inputs.adjustment_inputs, viewing)
     trim_heap()
-    return inputs.adjustment_inputs, adjustment
+    return adjustment
 
 
 def load_viewing_geometry(site: Site, geometry: ScanGeometry, reference: Reference) -> ViewingGeometry:

@@ -6,12 +6,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from station.processing.pipeline import AdjustmentInputs
+from station.processing.pipeline import ScanAdjustment
 from station.processing.scans.scan_inputs import ScanInputs
 from station.processing.scans.scan_residuals import variance_factors, with_motion_seen
 from station.processing.workers.worker_process import trim_heap
 from station.quantities import Floats, Reference, SharedParameters, VarianceComponents
-from station.science.adjustment.joint import Adjustment
 from station.science.adjustment.prior import globals_sigma
 from station.science.gridding.gridder import Gridder
 from station.science.gridding.viewing_geometry import ViewingGeometry
@@ -41,20 +40,20 @@ def scan_errors(
     inputs: ScanInputs,
     gridder: Gridder,
     viewing: ViewingGeometry | None,
-    adjustment: tuple[AdjustmentInputs, Adjustment] | None,
+    adjustment: ScanAdjustment | None,
     components: VarianceComponents,
 ) -> ScanErrors:
     """Return the errors of a gridded scan, adjusted or not; `components` are its usual motion."""
     if adjustment is None or viewing is None:
         return ScanErrors(inputs.log_only_shared(components))
-    shared = adjustment[1].to_shared_parameters()
+    shared = adjustment.state.shared
     if inputs.geometry.published_budget:
         return ScanErrors(shared)
     variance = _motion_variance(viewing.reference, components)
     positions = position_errors(gridder, inputs.geometry, viewing, variance)
     if positions is not None:
         positions = with_motion_seen(positions, gridder, viewing, adjustment, shared)
-    factors = variance_factors(gridder, inputs.geometry, viewing, adjustment, shared, positions)
+    factors = variance_factors(gridder, viewing, adjustment, shared, positions)
     trim_heap()
     factor = factors.systematic
     return ScanErrors(shared.scaled(factor), positions and positions.scaled(factor), factors)

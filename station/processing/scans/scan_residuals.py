@@ -8,9 +8,8 @@ from functools import cached_property
 
 import numpy as np
 
-from station.processing.pipeline import AdjustmentInputs, height_correction, under_snow
-from station.quantities import Ints, Reals, ScanGeometry, SharedParameters
-from station.science.adjustment.joint import Adjustment
+from station.processing.pipeline import ScanAdjustment
+from station.quantities import Ints, Reals, SharedParameters
 from station.science.gridding.gridder import CellSums, Gridder
 from station.science.gridding.reference_cells import CellClass
 from station.science.gridding.significance import supported_variance
@@ -57,7 +56,7 @@ class SampledCells:
 
 
 def sampled_cells(
-    gridder: Gridder, viewing: ViewingGeometry, adjustment: tuple[AdjustmentInputs, Adjustment]
+    gridder: Gridder, viewing: ViewingGeometry, adjustment: ScanAdjustment
 ) -> Iterator[SampledCells]:
     """Yield the observed cells of the sectors of a reference, of very many a sample."""
     step = 1 + int(viewing.sector_bounds[-1]) // MAX_RESIDUALS
@@ -68,7 +67,7 @@ def sampled_cells(
             continue
         sector, sums = whole.take(cell_index - first), gridder.take(cell_index.astype(np.int32))
         jacobian, offset_m = viewing.jacobian(sector), viewing.offset_m(sector.cell, sector.height_m)
-        residual_m = sums.mean_residual() - sector.mean_residual_m - height_correction(adjustment, jacobian)
+        residual_m = sums.mean_residual() - sector.mean_residual_m - adjustment.correction(jacobian)
         yield SampledCells(cell_index, sector, sums, jacobian, offset_m, residual_m)
 
 
@@ -76,7 +75,7 @@ def with_motion_seen(
     positions: PositionErrors,
     gridder: Gridder,
     viewing: ViewingGeometry,
-    adjustment: tuple[AdjustmentInputs, Adjustment],
+    adjustment: ScanAdjustment,
     posterior: SharedParameters,
 ) -> PositionErrors:
     """Return the errors of positions, as large as residuals show that the positions moved.
@@ -119,15 +118,13 @@ def _group_means(columns: Reals, group: Ints, *, at_cells: bool = False) -> Real
 
 def variance_factors(
     gridder: Gridder,
-    scan_geometry: ScanGeometry,
     viewing: ViewingGeometry,
-    adjustment: tuple[AdjustmentInputs, Adjustment],
+    adjustment: ScanAdjustment,
     posterior: SharedParameters,
     positions: PositionErrors | None = None,
 ) -> VarianceFactors:
     """Return the variance factors of an adjusted scan."""
-    snow, parts = under_snow(gridder, scan_geometry, viewing), []
-    response = adjustment[1].stable_response
+    snow, response, parts = adjustment.under_snow, adjustment.state.stable_response, []
     for cells in sampled_cells(gridder, viewing, adjustment):
         sector, sums, jacobian = cells.sector, cells.sums, cells.jacobian
         residual_m, stable = cells.residual_m, sector.in_class(CellClass.STABLE) & ~snow[cells.cell_index]

@@ -61,12 +61,12 @@ class Adjustment:
     `change_size_m` is the size of the change of moving ground, from its mean and one sigma about it.
     `stable_weights` (patches,) are the robust weights of the stable patches, 0 to 1. `leverage_m2` holds the
     leverage variances of moving and stable cells (see `leverage`). `mean_sigma_m` is the uncertainty of the
-    mean height of moving ground that comes from the state. `sigma` (p,) is that of each parameter;
-    `redundancy` (p,) is the share of its prior variance that the scan has removed: 0 if its value is the
-    prior's, 1 if the observations alone determine it. `log` is the inclination log that was used, and
-    `predicted_log_rad` (lines,) is what the adjustment predicts for it, without the errors of the sensor.
-    `unapplied_rad` (3,) is the estimated rotation about east, north and up that the points lack, as a mean
-    over the lines. `stable_response` is by how much stable ground rose otherwise than modelled.
+    mean height of moving ground that comes from the state. `shared` are the state and its covariance by
+    knots. `redundancy` (p,) is the share of the prior variance of a parameter that the scan has removed: 0 if
+    its value is the prior's, 1 if the observations alone determine it. `log` is the inclination log that was
+    used, and `predicted_log_rad` (lines,) is what the adjustment predicts for it, without the errors of the
+    sensor. `unapplied_rad` (3,) is the estimated rotation about east, north and up that the points lack, as a
+    mean over the lines. `stable_response` is by how much stable ground rose otherwise than modelled.
     """
 
     params: ParameterLayout
@@ -76,7 +76,7 @@ class Adjustment:
     stable_weights: Floats
     leverage_m2: tuple[float, float]
     mean_sigma_m: float
-    sigma: Floats
+    shared: SharedParameters
     redundancy: Floats
     log: LineInclination | None
     predicted_log_rad: Floats
@@ -106,9 +106,10 @@ class Adjustment:
         """Posterior covariance (u, u) of the estimate."""
         return self.posterior.line_covariance()
 
-    def to_shared_parameters(self) -> SharedParameters:
-        """Return the estimate and its covariance on knots, for the store."""
-        return self.posterior.to_shared_parameters(self.estimate)
+    @property
+    def sigma(self) -> Floats:
+        """Posterior sigma of each parameter by knots (p,)."""
+        return np.asarray(np.sqrt(np.diag(self.shared.covariance)))
 
 
 def tilt_effect(jacobian: HeightJacobian, applied_rad: Floats) -> Reals:
@@ -157,7 +158,7 @@ def adjust_scan(
     )
     leverage_m2 = fit_leverage(patches, estimation.weight, equations, posterior)
     state, predicted_log_rad = _state_and_log(params, mixture.estimate, reduced, log)
-    sigma = np.sqrt(np.diag(posterior.to_shared_parameters(state).covariance))
+    shared = posterior.to_shared_parameters(state)
     return Adjustment(
         params,
         state,
@@ -166,8 +167,8 @@ def adjust_scan(
         estimation.robust_weight[~moving],
         leverage_m2,
         _mean_sigma(patches, moving, posterior),
-        sigma,
-        np.clip(1 - sigma**2 / np.diag(prior.knot_covariance), 0.0, 1.0),  # redundancy numbers of the prior
+        shared,
+        np.clip(1 - np.diag(shared.covariance) / np.diag(prior.knot_covariance), 0.0, 1.0),  # of the prior
         log,
         predicted_log_rad,
         state[:3] * HEADING_CLOCKWISE - applied_rad.mean(axis=1),

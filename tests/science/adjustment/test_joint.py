@@ -176,7 +176,7 @@ def simulated_log(state, rng):
 
 
 def height_sigma(adjustment, cells):
-    return np.sqrt(cells.jacobian().variance(adjustment.to_shared_parameters()))
+    return np.sqrt(cells.jacobian().variance(adjustment.shared))
 
 
 def simulate(seed, stable, *, log=False, moving=0, change_m=None, sigma_m=0.01):
@@ -292,7 +292,7 @@ def test_estimate_and_covariance_match_dense_least_squares(params, with_log, mon
     )
     assert np.all(variance[seam] < 1.02 * sigma[seam] ** 2)  # sigma is conservative there
     condensed = propagation.condense_to_knots(params, adjustment.estimate, adjustment.covariance)
-    shared = adjustment.to_shared_parameters()
+    shared = adjustment.shared
     assert_allclose(shared.covariance, condensed.covariance, rtol=1e-6, atol=1e-9 * sigma[0] ** 2)
     assert_allclose(shared.line_tilt_variance, condensed.line_tilt_variance, rtol=1e-6)
     assert_allclose(shared.estimate, condensed.estimate, rtol=1e-6, atol=1e-12)
@@ -394,7 +394,7 @@ def adjusted_tilt(tilt_deg, reference_deg, response_error, ratio, ground_class=G
 
 def variance_by_response(rough, smooth, cells):
     """What the response of rough ground adds to the variance of cells (n,) [m²]."""
-    of_rough, of_smooth = (cells.variance(each.to_shared_parameters()) for each in (rough, smooth))
+    of_rough, of_smooth = (cells.variance(each.shared) for each in (rough, smooth))
     return of_rough - of_smooth
 
 
@@ -451,7 +451,7 @@ def test_sigma_has_the_errors_that_responses_of_sectors_cause():
             for index in np.unique(sector)
         ]
     )
-    stated_m2, without_m2 = (cells.variance(each.to_shared_parameters()) for each in (modelled, smooth))
+    stated_m2, without_m2 = (cells.variance(each.shared) for each in (modelled, smooth))
     expected_m2 = 0.65**2 * caused_m.sum(axis=0) ** 2 + (1 - 0.65**2) * np.sum(caused_m**2, axis=0)
     ratio = (stated_m2 - without_m2) / expected_m2
     assert np.median(ratio) == pytest.approx(1, abs=0.02)
@@ -492,7 +492,7 @@ def test_responses_are_estimated_where_smooth_ground_shows_them(monkeypatch):
     def errors_and_sigma():
         adjusted = [adjusted_rock_and_ice(seed) for seed in range(40)]
         errors_m = [adjustment.effect(cells) - cells.effect(state) for adjustment, state, _ in adjusted]
-        variance_m2 = [cells.variance(adjustment.to_shared_parameters()) for adjustment, *_ in adjusted]
+        variance_m2 = [cells.variance(adjustment.shared) for adjustment, *_ in adjusted]
         return np.array(errors_m), np.sqrt(variance_m2)
 
     error_m, sigma_m = errors_and_sigma()
@@ -731,8 +731,8 @@ def test_a_moved_scanner_gives_a_warning(index, size, word):
     for share, sigma, expected in ((0.5, 0.0, []), (1.0, 0.0, [word]), (1.0, 0.05, [word]), (1.0, 0.2, [])):
         moved = np.zeros(len(covariance))
         moved[index] = share * size
-        uncertain = np.full(len(at_rest.sigma), sigma * size)
-        reasons = adjustment_warnings(replace(at_rest, estimate=moved, sigma=uncertain), COMPONENTS)
+        uncertain = replace(at_rest.shared, covariance=np.eye(len(at_rest.sigma)) * (sigma * size) ** 2)
+        reasons = adjustment_warnings(replace(at_rest, estimate=moved, shared=uncertain), COMPONENTS)
         assert [word for reason in reasons if word in reason] == expected
         assert len(reasons) == len(expected)
 
@@ -929,7 +929,7 @@ def glacier_mean_errors(seed, change_m):
     )
     adjustment = adjust_scan(patches, NO_TILT, knot_prior(PARAMS), None)
     error_m = GLACIER.matrix() @ state - adjustment.effect(GLACIER.jacobian())
-    return np.array([error_m[box].mean() for box in BOXES]), adjustment.to_shared_parameters()
+    return np.array([error_m[box].mean() for box in BOXES]), adjustment.shared
 
 
 @cache

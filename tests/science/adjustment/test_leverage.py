@@ -95,7 +95,7 @@ def variances_of_means(stable):
         adjustment = adjust_scan(make_patches(noise_m, ground_class), NO_TILT, PRIOR, None)
         cell_leverage, shared = (
             leverage(cell_m2, cell_m2, ground_class, adjustment.leverage_m2),
-            adjustment.to_shared_parameters(),
+            adjustment.shared,
         )
         observed_m2.append((weights @ (noise_m - adjustment.effect(jacobian))) ** 2)
         for variances, used in ((leverage_m2, cell_leverage), (independent_m2, None)):

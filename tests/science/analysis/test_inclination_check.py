@@ -102,7 +102,7 @@ def make_adjustment(estimate, covariance, log):
         np.ones(9),
         (1.0, 1.0),
         0.0,
-        redundancy,
+        SimpleNamespace(covariance=covariance),
         redundancy,
         log,
         predicted_rad,
