@@ -431,7 +431,7 @@ def test_log_clock_offset_is_estimated_and_stored(calm):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("method", ["joint", "none"])
-def test_log_five_seconds_late_is_within_sigma_and_reported_in_wind(tmp_path, calm_folder, method):
+def test_log_five_seconds_late_is_within_sigma_and_corrected_in_wind(tmp_path, calm_folder, method):
     """In calm air the offset is too small to detect or to matter; with gusts the ground shows it."""
     folder, scenario = calm_folder, CALM
     if method == "joint":
@@ -451,11 +451,14 @@ def test_log_five_seconds_late_is_within_sigma_and_reported_in_wind(tmp_path, ca
         assert {result.verdict for result in processed.results} == {"good"}
         return
     true_offset_s = 5 + true_clock_offsets(scenario)[REFERENCE:]
-    error_s = processed.series.log_clock_offset + processed.series.log_offset - true_offset_s
-    z = error_s.values / processed.series.log_clock_offset_uncertainty.values
+    corrected_s = processed.series.log_offset.values
+    error_s = processed.series.log_clock_offset.values + corrected_s - true_offset_s
+    z = error_s / processed.series.log_clock_offset_uncertainty.values
     assert 0.3 < rms(z) < 1.6  # of six
-    assert {result.verdict for result in processed.results} == {"good", "degraded"}
-    assert any("s late (±" in result.reason for result in processed.results)
+    corrected = np.abs(corrected_s) > 3.5
+    assert any(corrected)
+    assert corrected_s[corrected] == pytest.approx(true_offset_s[corrected], abs=1)
+    assert {result.verdict for result in processed.results} == {"good"}
 
 
 @pytest.mark.slow

@@ -21,15 +21,17 @@ MIN_OFFSET_S = 2.5  # below which nothing is reported
 def log_clock_offset(site: Site) -> str:
     """Return a message on the mean clock offset of the newest inclination logs; "" if it is insignificant.
 
-    The offset of each log is estimated from the ground. Raises StoreError if the series cannot be read.
+    That of each log is what was corrected and what remains, estimated from the ground. Raises StoreError if
+    the series cannot be read.
     """
     path = processing_file(series_for(site))
-    names = ("log_clock_offset", "log_clock_offset_uncertainty")
+    names = ("log_offset", "log_clock_offset", "log_clock_offset_uncertainty")
     with read_errors(path), h5py.File(path, "r") as file:
         if any(name not in file for name in names):
             return ""
-        offset_s, sigma_s = (file[name][-MAX_SCANS:].astype(np.float64) for name in names)
-    estimated = np.isfinite(offset_s) & (offset_s < FILL / 2)
+        corrected_s, remaining_s, sigma_s = (file[name][-MAX_SCANS:].astype(np.float64) for name in names)
+    estimated = np.isfinite(remaining_s) & (remaining_s < FILL / 2)
+    offset_s = corrected_s + remaining_s
     if np.count_nonzero(estimated) < MIN_SCANS:
         return ""
     weight = 1 / (sigma_s[estimated] ** 2 + CLOCK_SIGMA_S**2)

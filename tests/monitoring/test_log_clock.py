@@ -12,19 +12,23 @@ from station.inbox.journal import Journal
 from station.monitoring import log_clock, status
 from station.quantities import Grid
 
-NAMES = ("log_clock_offset", "log_clock_offset_uncertainty")
+NAMES = ("log_offset", "log_clock_offset", "log_clock_offset_uncertainty")
 
 
 @pytest.fixture
 def problem_of(tmp_path, monkeypatch):
-    """Return a function: the reported problem of a series of clock offsets and their sigma [s]."""
+    """Return a function: the reported problem of a series of clock offsets and their sigma [s].
+
+    Large ones were corrected before the scan was adjusted; what remains of them is zero.
+    """
     series = Series(tmp_path, "hef", Grid(0.0, 20.0, 10.0, 3, 2), None)
     monkeypatch.setattr(log_clock, "series_for", lambda _: series)
 
     def report(offset_s, sigma_s, names=NAMES):
         with netCDF4.Dataset(series.path, "w") as file:
             file.createDimension("time", len(offset_s))
-            for name, values in zip(names, (offset_s, sigma_s), strict=True):
+            corrected_s = np.where(np.abs(offset_s) > 3.5, offset_s, 0.0)
+            for name, values in zip(names, (corrected_s, offset_s - corrected_s, sigma_s), strict=True):
                 file.createVariable(name, "f8", ("time",), fill_value=9.96921e36)[:] = np.ma.masked_invalid(
                     values
                 )
@@ -64,7 +68,7 @@ def test_scans_without_an_estimate_do_not_count(problem_of):
 
 
 def test_series_without_the_variables_reports_nothing(problem_of):
-    assert problem_of(*draw(1, 6.0), names=("a", "b")) == ""
+    assert problem_of(*draw(1, 6.0), names=("a", "b", "c")) == ""
 
 
 def test_status_lists_the_offset_among_the_faults(problem_of, tmp_path, monkeypatch):

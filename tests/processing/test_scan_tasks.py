@@ -19,12 +19,13 @@ from station.operations import site_check
 from station.processing import provenance, reference_tasks, scan_tasks
 from station.processing.pipeline import to_map
 from station.processing.scan_tasks import ScanHistory
-from station.processing.scans import open_scans
+from station.processing.scans import adjusted_scan, open_scans
 from station.processing.scans.epoch_inputs import load_scan_inputs
 from station.processing.scans.scan_air import pressure_fault
 from station.processing.scans.scan_files import scan_file
 from station.quantities import Air, Quality
 from station.science.adjustment import ground_response
+from station.science.analysis.inclination_check import ClockOffset, LogCheck
 from station.science.uncertainty.parameters import LINE_GROUPS_PER_KNOT
 from station.simulation.instrument.motion import sensor_faults
 from station.simulation.station import simulate, small
@@ -277,6 +278,20 @@ def test_a_log_that_the_ground_contradicts_is_not_used(folder):
     _, estimate_without, sigma_without = state()
     np.testing.assert_array_equal(estimate, estimate_without)
     np.testing.assert_array_equal(sigma, sigma_without)
+
+
+@pytest.mark.integration
+def test_a_log_is_not_used_if_its_corrected_clock_does_not_explain_it(folder, monkeypatch):
+    """As with another log: the ground says that it is late, and says so again once it is corrected."""
+    site = edited_site(folder)
+    scans = [scan_file(site, path) for path in sorted(site.scans.inbox.glob("*.laz"))]
+    reference_tasks.build_reference_version(site, scans[:1], "1", lambda: None)
+    offset = ClockOffset(4.2, 0.3, log_likelihood_ratio=50.0)
+    monkeypatch.setattr(adjusted_scan, "check_log", lambda *_: LogCheck(offset.warnings(), offset))
+    result, _ = process(folder)
+    assert result.verdict == "degraded"
+    assert "inclination log 4.2 s late (± 0.3 s) by the ground: it is not used" in result.reason
+    assert "clock of the inclination log" not in result.reason
 
 
 @pytest.mark.integration

@@ -53,20 +53,36 @@ def grid_and_adjust(
 ) -> AdjustedScan:
     """Return a scan on the grid, adjusted to the reference as `viewing` shows it.
 
-    If the ground contradicts the inclination log, the scan is gridded and adjusted again as if there were
-    none: its tilt, where the SOP contains that of the mount, is not applied.
+    If the ground shows that the clock of the inclination log is off, the log is corrected, and the scan
+    adjusted again. If the ground contradicts the log, it is gridded and adjusted again as if there were none:
+    its tilt, where the SOP contains that of the mount, is not applied.
     Raises ScanError if no point falls on the grid.
     """
-    scan = _adjusted(site, opened, inputs, viewing, progress)
+    scan = _with_log_checked(_adjusted(site, opened, inputs, viewing, progress))
+    check = scan.log_check
+    if check is not None and check.clock_offset is not None and check.clock_offset.warnings():
+        offset_s, sigma_s = check.clock_offset.offset_s, check.clock_offset.sigma_s
+        corrected = scan.inputs.with_clock_offset(offset_s, sigma_s)
+        adjustment = adjust_scan(site, scan.gridder, corrected, scan.viewing)
+        second = _with_log_checked(replace(scan, inputs=corrected, adjustment=adjustment, log_check=None))
+        if second.log_check is not None and not second.log_check.warnings:
+            return second
+    if check is not None and check.warnings:
+        del scan  # the memory of a worker does not hold two gridded scans
+        keep_tilt = site.inclination is not None and site.inclination.mode == "absolute"
+        scan = _adjusted(site, opened, inputs.without_log(keep_tilt=keep_tilt), viewing, progress)
+        trim_heap()
+        return replace(scan, log_check=check)
+    return scan
+
+
+def _with_log_checked(scan: AdjustedScan) -> AdjustedScan:
+    """Return a scan with the check of its log, if it was adjusted with one."""
     if scan.adjustment is None or scan.viewing is None or scan.inputs.is_given:
         return scan
     if not is_usable(scan.adjustment):
         return scan
     check = check_log(scan.adjustment.inputs.lines, scan.adjustment.state, scan.viewing.reference)
-    if check is not None and check.warnings:
-        del scan  # the memory of a worker does not hold two gridded scans
-        keep_tilt = site.inclination is not None and site.inclination.mode == "absolute"
-        scan = _adjusted(site, opened, inputs.without_log(keep_tilt=keep_tilt), viewing, progress)
     trim_heap()
     return replace(scan, log_check=check)
 

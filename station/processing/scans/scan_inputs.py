@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 
@@ -27,6 +27,7 @@ from station.processing.scans.registration import (
 )
 from station.processing.scans.scan_air import air_of_scan
 from station.processing.scans.scan_tilt import (
+    clock_warnings,
     log_of_scan,
     own_tilt_offset,
     sop_tilt_offset,
@@ -43,6 +44,7 @@ from station.quantities import (
     VarianceComponents,
 )
 from station.science.adjustment import prior
+from station.science.adjustment.normal_equations import LineInclination
 from station.science.geometry.air import air_correction
 from station.science.geometry.cyclic_error import NO_CYCLIC_ERROR
 from station.science.geometry.inclination import TiltRecord
@@ -66,6 +68,7 @@ class ScanInputs:
     faults: tuple[str, ...] = ()  # that make the scan unusable
     position_poses: tuple[Pose, ...] = ()  # of several positions, whose shots come on the map
     is_given: bool = False  # by the owner's registration, which is not to be changed
+    log_by_line: Callable[[TiltRecord], LineInclination] | None = None
 
     def shots(self, scan: OpenScan, intensity: IntensityScale) -> Iterator[Shots]:
         """Yield the shots of a scan, to be placed by `pose`; decoding starts with this call."""
@@ -91,6 +94,22 @@ class ScanInputs:
             self,
             pose=self.pose.rotated(rotation_rad),
             adjustment_inputs=replace(self.adjustment_inputs, assumed_rad=assumed_rad),
+        )
+
+    def with_clock_offset(self, offset_s: float, sigma_s: float) -> ScanInputs:
+        """Return the inputs with the inclination log corrected for a further offset of its clock [s].
+
+        The points keep the tilt that they have, which an adjustment knows.
+        """
+        assert self.adjustment_inputs is not None  # noqa: S101 - the scan was adjusted with the log
+        assert self.tilt_record is not None  # noqa: S101
+        assert self.log_by_line is not None  # noqa: S101
+        tilt_record = self.tilt_record.with_clock_offset(offset_s, sigma_s)
+        return replace(
+            self,
+            adjustment_inputs=replace(self.adjustment_inputs, log=self.log_by_line(tilt_record)),
+            tilt_record=tilt_record,
+            warnings=(*self.warnings, *clock_warnings(tilt_record)),
         )
 
     def without_log(self, *, keep_tilt: bool) -> ScanInputs:
@@ -163,12 +182,16 @@ def position_inputs(
     assert geometry.position_m is not None  # noqa: S101 - that of the SOP
     params = parameters.parameter_layout(geometry.grid, geometry.position_m, axis)
     lines = prior.line_times(params, rotation, track)
-    assumed_rad, line_inclination = np.zeros((3, params.line_groups)), None
+    assumed_rad, log_by_line = np.zeros((3, params.line_groups)), None
     if tilt_record is not None:
         assumed_rad = prior.tilt_rotation(tilt_record.tilt, rotation, lines.time_s)
         if track is not None and registered is None:
-            line_inclination = prior.line_inclination(
-                params, lines, tilt_record, tilt_offset or NO_CYCLIC_ERROR, rotation
+            log_by_line = partial(
+                prior.line_inclination,
+                params,
+                lines,
+                tilt_offset=tilt_offset or NO_CYCLIC_ERROR,
+                to_local=rotation,
             )
     placed = transform if registered is None else registered
     if site.air is not None:
@@ -194,7 +217,12 @@ def position_inputs(
         Pose(placed, tilt),
         covariance if registered is None else registered_covariance(site, covariance),
         AdjustmentInputs(
-            params, lines, assumed_rad, line_inclination, start.timestamp(), air if weather_known else None
+            params,
+            lines,
+            assumed_rad,
+            log_by_line(tilt_record) if log_by_line and tilt_record else None,
+            start.timestamp(),
+            air if weather_known else None,
         ),
         tilt_record,
         air if weather_known else None,
@@ -202,6 +230,7 @@ def position_inputs(
         provenance,
         faults,
         is_given=registered is not None and is_given(site),
+        log_by_line=log_by_line,
     )
 
 

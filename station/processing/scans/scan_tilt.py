@@ -20,7 +20,12 @@ from station.readers.inclination import align_gps_week, read_inclination
 from station.readers.scan import ScanReader
 from station.scan_names import scan_stem
 from station.science.geometry import inclination
-from station.science.geometry.cyclic_error import NO_CYCLIC_ERROR, CyclicError, fit_cyclic_error
+from station.science.geometry.cyclic_error import (
+    NO_CYCLIC_ERROR,
+    OFFSET_PRIOR_S,
+    CyclicError,
+    fit_cyclic_error,
+)
 from station.science.geometry.inclination import TiltRecord
 from station.sections.inputs import SopSection
 
@@ -28,7 +33,8 @@ MIN_LOG_COVERAGE = 0.97  # of the scan duration that a complete log covers
 MIN_LOG_ROWS = 20  # a shorter log is not filtered
 MIN_ABSOLUTE_LOG_S = 60.0  # of a scan whose static tilt is known from its log alone
 MAX_SATURATED = 0.1  # of the rows of a log, at the limit of the sensor's range
-MIN_CLOCK_OFFSET_S = 4.0  # clock offset of a log, and its significance, that lead to a warning
+# Clock offset of a log, and its significance, that lead to a warning: more than clocks usually differ by.
+MIN_CLOCK_OFFSET_S = 2 * OFFSET_PRIOR_S
 MIN_CLOCK_OFFSET_SIGMAS = 3.0
 
 
@@ -156,16 +162,18 @@ def tilt_of_scan(
     gap_s = float(np.ptp(tilt_record.gaps_s, axis=1).max(initial=0.0))
     if gap_s > 2 * tilt_record.correlation_time_s:
         warnings.append(f"inclination log has a gap of {gap_s:,.0f} s")
-    if abs(tilt_record.offset_s) > max(
-        MIN_CLOCK_OFFSET_S, MIN_CLOCK_OFFSET_SIGMAS * tilt_record.offset_sigma_s
-    ):
-        warnings.append(
-            f"clock of the inclination log {tilt_record.offset_s:+z.1f} s off,"
-            f" sigma {tilt_record.offset_sigma_s:.1f} s"
-        )
+    warnings += clock_warnings(tilt_record)
     if track is None:
         return inclination.mean_tilt(tilt_record)
     return tilt_record
+
+
+def clock_warnings(tilt_record: TiltRecord) -> list[str]:
+    """Return a message if the clock of a log was off by more than is usual; its times are corrected."""
+    offset_s, sigma_s = tilt_record.offset_s, tilt_record.offset_sigma_s
+    if abs(offset_s) <= max(MIN_CLOCK_OFFSET_S, MIN_CLOCK_OFFSET_SIGMAS * sigma_s):
+        return []
+    return [f"clock of the inclination log {offset_s:+z.1f} s off, sigma {sigma_s:.1f} s"]
 
 
 def own_tilt_offset(site: Site, log: InclinationLog | None, track: AzimuthTrack | None) -> CyclicError | None:

@@ -287,6 +287,27 @@ def test_tilt_contained_in_the_sop_is_not_applied_again():
     assert np.abs(record.tilt.pitch_rad).max() < math.radians(1e-4)
 
 
+def test_a_record_follows_the_motion_once_its_clock_offset_is_corrected():
+    """A sway of 20 s, in a log without noise that is 4.5 s late; its wave moves by 0.0004° at most."""
+    time_s = np.arange(0.0, 920.0)
+
+    def sway(seconds):
+        return math.radians(0.004) * np.sin(2 * math.pi * seconds / 20)
+
+    roll, pitch = CYCLIC_ERROR.at(head_azimuth(AZIMUTH_TRACK, time_s))
+    late = inclination_log(roll + sway(time_s), pitch + sway(time_s), time_s + 4.5)
+    record = inclination.relative_tilt(late, AZIMUTH_TRACK, CYCLIC_ERROR, NOISE)
+    corrected = record.with_clock_offset(4.5 - record.offset_s, 0.3)
+    assert (corrected.offset_s, corrected.offset_sigma_s) == (pytest.approx(4.5), 0.3)
+
+    def largest_error_deg(record):
+        error_rad = record.unfiltered.roll_rad - sway(record.unfiltered.time_s)
+        return np.degrees(np.abs(error_rad[10:-10]).max())
+
+    assert largest_error_deg(corrected) < 0.0005
+    assert largest_error_deg(record) > 0.004
+
+
 def test_relative_tilt_passes_drift_and_removes_noise():
     rng = np.random.default_rng(8)
     time_s = np.arange(0.0, 920.0)
