@@ -368,7 +368,7 @@ def measure(
         posterior = propagation.difference_to_reference(posterior, viewing.reference.shared)
     correction, under_snow = (adjustment.correction, adjustment.under_snow) if adjustment else (None, None)
     estimator = CellEstimator(
-        scan_geometry, posterior, independent, correction, under_snow, factors.random, position_errors
+        scan_geometry, posterior, independent, correction, under_snow, factors, position_errors
     )
     return estimate_cells(gridder, viewing, estimator)
 

@@ -32,7 +32,7 @@ from station.science.gridding.viewing_geometry import AzimuthSector, ViewingGeom
 from station.science.gridding.viewpoints import PositionErrors, mean_shot_variance
 from station.science.uncertainty import budget, parameters, shot_noise
 from station.science.uncertainty.jacobian import HeightJacobian, height_jacobian
-from station.science.uncertainty.variance_factors import class_in_scan
+from station.science.uncertainty.variance_factors import VarianceFactors, class_in_scan
 
 FEW_POINTS = 3
 
@@ -144,8 +144,7 @@ class CellEstimator:
     `posterior` are the shared parameters of the difference from the reference, `independent` those of the
     scan alone, None if unknown. `correction` returns what to subtract from heights [m], and `under_snow` (m,)
     is True for those cells of the reference that are stable ground whose snow may have changed; both are
-    None without an adjustment. `variance_factors` (2048,) are those of the random variance by noise class,
-    `position_errors` those of several scan positions.
+    None without an adjustment. `position_errors` are those of several scan positions.
     """
 
     scan_geometry: ScanGeometry
@@ -153,7 +152,7 @@ class CellEstimator:
     independent: SharedParameters | None
     correction: Callable[[HeightJacobian], Reals] | None
     under_snow: Bools | None
-    variance_factors: Floats32
+    factors: VarianceFactors
     position_errors: PositionErrors | None = None
 
     def in_reference(
@@ -166,7 +165,10 @@ class CellEstimator:
             point_m2 = significance.supported_variance(point_m2, sums.standard_deviation(), sums.count)
         excess = point_m2 > sector.point_variance_m2
         noise_class = class_in_scan(sector.noise_class, excess, count, sector.point_count)
-        point_m2 = point_m2 * self.variance_factors.take(noise_class)
+        stable = np.zeros(len(count), bool)
+        if self.under_snow is not None:
+            stable = sector.in_class(CellClass.STABLE) & ~self.under_snow[cell_index]
+        point_m2 = point_m2 * self.factors.random_of(noise_class, stable)
         random_m2 = point_m2 / count + sector.reference_variance_m2
         shared_m2: Reals = np.zeros_like(count)
         correction_m: Reals = np.zeros_like(count)
@@ -192,9 +194,7 @@ class CellEstimator:
         flags |= Quality.HIGH_INCIDENCE * sector.in_class(CellClass.GRAZING).view(np.uint8)
         flags |= Quality.CHANGE_SIGNIFICANT * significance.significant(change_m, sigma_m).view(np.uint8)
         flags |= Quality.BARE_GROUND * sector.in_class(CellClass.BARE).view(np.uint8)
-        if self.under_snow is not None:
-            stable = sector.in_class(CellClass.STABLE) & ~self.under_snow[cell_index]
-            flags |= Quality.STABLE_GROUND * stable.view(np.uint8)
+        flags |= Quality.STABLE_GROUND * stable.view(np.uint8)
         height_m = sector.height_m.astype(np.float64) + sector.mean_residual_m
         elevation_m = viewing.datum_m + (height_m + change_m)
         return _CellEstimates(elevation_m, change_m, sigma_m, np.sqrt(random_m2), flags, terms)

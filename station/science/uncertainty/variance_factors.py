@@ -8,7 +8,7 @@ Source: equations.md, 6.7.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from typing import Any
 
 import numpy as np
@@ -47,14 +47,21 @@ BISECTIONS = 30
 
 @dataclass(frozen=True)
 class VarianceFactors:
-    """Factors of the modelled variances of one scan [1]: random by noise class (2048,), and systematic."""
+    """Factors of the modelled variances of one scan [1]: random by noise class (4096,), and systematic.
+
+    The first half of the random ones is that of moving ground, the second that of stable ground.
+    """
 
     random: Floats32
     systematic: float
     median_random: float = 1.0  # of the cells of the scan
 
+    def random_of(self, noise_class: NDArray[np.integer[Any]], stable: Bools) -> Floats32:
+        """Return the factor of the random variance of cells (n,), by noise class and kind of ground."""
+        return np.asarray(self.random.take(noise_class + NOISE_CLASSES * stable))
 
-UNIT_FACTORS = VarianceFactors(np.ones(NOISE_CLASSES, np.float32), 1.0)
+
+UNIT_FACTORS = VarianceFactors(np.ones(2 * NOISE_CLASSES, np.float32), 1.0)
 
 
 @dataclass(frozen=True)
@@ -119,36 +126,44 @@ def class_in_scan(
 
 def estimate_variance_factors(residuals: Residuals) -> VarianceFactors:
     """Return the variance factors that the residuals of a scan show."""
-    random = _random_factors(residuals)
-    of_cells = random[residuals.noise_class]
-    return VarianceFactors(random, _systematic_factor(residuals, random), float(np.median(of_cells)))
+    factors = UNIT_FACTORS
+    for _ in range(WEIGHT_PASSES):
+        of_cells = factors.random_of(residuals.noise_class, residuals.stable)
+        ratio, usable = _local_deviations(residuals, of_cells)
+        random = [_random_factors(residuals, ratio, usable, least) for least in (MIN_STABLE_CELLS, 0)]
+        factors = replace(factors, random=np.concatenate(random))
+    of_cells = factors.random_of(residuals.noise_class, residuals.stable)
+    return replace(
+        factors,
+        systematic=_systematic_factor(residuals, of_cells),
+        median_random=float(np.median(of_cells)),
+    )
 
 
-def _random_factors(residuals: Residuals) -> Floats32:
+def _random_factors(residuals: Residuals, ratio: Floats, usable: Bools, least_stable: int) -> Floats32:
     """Return the factor of the random variance by noise class (2048,), from deviations within groups.
 
-    A class is drawn to the common factor of its roughness, scatter and number of points at all ranges, that
-    to the one of any number of points, and that to the model.
+    Those of classes with fewer than `least_stable` stable cells come from moving ground. A class is drawn to
+    the common factor of its roughness, scatter and number of points at all ranges, that to the one of any
+    number of points, and that to the model. `ratio` (n,) is a deviation over its modelled sigma; only usable
+    ones count.
     """
     in_scan, of_cells = np.divmod(np.arange(NOISE_CLASSES), CELL_CLASSES)
     roughness = _ratio_class(of_cells) + RATIO_CLASSES * in_scan
     factors = np.ones(NOISE_CLASSES, np.float32)
-    for _ in range(WEIGHT_PASSES):
-        ratio, usable = _local_deviations(residuals, factors)
-        factors = np.ones(NOISE_CLASSES, np.float32)
-        for classes in (roughness % (2 * RATIO_CLASSES), roughness, np.arange(NOISE_CLASSES)):
-            factors = _factors_by_class(residuals, ratio, usable, classes, factors)
+    for classes in (roughness % (2 * RATIO_CLASSES), roughness, np.arange(NOISE_CLASSES)):
+        factors = _factors_by_class(residuals, ratio, usable, classes, factors, least_stable)
     return factors
 
 
-def _local_deviations(residuals: Residuals, factors: Floats32) -> tuple[Floats, Bools]:
+def _local_deviations(residuals: Residuals, factor: Floats32) -> tuple[Floats, Bools]:
     """Return deviations (n,) from planes through groups over their modelled sigma, and which of them to use.
 
     Change slopes, as drifts of snow do, and ends at stable ground, which has planes of its own. Cells are
-    weighted as the factors (2048,) of the random variance say.
+    weighted by the random variance with its factor (n,).
     """
     model_m2 = (residuals.scan_m2 + residuals.reference_m2).astype(np.float64)
-    weight = 1 / (residuals.scan_m2 * factors[residuals.noise_class] + residuals.reference_m2)
+    weight = 1 / (residuals.scan_m2 * factor + residuals.reference_m2)
     group = 2 * residuals.group + residuals.stable
     groups, count = int(group.max(initial=0)) + 1, np.bincount(group)
     tiny = np.finfo(float).tiny
@@ -175,21 +190,21 @@ def _local_deviations(residuals: Residuals, factors: Floats32) -> tuple[Floats, 
 
 
 def _factors_by_class(
-    residuals: Residuals, ratio: Floats, usable: Bools, classes: Ints, prior: Floats32
+    residuals: Residuals, ratio: Floats, usable: Bools, classes: Ints, prior: Floats32, least_stable: int
 ) -> Floats32:
     """Return the factors (2048,) by noise class, common to those with the same number in `classes` (2048,).
 
-    Where there are few cells they are drawn to a prior (2048,). `ratio` is a deviation over its modelled
-    sigma; only usable ones count.
+    Where there are few cells they are drawn to a prior (2048,); see `_random_factors`.
     """
     at_any_count = classes[np.arange(NOISE_CLASSES) % (2 * CELL_CLASSES)]
     stable = residuals.noise_class[usable & residuals.stable]
     stable_count = np.bincount(at_any_count[stable], minlength=NOISE_CLASSES)[at_any_count]
-    needs_moving = (stable_count < MIN_STABLE_CELLS)[residuals.noise_class]
+    needs_moving = (stable_count < least_stable)[residuals.noise_class]
     of_cells = classes[residuals.noise_class]
-    factors, of_points = prior.copy(), _point_factors(residuals, of_cells, NOISE_CLASSES)
-    order = np.argsort(of_cells, kind="stable")
-    order = order[(usable & (residuals.stable | needs_moving))[order]]
+    factors = prior.copy()
+    of_points = _point_factors(residuals, of_cells, NOISE_CLASSES) if needs_moving.any() else np.empty(0)
+    chosen = np.flatnonzero(usable & (residuals.stable | needs_moving))
+    order = chosen[np.argsort(of_cells[chosen], kind="stable")]
     edges = np.searchsorted(of_cells[order], np.arange(NOISE_CLASSES + 1))
     for index in np.flatnonzero(np.diff(edges) >= MIN_CLASS_CELLS):
         members, same = order[edges[index] : edges[index + 1]], classes == index
@@ -221,9 +236,10 @@ def _point_factors(residuals: Residuals, all_classes: NDArray[np.integer[Any]], 
     return np.asarray((of_class + MIN_CLASS_CELLS * of_all) / (weight + MIN_CLASS_CELLS))
 
 
-def _systematic_factor(residuals: Residuals, random: Floats32) -> float:
+def _systematic_factor(residuals: Residuals, factor: Floats32) -> float:
     """Return the factor of the systematic variance, from the mean residuals of blocks of stable ground.
 
+    `factor` (n,) is that of the random variance.
     It is at least 1: little stable ground fits the state that was estimated from it, which does not make that
     state more certain.
     """
@@ -236,7 +252,7 @@ def _systematic_factor(residuals: Residuals, random: Floats32) -> float:
     columns = int(np.ptp(column)) + 2  # so that the last block of a row has no neighbour in the next
     key = (row - row.min()) * columns + column - column.min()
     blocks_found, block, count = np.unique(key, return_inverse=True, return_counts=True)
-    random_m2 = (residuals.scan_m2 * random[residuals.noise_class] + residuals.reference_m2)[stable]
+    random_m2 = (residuals.scan_m2 * factor + residuals.reference_m2)[stable]
     weight = 1 / random_m2.astype(np.float64)
     weight_sum = np.bincount(block, weight)
     enough = count >= MIN_BLOCK_CELLS

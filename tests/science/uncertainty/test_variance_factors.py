@@ -42,7 +42,8 @@ def test_random_factors_are_found_by_class_in_both_directions(factors):
     found = estimate_variance_factors(residuals(1, factors)).random
     assert found[:2] == pytest.approx(factors, rel=0.03)
     assert (found[2:14] == 1).all()  # rougher ground at the same range
-    assert len(found) == NOISE_CLASSES
+    assert found[NOISE_CLASSES : NOISE_CLASSES + 2] == pytest.approx(factors, rel=0.03)  # of stable ground
+    assert len(found) == 2 * NOISE_CLASSES
 
 
 def test_classes_with_few_cells_have_the_factor_of_the_same_roughness_at_all_ranges():
@@ -172,6 +173,19 @@ def test_rock_among_deep_snow_has_deviations_of_its_own():
     residual_m = quiet.residual_m + np.where(rock, 0.0, 2.0)
     found = estimate_variance_factors(Residuals(**{**vars(quiet), "residual_m": residual_m, "stable": rock}))
     assert found.random[:2] == pytest.approx([1, 4], rel=0.03)
+
+
+def test_little_rock_does_not_have_the_noise_of_the_snow_around():
+    """Two patches of 150 cells of rock: new snow scatters by 1.5 times as modelled, rock by a half."""
+    quiet = residuals(3, (1.0, 1.0), reference_share=0.0)
+    rock = (quiet.x_m % (SIDE_M / 2) < 50) & (quiet.y_m < 75)
+    residual_m = quiet.residual_m * np.where(rock, 0.5, 1.5)
+    found = estimate_variance_factors(Residuals(**{**vars(quiet), "residual_m": residual_m, "stable": rock}))
+    assert found.random[:2] == pytest.approx([2.25, 2.25], rel=0.05)
+    of_rock = found.random[NOISE_CLASSES : NOISE_CLASSES + 2]
+    assert of_rock == pytest.approx([0.25, 0.25], rel=0.35)  # one sigma is 14 %
+    snow_and_rock = found.random_of(np.zeros(2, np.int64), np.array([False, True]))
+    assert snow_and_rock == pytest.approx(found.random[[0, NOISE_CLASSES]])
 
 
 def test_change_that_slopes_is_not_noise():
