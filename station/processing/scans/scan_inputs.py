@@ -68,7 +68,7 @@ class ScanInputs:
     faults: tuple[str, ...] = ()  # that make the scan unusable
     position_poses: tuple[Pose, ...] = ()  # of several positions, whose shots come on the map
     is_given: bool = False  # by the owner's registration, which is not to be changed
-    log_by_line: Callable[[TiltRecord], LineInclination] | None = None
+    log_by_line: Callable[[TiltRecord], LineInclination] | None = None  # of a tilt record, if there is a log
 
     def shots(self, scan: OpenScan, intensity: IntensityScale) -> Iterator[Shots]:
         """Yield the shots of a scan, to be placed by `pose`; decoding starts with this call."""
@@ -101,9 +101,8 @@ class ScanInputs:
 
         The points keep the tilt that they have, which an adjustment knows.
         """
-        assert self.adjustment_inputs is not None  # noqa: S101 - the scan was adjusted with the log
-        assert self.tilt_record is not None  # noqa: S101
-        assert self.log_by_line is not None  # noqa: S101
+        if self.adjustment_inputs is None or self.tilt_record is None or self.log_by_line is None:
+            return self  # there is no log
         tilt_record = self.tilt_record.with_clock_offset(offset_s, sigma_s)
         return replace(
             self,
